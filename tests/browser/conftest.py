@@ -1,4 +1,4 @@
-"""A real Chromium that walks through the example study, and keeps an eye on what no participant should see."""
+"""Fixtures for tests in a real Chromium: pages, held studies, and participants whose pages are checked for errors."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ SHOTS = ROOT / "shots"
 PATIENCE = 45_000  # ms
 
 
-class Kept:
-    """Chromium, from the first test of this folder that wants it to the last: to start it takes as long as some tests."""
+class SharedBrowser:
+    """One Chromium for all tests of this folder, because its start takes as long as some tests."""
 
     def __init__(self) -> None:
         self._open = contextlib.ExitStack()
@@ -45,32 +45,32 @@ class Kept:
         return self._browser
 
     def close(self) -> None:
-        """End it, if it runs."""
+        """End the browser, if it runs."""
         self._browser = None
         self._open.close()
 
 
-KEPT = Kept()
+SHARED_BROWSER = SharedBrowser()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-    """After this folder's last test the browser ends: while Playwright is there, its thread cannot run any other event loop."""
+    """End the browser after this folder's last test: while Playwright runs, its thread cannot run another event loop."""
     try:
         return (yield)
     finally:
         if nextitem is None or not nextitem.path.is_relative_to(HERE):
-            KEPT.close()
+            SHARED_BROWSER.close()
 
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """The browser. Tests that want it are not run without one, unless BROWSER_TESTS=required.
+    """The browser. Without one, its tests are skipped; with BROWSER_TESTS=required they fail.
 
-    What a file leaves open is closed after it.
+    Contexts that a file leaves open are closed after its last test.
     """
     try:
-        browser = KEPT.browser()
+        browser = SHARED_BROWSER.browser()
     except NoChromium:
         if os.environ.get("BROWSER_TESTS") == "required":
             pytest.fail(NO_CHROMIUM)
@@ -82,7 +82,7 @@ def chromium() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def own_page(context: Any) -> Iterator[Any]:
-    """A new page in this context. When it is closed, what its addresses have stored in the browser is deleted."""
+    """A new page in this context. At its end, the data that its sites have stored in the browser are deleted."""
     page, origins = context.new_page(), set()
     page.on("framenavigated", lambda shown: origins.add("/".join(shown.url.split("/", 3)[:3])))
     try:
@@ -90,24 +90,24 @@ def own_page(context: Any) -> Iterator[Any]:
     finally:
         devtools = context.new_cdp_session(page)
         for origin in origins:
-            if origin.startswith("http"):  # ports are given again
+            if origin.startswith("http"):  # another test may get the same port
                 devtools.send("Storage.clearDataForOrigin", {"origin": origin, "storageTypes": "all"})
         page.close()
 
 
 @contextlib.contextmanager
 def without_errors(page: Any) -> Iterator[Any]:
-    """Errors in the page's scripts, and what the policy refuses, fail the test."""
-    wrong: list[str] = []
-    page.on("pageerror", lambda error: wrong.append(str(error)))
+    """Fail the test if the page's scripts raise an error, or if the Content Security Policy refuses something."""
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
 
     def listen(said: Any) -> None:
         if "Content Security Policy" in said.text:
-            wrong.append(said.text)
+            problems.append(said.text)
 
     page.on("console", listen)
     yield page
-    assert not wrong
+    assert not problems
 
 
 NARROW = {"viewport": {"width": 360, "height": 640}}
@@ -115,17 +115,17 @@ NARROW = {"viewport": {"width": 360, "height": 640}}
 
 @pytest.fixture(scope="module")
 def narrow(chromium: Any) -> Iterator[Any]:
-    """What the tabs of a file share."""
+    """The browser context that all pages of a file share."""
     context = chromium.new_context(**NARROW)
     context.set_default_timeout(PATIENCE)
-    context.new_page()  # its window stays: to make one for each tab takes Chromium longer than some tests
+    context.new_page()  # keeps a window open: a new one for each page takes Chromium longer than some tests
     yield context
     context.close()
 
 
 @pytest.fixture
 def tab(narrow: Any) -> Iterator[Any]:
-    """A page. A test that sets the context's clock, network or permissions takes `lone_tab`."""
+    """A page in the file's context. A test that sets the context's clock, network or permissions takes `lone_tab`."""
     with own_page(narrow) as page, without_errors(page):
         yield page
 
@@ -141,14 +141,14 @@ def lone_tab(chromium: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def standing(lone_tab: Any) -> Any:
-    """A page whose clock stands but for `standing.clock.run_for(ms)`: what it counts down is what a test has let pass."""
+def stopped_clock_tab(lone_tab: Any) -> Any:
+    """A page whose clock is stopped: its time passes only in `stopped_clock_tab.clock.run_for(ms)`."""
     lone_tab.clock.install(time="2026-01-01T00:00:00Z")
-    lone_tab.clock.pause_at("2026-01-01T01:00:00Z")  # later than any machine gets here
+    lone_tab.clock.pause_at("2026-01-01T01:00:00Z")  # the page's clock must not be past it yet, on the slowest machine
     return lone_tab
 
 
-HOLDS = """(() => {
+HOLD_TIMERS = """(() => {
     const lengths = %s, held = new Map(), { setTimeout: begin, clearTimeout: end } = window;
     let last = 0;
     window.setTimeout = (done, ms, ...more) => {
@@ -162,14 +162,14 @@ HOLDS = """(() => {
 
 
 def hold_timers(page: Any, *lengths: int) -> None:
-    """Timers of so many milliseconds wait for `window.letGo()`: what the page shows only for so long stays to be looked at.
+    """Hold the page's timers of these lengths (ms) until `window.letGo()`, so that short-lived words can be checked.
 
-    For a page that is not open yet.
+    Call it before the page is opened.
     """
-    page.add_init_script(HOLDS % json.dumps(lengths))
+    page.add_init_script(HOLD_TIMERS % json.dumps(lengths))
 
 
-NOTES = """selector => {
+NOTE_TEXTS = """selector => {
     const found = document.querySelector(selector), texts = [found.textContent];
     (window.noted ??= {})[selector] = texts;
     new MutationObserver(() => texts.push(found.textContent)).observe(found, { childList: true, characterData: true, subtree: true });
@@ -177,12 +177,12 @@ NOTES = """selector => {
 
 
 def note_texts(page: Any, selector: str) -> None:
-    """From now on, note each text of this element for `noted`: some stand there for less than a second."""
-    page.evaluate(NOTES, selector)
+    """Note each text of this element from now on, for `wait_for_noted`: some are shown for less than a second."""
+    page.evaluate(NOTE_TEXTS, selector)
 
 
-def noted(page: Any, selector: str, text: str) -> None:
-    """This text has stood there since `note_texts`, or does so soon."""
+def wait_for_noted(page: Any, selector: str, text: str) -> None:
+    """Wait until the element has shown this text at any time since `note_texts`."""
     page.wait_for_function(
         "([selector, text]) => window.noted[selector].some((each) => each.includes(text))", arg=[selector, text]
     )
@@ -192,11 +192,11 @@ def noted(page: Any, selector: str, text: str) -> None:
 def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     """The example study, in a copy whose game can be ended with a button.
 
-    Its steps last three times as long: at its own speed the game is over after half a minute in which nobody presses a key.
+    It runs at a third of its speed: otherwise the game is over after half a minute in which nobody presses a key.
     """
     folder = tmp_path_factory.mktemp("example")
     copy_of(ROOT, folder / "project")
-    change(folder / "project", {"  startingFrameRate: 30\n": "  startingFrameRate: 10\n"})
+    replace_lines(folder / "project", {"  startingFrameRate: 30\n": "  startingFrameRate: 10\n"})
     held = HeldStudy(folder / "project", folder / "data")
     try:
         held.start()
@@ -210,8 +210,8 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
 Hold = Callable[..., StudyProcess]
 
 
-def change(project: Path, changes: Mapping[str, str]) -> None:
-    """Other lines of config.yml for these."""
+def replace_lines(project: Path, changes: Mapping[str, str]) -> None:
+    """Replace lines of the project's config.yml."""
     config = project / "config.yml"
     for line, instead in changes.items():
         assert config.read_text().count(line) == 1, line
@@ -222,7 +222,7 @@ def change(project: Path, changes: Mapping[str, str]) -> None:
 def hold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hold]:
     """An example, held once for all tests of the file, in a copy whose game can be ended with a button.
 
-    `hold("gridworld")`. `changes` are lines of config.yml with what stands there instead.
+    Call it as `hold("gridworld")`. `changes` has lines of config.yml and their replacements.
     """
     studies: dict[tuple[str, ...], HeldStudy] = {}
 
@@ -231,7 +231,7 @@ def hold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hold]:
         if key not in studies:
             folder = tmp_path_factory.mktemp(name)
             copy_of(ROOT / "examples" / name, folder / "project")
-            change(folder / "project", changes or {})
+            replace_lines(folder / "project", changes or {})
             studies[key] = HeldStudy(folder / "project", folder / "data")
             studies[key].start()
         return studies[key]
@@ -248,7 +248,7 @@ class Visitor:
         self, browser: Any, study: StudyProcess, name: str, width: int, pictures: bool, **options: Any
     ) -> None:
         self.name, self.width, self.study, self.pictures = name, width, study, pictures
-        self.invited = ""  # in which of the two wordings
+        self.invited = ""  # the heading of the consent page, which has two wordings
         narrow = width < 600
         self.context = browser.new_context(
             viewport={"width": width, "height": 740 if narrow else 800},
@@ -259,11 +259,11 @@ class Visitor:
         )
         self.context.set_default_timeout(PATIENCE)
         self.context.on("request", self._asks)
-        self.went: set[str] = set()
-        self.kinds: set[str] = set()
+        self.hosts: set[str] = set()
+        self.resource_types: set[str] = set()
         self.complaints: list[str] = []
         self.sockets: list[str] = []
-        self.weights: dict[str, int] = {}
+        self.sizes: dict[str, int] = {}
         self.link = with_user(study.link, name)
         self.page = self.tab()
 
@@ -279,11 +279,11 @@ class Visitor:
     def _asks(self, request: Any) -> None:
         self._goes_to(request.url)
         if not request.url.startswith("data:"):
-            self.kinds.add(request.resource_type)
+            self.resource_types.add(request.resource_type)
 
     def _goes_to(self, url: str) -> None:
         if not url.startswith(("data:", "blob:")):
-            self.went.add(str(urlsplit(url).hostname))
+            self.hosts.add(str(urlsplit(url).hostname))
 
     def _connects(self, socket: Any) -> None:
         self._goes_to(socket.url)
@@ -295,21 +295,21 @@ class Visitor:
         assert answer is not None
         assert answer.status == 200
 
-    def weigh(self, what: str) -> None:
-        """How large this page is on its way. It loads nothing else: see `complete`."""
-        self.weights[what] = len(gzip.compress(self.context.request.get(self.page.url).body(), 6))
+    def record_size(self, what: str) -> None:
+        """Record the page's compressed size, which is all that it loads (`check_all` proves that)."""
+        self.sizes[what] = len(gzip.compress(self.context.request.get(self.page.url).body(), 6))
 
     @property
     def step(self) -> str:
         return str(self.page.locator("body").get_attribute("data-step"))
 
     def send(self, following: str) -> None:
-        """Press the button, and see the step that follows."""
+        """Press the button, and wait for the next step."""
         self.page.locator("form.page button:not([type=button])").last.click()
         self.page.wait_for_selector(f"body[data-step='{following}']")
 
     def shot(self, what: str) -> None:
-        """A picture of the page, for people to look at."""
+        """Save a screenshot of the page, for people to look at."""
         if not self.pictures:
             return
         SHOTS.mkdir(exist_ok=True)
@@ -326,17 +326,17 @@ class Visitor:
         lines = [line for path in sorted(folder.glob("*/*.gz")) for line in read(path.read_bytes())]
         return [line for line in lines if line["kind"] == "step"]
 
-    def complete(self) -> None:
-        """Nothing happened that no participant should meet."""
-        assert self.went <= {"127.0.0.1"}
-        assert self.kinds <= {"document", "fetch"}  # fetch: the game page asks how far the server is
+    def check_all(self) -> None:
+        """Check that the page asked nobody else, loaded nothing unexpected, complained of nothing, and was small."""
+        assert self.hosts <= {"127.0.0.1"}
+        assert self.resource_types <= {"document", "fetch"}  # fetch: the game page asks for the server's state
         assert self.complaints == []
-        assert all(weight < 40_000 for weight in self.weights.values()), self.weights
+        assert all(size < 40_000 for size in self.sizes.values()), self.sizes
 
 
 @pytest.fixture
 def visit(chromium: Any, study: StudyProcess) -> Iterator[Any]:
-    """A participant: `visit("ada", 1280)`."""
+    """Makes participants, each in a browser of their own: `visit("ada", 1280)`."""
     visitors: list[Visitor] = []
 
     def come(name: str, width: int = 1280, *, pictures: bool = False, **options: Any) -> Visitor:

@@ -1,4 +1,4 @@
-"""What the bench measures in a browser is there; how much it is, is not judged here."""
+"""The bench's measurements in a browser yield values of the right kind; their size is not judged here."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from bench import pictures, scenes, seen
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 
-def test_all_kinds_of_picture_are_looked_at() -> None:
+def test_the_bench_has_agents_for_every_kind_of_picture() -> None:
     assert list(seen.AGENTS) == list(seen.LEFT) == list(pictures.KINDS)
 
 
 @pytest.mark.parametrize("picture", ["CartPole, 600 x 400", "scrolling texture, 600 x 400"])
 @pytest.mark.parametrize(
     ("setting", "seconds"),
-    [(seen.ours, 1.0), (seen.bare, 4.0)],  # the yardstick makes up for pictures that it was late with
+    [(seen.ours, 1.0), (seen.bare, 4.0)],  # longer, because `bare` first makes up for pictures that it was late with
     ids=["ours", "bare"],
 )
 def test_drawn_frames_and_effects_of_keys_are_timed(

@@ -1,4 +1,4 @@
-"""What Chromium does for itself in tests: no more than they need."""
+"""The options with which tests start Chromium: it opens no pages and processes of its own."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_new_window_has_one_page_and_one_process(chromium: Any, devtools: Any)
     context.close()
 
 
-def test_what_playwright_switches_off_stays_off(chromium: Any, devtools: Any) -> None:
+def test_the_disabled_features_include_those_of_playwright(chromium: Any, devtools: Any) -> None:
     (browser,) = _processes(devtools, "browser")
     lists = [each for each in psutil.Process(browser).cmdline() if each.startswith("--disable-features=")]
     theirs, ours = (each.partition("=")[2].split(",") for each in lists)

@@ -74,7 +74,7 @@ def test_a_participant_plays(
     for key, button, milliseconds in presses:
         press(page, key, button, narrow=narrow, milliseconds=milliseconds)
         before = len(pictures)
-        while len(pictures) < before + 3:  # the steps of this press are over, before the next may take its place
+        while len(pictures) < before + 3:  # the steps of this press are over before the next press
             page.wait_for_timeout(20)
     shown = Image.open(io.BytesIO(page.locator("canvas").last.screenshot()))
     assert len(shown.getcolors(maxcolors=10_000_000)) > 20, "pictures are drawn"

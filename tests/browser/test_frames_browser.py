@@ -1,4 +1,4 @@
-"""Frames in a real Chromium: what arrives is drawn, in order, and a picture at rest is exact."""
+"""Frames in a real Chromium: the page draws them in order, and a picture that stands still exactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from PIL import Image
 
 from testing.browser import game_page
 from tests.browser.conftest import PATIENCE
-from tests.browser.test_pages_browser import World, play, reconnected, world
+from tests.browser.test_pages_browser import World, play, wait_for_reconnection, world
 from tests.trial.conftest import launch
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
@@ -47,7 +47,7 @@ HEIGHT, WIDTH = 200, 320
 PIXELS = "[...document.getElementById('screen').getContext('2d').getImageData(0, 0, {width}, {height}).data]"
 
 
-def expected(t: int) -> Frame:
+def picture_at(t: int) -> Frame:
     namespace: dict[str, Any] = {}
     exec(AGENT, namespace)
     agent = namespace["Agent"]()
@@ -57,26 +57,26 @@ def expected(t: int) -> Frame:
     return picture
 
 
-def shown(tab: Any, width: int, height: int) -> Frame:
+def pixels(tab: Any, width: int, height: int) -> Frame:
     data = tab.evaluate(PIXELS.format(width=width, height=height))
     return np.array(data, np.uint8).reshape(height, width, 4)[:, :, :3]
 
 
-def time_of(picture: Frame) -> int:
+def step_of(picture: Frame) -> int:
     """The number of the step that the agent has written into the picture."""
     return 256 * int(picture[0, 0, 0]) + int(picture[1, 0, 0])
 
 
-def until(tab: Any, true: Callable[[], bool]) -> None:
+def wait_until(tab: Any, condition: Callable[[], bool]) -> None:
     end = time.monotonic() + PATIENCE / 1000
-    while not true():
+    while not condition():
         assert time.monotonic() < end
         tab.wait_for_timeout(20)
 
 
 @pytest.fixture
-def sent(tab: Any) -> list[int]:
-    """The kinds of frames that the page has been sent."""
+def frame_kinds(tab: Any) -> list[int]:
+    """The kinds of the frames that the page has received, in order."""
     kinds: list[int] = []
 
     def hear(data: Any) -> None:
@@ -88,33 +88,33 @@ def sent(tab: Any) -> list[int]:
 
 
 @pytest.fixture
-def textured(launch: Any) -> Iterator[str]:
-    """The address of the game page of a game whose texture scrolls."""
+def texture_page(launch: Any) -> Iterator[str]:
+    """The address of the page of a game that draws a scrolling texture."""
     server = launch(agent=AGENT, trial={"actionSpace": ["noop", "left"]})
     with game_page(server.address, user="P1", token="the-secret-token", step="3") as address:
         yield address
 
 
-def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, sent: list[int], textured: str) -> None:
-    tab.goto(textured)
+def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, frame_kinds: list[int], texture_page: str) -> None:
+    tab.goto(texture_page)
     tab.click("#overlay-button")
-    until(tab, lambda: sent.count(JPEG) >= 30)
-    assert not {KEY, DIFFERENCE} & set(sent[5:])
+    wait_until(tab, lambda: frame_kinds.count(JPEG) >= 30)
+    assert not {KEY, DIFFERENCE} & set(frame_kinds[5:])
     tab.keyboard.press("p")
     tab.wait_for_selector("#mode[data-state=paused]", state="attached")
-    until(tab, lambda: ROWS in sent)
-    until(tab, lambda: np.array_equal(picture := shown(tab, WIDTH, HEIGHT), expected(time_of(picture))))
-    t = time_of(shown(tab, WIDTH, HEIGHT))
+    wait_until(tab, lambda: ROWS in frame_kinds)
+    wait_until(tab, lambda: np.array_equal(picture := pixels(tab, WIDTH, HEIGHT), picture_at(step_of(picture))))
+    t = step_of(pixels(tab, WIDTH, HEIGHT))
     assert t >= 20
-    before = sent.count(JPEG)
+    before = frame_kinds.count(JPEG)
     tab.click("#overlay-button")
-    until(tab, lambda: sent.count(JPEG) >= before + 10)
+    wait_until(tab, lambda: frame_kinds.count(JPEG) >= before + 10)
 
 
 @pytest.fixture
-def new_world(world: World) -> World:
-    """A trial server that speaks hippodrome.2."""
-    world.spoken = "hippodrome.2"
+def newer_world(world: World) -> World:
+    """The world with a trial server that speaks hippodrome.2."""
+    world.subprotocol = "hippodrome.2"
     return world
 
 
@@ -122,9 +122,9 @@ def texture(seed: int, channels: int = 3) -> Frame:
     return np.random.default_rng(seed).integers(0, 256, (40, 60, channels), np.uint8).repeat(2, 0)
 
 
-def test_mixed_kinds_are_drawn_in_order(new_world: World, tab: Any) -> None:
-    """What the encoder makes of a sequence is shown by the browser as it is meant, and every frame is acknowledged."""
-    play(new_world, tab)
+def test_frames_of_mixed_kinds_are_drawn_in_order(newer_world: World, tab: Any) -> None:
+    """The browser shows the encoder's frames as they were meant, and acknowledges each."""
+    play(newer_world, tab)
     encoder = Encoder(lossy=True)
     number = 2
     for picture in (texture(1), texture(1, 1), np.zeros((80, 60, 3), np.uint8), texture(2)):
@@ -133,19 +133,19 @@ def test_mixed_kinds_are_drawn_in_order(new_world: World, tab: Any) -> None:
             number += 1
             data = encoder.encode(np.roll(picture, shift, 1), number)
             encoder_kinds.append(data[0])
-            new_world.connections[0].send(data)
-        new_world.wait_for({"ack": number})
-        error = np.abs(shown(tab, 60, 80).astype(int) - np.roll(picture, 6, 1)).mean()
+            newer_world.connections[0].send(data)
+        newer_world.wait_for({"ack": number})
+        error = np.abs(pixels(tab, 60, 80).astype(int) - np.roll(picture, 6, 1)).mean()
         assert error < 60 if JPEG in encoder_kinds else error == 0
         while not encoder.exact:
-            new_world.connections[0].send(encoder.sharpen(number))
+            newer_world.connections[0].send(encoder.sharpen(number))
         exact = np.broadcast_to(np.roll(picture, 6, 1), (80, 60, 3))
-        until(tab, lambda exact=exact: np.array_equal(shown(tab, 60, 80), exact))
-    assert len(new_world.connections) == 1
+        wait_until(tab, lambda exact=exact: np.array_equal(pixels(tab, 60, 80), exact))
+    assert len(newer_world.connections) == 1
 
 
-def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: World, tab: Any) -> None:
-    """JPEGs that wait behind a slow one are left out when a later picture is ready; none comes after a newer one."""
+def test_a_burst_of_frames_is_acknowledged_and_the_newest_is_shown(newer_world: World, tab: Any) -> None:
+    """The page leaves out JPEGs that wait behind a slow one when a later one is ready, and never draws an older one later."""
     tab.add_init_script(
         """const plain = window.createImageBitmap;
         const first = new Promise((done) => { window.goOn = done; });
@@ -160,21 +160,21 @@ def test_a_burst_is_acknowledged_to_the_end_and_the_newest_is_shown(new_world: W
         const draw = CanvasRenderingContext2D.prototype.drawImage;
         CanvasRenderingContext2D.prototype.drawImage = function (...parts) { window.drawn += 1; draw.apply(this, parts); };"""
     )
-    play(new_world, tab)
+    play(newer_world, tab)
     flat = [np.full((16, 16, 3), value, np.uint8) for value in range(10, 90, 10)]
     for number, frame in enumerate(flat, 3):
-        new_world.connections[0].send(header(JPEG, frame, number) + jpeg(frame))
-    until(tab, lambda: tab.evaluate("window.decoded") == len(flat) - 1)
+        newer_world.connections[0].send(header(JPEG, frame, number) + jpeg(frame))
+    wait_until(tab, lambda: tab.evaluate("window.decoded") == len(flat) - 1)
     tab.evaluate("window.goOn()")
-    new_world.wait_for({"ack": 10})
-    assert np.abs(shown(tab, 16, 16).astype(int) - flat[-1]).max() <= 3
+    newer_world.wait_for({"ack": 10})
+    assert np.abs(pixels(tab, 16, 16).astype(int) - flat[-1]).max() <= 3
     assert 1 <= tab.evaluate("window.drawn") < len(flat)
-    acks = new_world.commands("ack")
+    acks = newer_world.commands("ack")
     assert acks == sorted(acks)
-    assert len(new_world.connections) == 1
+    assert len(newer_world.connections) == 1
 
 
-def test_every_second_frame_is_acknowledged_where_they_come_quickly(new_world: World, tab: Any) -> None:
+def test_every_second_frame_is_acknowledged_when_frames_come_quickly(newer_world: World, tab: Any) -> None:
     tab.add_init_script(
         """window.clock = 1000;
         performance.now = () => window.clock;
@@ -183,20 +183,20 @@ def test_every_second_frame_is_acknowledged_where_they_come_quickly(new_world: W
         window.drawn = 0;
         CanvasRenderingContext2D.prototype.putImageData = function (...parts) { window.drawn += 1; draw.apply(this, parts); };"""
     )
-    play(new_world, tab)  # the server sends frames 1 and 2
+    play(newer_world, tab)  # the server sends frames 1 and 2
     for number in range(3, 12):
-        until(tab, lambda number=number: tab.evaluate("window.drawn") == number - 1)
+        wait_until(tab, lambda number=number: tab.evaluate("window.drawn") == number - 1)
         tab.evaluate("window.clock += 20")
-        new_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
-    new_world.wait_for({"ack": 11})
-    assert new_world.commands("ack") == [1, 3, 5, 7, 9, 11]
+        newer_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
+    newer_world.wait_for({"ack": 11})
+    assert newer_world.commands("ack") == [1, 3, 5, 7, 9, 11]
 
 
-def test_a_frame_that_no_other_follows_is_acknowledged(new_world: World, tab: Any) -> None:
-    play(new_world, tab)
+def test_a_frame_that_no_other_follows_is_acknowledged(newer_world: World, tab: Any) -> None:
+    play(newer_world, tab)
     for number in range(3, 8):
-        new_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
-        new_world.wait_for({"ack": number})
+        newer_world.connections[0].send(header(KEY, SMALL, number) + PACKED)
+        newer_world.wait_for({"ack": number})
 
 
 def jpeg_of(width: int, height: int) -> bytes:
@@ -207,7 +207,7 @@ def jpeg_of(width: int, height: int) -> bytes:
 
 SMALL = np.zeros((2, 2, 3), np.uint8)
 PACKED = zlib.compress(SMALL.tobytes(), wbits=-15)
-BOMBS = {
+MALFORMED = {
     "another size": header(JPEG, SMALL, 3) + jpeg_of(3, 2),
     "a huge one in a small frame": header(JPEG, SMALL, 3) + jpeg_of(5000, 5000),
     "no JPEG": header(JPEG, SMALL, 3) + b"nonsense",
@@ -219,26 +219,26 @@ BOMBS = {
 }
 
 
-@pytest.mark.parametrize("bomb", BOMBS)
-def test_frames_that_are_none_are_refused(new_world: World, tab: Any, bomb: str) -> None:
-    play(new_world, tab)
-    new_world.connections[0].send(BOMBS[bomb])
-    reconnected(new_world, tab)
+@pytest.mark.parametrize("bomb", MALFORMED)
+def test_malformed_frames_are_refused(newer_world: World, tab: Any, bomb: str) -> None:
+    play(newer_world, tab)
+    newer_world.connections[0].send(MALFORMED[bomb])
+    wait_for_reconnection(newer_world, tab)
     assert tab.evaluate("document.getElementById('screen').width") == 2
 
 
-def test_a_small_message_cannot_fill_the_memory(new_world: World, tab: Any) -> None:
+def test_a_small_message_cannot_fill_the_memory(newer_world: World, tab: Any) -> None:
     packer = zlib.compressobj(wbits=-15)
     zeros = packer.compress(bytes(2**24)) + packer.flush(zlib.Z_FULL_FLUSH)
-    play(new_world, tab)
-    before = most_memory(tab)
-    new_world.connections[0].send(header(KEY, SMALL, 3) + 64 * zeros)  # 1 MB, unpacked 1 GB
-    reconnected(new_world, tab)
-    assert most_memory(tab) - before < 256
+    play(newer_world, tab)
+    before = peak_memory(tab)
+    newer_world.connections[0].send(header(KEY, SMALL, 3) + 64 * zeros)  # 1 MB, unpacked 1 GB
+    wait_for_reconnection(newer_world, tab)
+    assert peak_memory(tab) - before < 256
 
 
-def most_memory(tab: Any) -> float:
-    """The megabytes that the browser's pages ever had at a time."""
+def peak_memory(tab: Any) -> float:
+    """The most memory that a page of the browser has ever had, in megabytes."""
     asked = tab.context.browser.new_browser_cdp_session()
     processes = asked.send("SystemInfo.getProcessInfo")["processInfo"]
     asked.detach()
@@ -246,11 +246,11 @@ def most_memory(tab: Any) -> float:
     return max(int(status.split("VmHWM:")[1].split()[0]) for status in statuses) / 1024
 
 
-def test_a_browser_that_cannot_decode_gets_what_it_knows(launch: Any, tab: Any, sent: list[int]) -> None:
+def test_a_browser_that_cannot_decode_jpegs_gets_lossless_frames(launch: Any, tab: Any, frame_kinds: list[int]) -> None:
     server = launch(agent=AGENT, trial={"actionSpace": ["noop", "left"]})
     tab.add_init_script("delete window.createImageBitmap")
     with game_page(server.address, user="P1", token="the-secret-token", step="3") as address:
         tab.goto(address)
         tab.click("#overlay-button")
-        until(tab, lambda: len(sent) >= 10)
-    assert set(sent) == {KEY, DIFFERENCE}
+        wait_until(tab, lambda: len(frame_kinds) >= 10)
+    assert set(frame_kinds) == {KEY, DIFFERENCE}

@@ -1,4 +1,4 @@
-"""A study in German in two real browsers, one wide and one a phone: no word of ours is English, and everything fits."""
+"""A study in German in two real browsers, one wide and one a phone: no text of Hippodrome is English, and all fits."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ NOTE_WHAT_IS_SAID = """() => {
     window.said = [];
     new MutationObserver(() => window.said.push(trouble.textContent)).observe(trouble, { childList: true });
 }"""
-"""Messages of the server's, which the page may show for a moment only."""
+"""Notes the server's messages, because the page may show them only for a moment."""
 
 
 class Person:
@@ -76,23 +76,23 @@ class Person:
             self._sockets.append(socket)
             socket.connect_to_server()
 
-    def cut(self) -> None:
-        """Nothing reaches the game any more."""
+    def disconnect(self) -> None:
+        """Close the connection to the game, and refuse new ones until `reconnect`."""
         self._cut = True
         self._sockets[-1].close(code=4000)
 
-    def mend(self) -> None:
+    def reconnect(self) -> None:
         self._cut = False
 
-    def sees(self, selector: str, text: str) -> None:
+    def wait_for_text(self, selector: str, text: str) -> None:
         says = "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)"
         self.page.wait_for_function(says, arg=[selector, text])
 
-    def plays(self) -> None:
+    def wait_until_playing(self) -> None:
         self.page.wait_for_selector("#mode[data-state=playing]", state="attached")
 
-    def reads_german(self, name: str) -> None:
-        """No text of ours is English, here or hidden, and nothing is wider than the page."""
+    def check_german(self, name: str) -> None:
+        """Check that no text of Hippodrome is English, shown or hidden, and that nothing is wider than the page."""
         self.page.screenshot(path=SHOTS / f"{self.width}-german-{name}.png")
         texts = self.page.evaluate(READ)
         assert [text for text in texts if any(english.fullmatch(text) for english in PATTERNS)] == []
@@ -100,7 +100,7 @@ class Person:
         assert self.page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
         assert self.page.evaluate(FLAWS) == []
 
-    def goes_on(self) -> None:
+    def go_on(self) -> None:
         for box in self.page.get_by_role("checkbox").all():
             box.check()
         self.page.get_by_role("button", name="Weiter").click()
@@ -135,7 +135,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
 
 @pytest.fixture
 def come(chromium: Any, study: StudyProcess) -> Iterator[Callable[[str, int], Person]]:
-    """A participant at the first page: `come("ada", 1280)`."""
+    """Makes a participant at the first page: `come("ada", 1280)`."""
     people: list[Person] = []
     SHOTS.mkdir(exist_ok=True)
 
@@ -152,63 +152,67 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Callable[[str, int], Pe
 def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, int], Person]) -> None:
     phone, wide = come("bo", 360), come("ada", 1280)
     for person in (phone, wide):
-        person.reads_german("consent")
-        person.goes_on()
+        person.check_german("consent")
+        person.go_on()
         person.page.wait_for_selector("body[data-step='2']")
-        person.goes_on()
+        person.go_on()
         if person is phone:
-            phone.sees("#lobby-here", "1 von 2 ist da: Sie")
-            phone.sees("#lobby-then", "geht es für Sie ohne dieses Spiel mit dem nächsten Teil der Studie weiter")
-            phone.reads_german("lobby")
+            phone.wait_for_text("#lobby-here", "1 von 2 ist da: Sie")
+            phone.wait_for_text(
+                "#lobby-then", "geht es für Sie ohne dieses Spiel mit dem nächsten Teil der Studie weiter"
+            )
+            phone.check_german("lobby")
     for person in (wide, phone):
-        person.plays()
-        person.reads_german("game")
-    phone.cut()
-    phone.sees("#overlay-title", GERMAN["lost"])
-    phone.reads_german("lost")
-    wide.sees("#overlay-title", "Warten auf die andere Person")
-    wide.sees("#overlay-hint", "übernimmt ein Computerspieler den Platz")
-    wide.reads_german("waits")
-    wide.sees("#trouble", "Ein Computerspieler hat den Platz der anderen Person übernommen.")
-    wide.reads_german("replaced")
-    phone.mend()
-    wide.sees("#trouble", "Die andere Person ist wieder da.")
+        person.wait_until_playing()
+        person.check_german("game")
+    phone.disconnect()
+    phone.wait_for_text("#overlay-title", GERMAN["lost"])
+    phone.check_german("lost")
+    wide.wait_for_text("#overlay-title", "Warten auf die andere Person")
+    wide.wait_for_text("#overlay-hint", "übernimmt ein Computerspieler den Platz")
+    wide.check_german("waits")
+    wide.wait_for_text("#trouble", "Ein Computerspieler hat den Platz der anderen Person übernommen.")
+    wide.check_german("replaced")
+    phone.reconnect()
+    wide.wait_for_text("#trouble", "Die andere Person ist wieder da.")
     for person in (wide, phone):
-        person.sees("#overlay-title", "Spiel 1 von 2 ist vorbei")
-        person.reads_german("break")
+        person.wait_for_text("#overlay-title", "Spiel 1 von 2 ist vorbei")
+        person.check_german("break")
     for person in (wide, phone):
-        person.sees("#overlay-title", "Das Spiel ist vorbei")
-        person.sees("#overlay-score", "Ihre Punkte in 2 Spielen: ")
-        person.reads_german("over")
+        person.wait_for_text("#overlay-title", "Das Spiel ist vorbei")
+        person.wait_for_text("#overlay-score", "Ihre Punkte in 2 Spielen: ")
+        person.check_german("over")
         person.page.click("#overlay-button")
     for person in (wide, phone):
         person.page.wait_for_selector("body[data-step='4']")
-        person.reads_german("survey")
-        person.goes_on()
-        person.sees(".copy", "Kopieren")
-        person.reads_german("end")
+        person.check_german("survey")
+        person.go_on()
+        person.wait_for_text(".copy", "Kopieren")
+        person.check_german("end")
 
 
-def test_one_who_ends_the_game_is_asked_in_german_and_the_other_is_told_so(come: Callable[[str, int], Person]) -> None:
+def test_ending_the_game_is_confirmed_in_german_and_the_other_participant_is_told(
+    come: Callable[[str, int], Person],
+) -> None:
     phone, wide = come("ed", 360), come("fi", 1280)
     for person in (phone, wide):
         for step in ("2", "3"):
-            person.goes_on()
+            person.go_on()
             person.page.wait_for_selector(f"body[data-step='{step}']")
     for person in (phone, wide):
-        person.plays()
+        person.wait_until_playing()
     wide.page.evaluate(NOTE_WHAT_IS_SAID)
     asked: list[str] = []
     phone.page.on("dialog", lambda dialog: (asked.append(dialog.message), dialog.accept()))
     phone.page.get_by_role("button", name="Spiel für alle beenden").tap()
     wide.page.wait_for_function("text => window.said.includes(text)", arg=GERMAN["saidPartnerStopped"])
-    wide.sees("#overlay-title", GERMAN["hasEnded"])
-    wide.reads_german("stopped")
+    wide.wait_for_text("#overlay-title", GERMAN["hasEnded"])
+    wide.check_german("stopped")
     assert asked == [GERMAN["endConfirm"]]
 
 
-def test_one_with_a_broken_link_reads_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
+def test_the_page_of_a_broken_link_is_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
     phone = come("cy", 360)
     phone.page.goto(f"{study.link}&userId=a%20b")
-    phone.sees("h1", "Dieser Link ist nicht vollständig")
-    phone.reads_german("broken-link")
+    phone.wait_for_text("h1", "Dieser Link ist nicht vollständig")
+    phone.check_german("broken-link")

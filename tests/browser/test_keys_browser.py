@@ -1,4 +1,4 @@
-"""Keys, labels and texts of a project's own in a real Chromium."""
+"""A project's own keys, labels and game pages in a real Chromium."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import PATIENCE, hold_timers, note_texts, noted
+from tests.browser.conftest import PATIENCE, hold_timers, note_texts, wait_for_noted
 from tests.browser.test_pages_browser import FLAWS, LAST_PICTURE, World, play, shot, tell, world
 from tests.trial.conftest import Running, grid_agent
 
@@ -26,57 +26,57 @@ SIZES = pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
 
 
 @pytest.fixture
-def keyed(world: World) -> World:
+def world_with_keys(world: World) -> World:
     world.trial = {"keys": KEYS, "labels": LABELS}
     world.controls = {"keys": KEYS, "labels": LABELS, "actionSpace": SPACE}
     return world
 
 
-def pressed(world: World, key: str) -> None:
+def wait_for_press(world: World, key: str) -> None:
     world.wait_for({"key": key, "held": True})
     world.wait_for({"key": key, "held": False})
 
 
-def test_the_projects_keys_are_told_as_the_browser_calls_them(keyed: World, tab: Any) -> None:
-    play(keyed, tab)
+def test_the_page_sends_the_projects_keys_by_the_browsers_names(world_with_keys: World, tab: Any) -> None:
+    play(world_with_keys, tab)
     for key in ("ArrowLeft", "a", "Enter", "1"):
         tab.keyboard.press(key)
-        pressed(keyed, key)
+        wait_for_press(world_with_keys, key)
     tab.keyboard.press("Space")
-    pressed(keyed, " ")
-    assert keyed.commands("action") == []
+    wait_for_press(world_with_keys, " ")
+    assert world_with_keys.commands("action") == []
 
 
-def test_a_letter_is_let_go_even_if_shift_came_meanwhile(keyed: World, tab: Any) -> None:
-    play(keyed, tab)
+def test_a_letter_is_released_even_if_shift_was_pressed_meanwhile(world_with_keys: World, tab: Any) -> None:
+    play(world_with_keys, tab)
     tab.keyboard.down("a")
     tab.keyboard.down("Shift")
     tab.keyboard.up("a")
-    pressed(keyed, "a")
+    wait_for_press(world_with_keys, "a")
     tab.keyboard.press("Digit1")  # "!" with Shift
-    pressed(keyed, "1")
+    wait_for_press(world_with_keys, "1")
 
 
-def test_keys_that_are_not_the_projects_do_as_usual(keyed: World, tab: Any) -> None:
-    play(keyed, tab)
+def test_keys_outside_the_project_send_nothing_and_p_still_starts_and_pauses(world_with_keys: World, tab: Any) -> None:
+    play(world_with_keys, tab)
     tab.keyboard.press("p")
-    keyed.wait_for({"command": "start"})
+    world_with_keys.wait_for({"command": "start"})
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
     tab.keyboard.press("p")
-    keyed.wait_for({"command": "pause"})
+    world_with_keys.wait_for({"command": "pause"})
     tab.keyboard.press("d")
     tab.keyboard.press("ArrowRight")
     tab.keyboard.press("a")
-    pressed(keyed, "a")
-    assert not [each for each in keyed.heard if "action" in each or each.get("key") in ("d", "ArrowRight")]
+    wait_for_press(world_with_keys, "a")
+    assert not [each for each in world_with_keys.received if "action" in each or each.get("key") in ("d", "ArrowRight")]
 
 
 @SIZES
-def test_there_is_a_button_for_each_action_and_what_two_do_together_needs_none(
-    keyed: World, tab: Any, width: int, height: int
+def test_each_action_has_a_button_except_those_that_two_keys_make_together(
+    world_with_keys: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
-    play(keyed, tab)
+    play(world_with_keys, tab)
     names = "all => all.map(each => each.getAttribute('aria-label'))"
     assert tab.eval_on_selector_all("#controls .pad button", names) == ["Up", "Go left"]
     assert tab.eval_on_selector_all("#controls .others button", names) == ["Jump!", "Put", "One"]
@@ -84,16 +84,16 @@ def test_there_is_a_button_for_each_action_and_what_two_do_together_needs_none(
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     shot(tab, f"{width}-keys")
     tab.click("text=Jump!")
-    pressed(keyed, " ")
+    wait_for_press(world_with_keys, " ")
     tab.click("#controls .pad .left")
-    pressed(keyed, "ArrowLeft")
+    wait_for_press(world_with_keys, "ArrowLeft")
     if width > 1000:
         assert tab.inner_text("#legend") == (
             "←A Go left\n↑ up\nSpace Jump!\nEnter put\n1 one\nP start and pause\nR begin again"
         )
 
 
-def test_an_action_that_only_keys_together_make_has_a_button_if_these_have_none(world: World, tab: Any) -> None:
+def test_an_action_of_two_keys_has_a_button_if_neither_key_has_one(world: World, tab: Any) -> None:
     world.trial = {"keys": {"x+y": "jump"}}
     world.controls = {"keys": {"x+y": "jump"}, "actionSpace": ["noop", "jump"]}
     play(world, tab)
@@ -102,7 +102,7 @@ def test_an_action_that_only_keys_together_make_has_a_button_if_these_have_none(
     world.wait_for({"action": "jump", "held": False})
 
 
-def test_labels_alone_are_the_texts_of_the_usual_buttons(world: World, tab: Any) -> None:
+def test_labels_without_keys_are_the_texts_of_the_usual_buttons(world: World, tab: Any) -> None:
     world.controls = {"labels": {"fire": "Serve", "left": "To the left"}}
     play(world, tab)
     assert tab.inner_text("#controls [data-action=fire]") == "Serve"
@@ -119,7 +119,7 @@ PAUSE = "<h2>Have a rest</h2><p>Look out of the window.</p>"
 
 
 @pytest.fixture
-def told(world: World) -> World:
+def world_with_pages(world: World) -> World:
     world.trial = {"instructions": "rules", "betweenEpisodes": "pause"}
     world.texts = {"instructions": RULES, "betweenEpisodes": PAUSE}
     world.step = 2
@@ -128,11 +128,11 @@ def told(world: World) -> World:
 
 
 @SIZES
-def test_instructions_stand_before_the_game_which_does_not_begin_behind_them(
-    told: World, tab: Any, width: int, height: int
+def test_the_game_does_not_begin_while_the_instructions_are_shown(
+    world_with_pages: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
-    tab.goto(told.url)
+    tab.goto(world_with_pages.url)
     tab.wait_for_selector("text=Jump over the stones.")
     assert not tab.is_visible("#play")
     assert not tab.is_visible("text=Have a rest")
@@ -141,18 +141,20 @@ def test_instructions_stand_before_the_game_which_does_not_begin_behind_them(
     shot(tab, f"{width}-instructions")
     for key in ("Space", "ArrowLeft", "KeyP"):
         tab.keyboard.press(key)
-    told.wait_for({"ack": 2})
-    assert {"command": "start"} not in told.heard
+    world_with_pages.wait_for({"ack": 2})
+    assert {"command": "start"} not in world_with_pages.received
     assert not tab.is_visible("#play")
     tab.click("text=Go to the game")
     tab.wait_for_selector("#overlay-title:text('Ready?')")
     shot(tab, f"{width}-instructions-ready")
     tab.click("#overlay-button")
-    told.wait_for({"command": "start"})
+    world_with_pages.wait_for({"command": "start"})
 
 
-def test_instructions_that_were_read_are_there_in_a_pause_and_not_after_a_reload(told: World, tab: Any) -> None:
-    tab.goto(told.url)
+def test_instructions_can_be_read_again_in_a_pause_and_are_not_shown_after_a_reload(
+    world_with_pages: World, tab: Any
+) -> None:
+    tab.goto(world_with_pages.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
@@ -169,16 +171,16 @@ def test_instructions_that_were_read_are_there_in_a_pause_and_not_after_a_reload
 
 
 @SIZES
-def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_leads_on(
-    told: World, tab: Any, width: int, height: int
+def test_the_page_between_two_games_follows_the_last_picture_and_its_button_starts_the_next(
+    world_with_pages: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
     hold_timers(tab, BETWEEN)
-    tab.goto(told.url)
+    tab.goto(world_with_pages.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
-    told.wait_for({"command": "start"})
-    tell(told, state="break")
+    world_with_pages.wait_for({"command": "start"})
+    tell(world_with_pages, state="break")
     tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
     assert not tab.is_visible("text=Have a rest")
     assert tab.inner_text("#overlay-hint") == ""
@@ -189,32 +191,34 @@ def test_a_page_between_two_games_comes_after_the_last_picture_and_a_button_lead
     assert not tab.is_visible("text=Jump over the stones.")
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-between")
-    before = len(told.given())
+    before = len(world_with_pages.player_commands())
     tab.click("text=Next game")
     tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    assert told.given()[before:] == ["start"]
+    assert world_with_pages.player_commands()[before:] == ["start"]
     assert tab.is_visible("#play")
 
 
-def test_who_has_seen_the_last_picture_opens_the_page_between_at_once(told: World, tab: Any) -> None:
+def test_a_button_on_the_last_picture_opens_the_page_between_two_games(world_with_pages: World, tab: Any) -> None:
     hold_timers(tab, BETWEEN)
-    tab.goto(told.url)
+    tab.goto(world_with_pages.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
-    told.wait_for({"command": "start"})
-    before = len(told.given())
-    tell(told, state="break")
+    world_with_pages.wait_for({"command": "start"})
+    before = len(world_with_pages.player_commands())
+    tell(world_with_pages, state="break")
     tab.click("#overlay-button:text('Go on')")
     tab.wait_for_selector("text=Have a rest")
-    assert told.given()[before:] == []
+    assert world_with_pages.player_commands()[before:] == []
 
 
 # The first picture, and the time that is left
 
 
 @SIZES
-def test_the_first_picture_stands_still_with_a_countdown(world: World, standing: Any, width: int, height: int) -> None:
-    tab = standing
+def test_the_first_picture_stands_still_with_a_countdown(
+    world: World, stopped_clock_tab: Any, width: int, height: int
+) -> None:
+    tab = stopped_clock_tab
     tab.set_viewport_size({"width": width, "height": height})
     world.trial = {"resetFreeze": 3, "episodeSeconds": 90}
     play(world, tab)
@@ -246,11 +250,11 @@ def test_the_first_picture_stands_still_with_a_countdown(world: World, standing:
     assert tab.inner_text("#left") == "0:10"
 
 
-def test_the_words_of_the_projects_pages_are_not_taken_for_the_game_pages_own(told: World, tab: Any) -> None:
-    told.texts["instructions"] += "<p id='score'>1</p>"
-    tab.goto(told.url)
+def test_an_id_in_the_projects_page_does_not_shadow_that_of_the_game_page(world_with_pages: World, tab: Any) -> None:
+    world_with_pages.texts["instructions"] += "<p id='score'>1</p>"
+    tab.goto(world_with_pages.url)
     tab.click("text=Go to the game")
-    told.connections[0].send(json.dumps({"state": "playing", "episode": 1, "score": 5, "frameRate": 30}))
+    world_with_pages.connections[0].send(json.dumps({"state": "playing", "episode": 1, "score": 5, "frameRate": 30}))
     tab.wait_for_selector(".hud #score:text('5')")
     assert tab.text_content("#text-instructions #score") == "1"
 
@@ -264,11 +268,11 @@ WAITS = grid_agent(1000).replace(
             time.sleep(0.01)
 """,
 ).replace("import gymnasium\n", "import pathlib\nimport time\n\nimport gymnasium\n", 1)  # fmt: skip
-"""A game that waits at its fifth step until somebody has pressed a key, however long that takes."""
+"""A game that waits at its fifth step until the test has pressed a key, however long that takes."""
 
 
 @pytest.mark.parametrize(("width", "height", "touch"), [(360, 740, True), (1280, 800, False)])
-def test_a_game_with_all_of_it_on_a_real_server(
+def test_all_these_options_work_together_on_a_real_server(
     world: World, chromium: Any, tmp_path: Path, width: int, height: int, touch: bool
 ) -> None:
     """Instructions, a countdown, the project's own keys, a limit, a page between two games, the last picture."""
@@ -283,11 +287,11 @@ def test_a_game_with_all_of_it_on_a_real_server(
     context.set_default_timeout(PATIENCE)
     tab, wrong = context.new_page(), []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
-    tab.on("websocket", lambda socket: socket.on("framesent", lambda said: told.append(str(said))))
+    tab.on("websocket", lambda socket: socket.on("framesent", lambda said: messages.append(str(said))))
     hold_timers(tab, BETWEEN, LAST_PICTURE)
-    told: list[str] = []
-    pressed = tmp_path / "pressed"
-    server = Running(tmp_path, WAITS.replace("PRESSED", repr(str(pressed))), section, {})
+    messages: list[str] = []
+    pressed_file = tmp_path / "pressed"
+    server = Running(tmp_path, WAITS.replace("PRESSED", repr(str(pressed_file))), section, {})
     try:
         world.trial, world.texts, world.step = section, {"instructions": RULES, "betweenEpisodes": PAUSE}, 2
         ready = {"state": "ready", "url": server.address, "token": "the-secret-token", "userId": "P1"}
@@ -299,13 +303,13 @@ def test_a_game_with_all_of_it_on_a_real_server(
         assert tab.is_visible("#legend") is not touch
         note_texts(tab, "#overlay-title")
         tab.click("#overlay-button")
-        noted(tab, "#overlay-title", "Get ready")
+        wait_for_noted(tab, "#overlay-title", "Get ready")
         shot(tab, f"{width}-real-countdown")
         tab.wait_for_selector("#overlay", state="hidden")
-        with held(tab, "#controls .others button" if touch else "Enter", touch):
-            while not any("Enter" in each for each in told):
+        with hold(tab, "#controls .others button" if touch else "Enter", touch):
+            while not any("Enter" in each for each in messages):
                 tab.wait_for_timeout(20)
-            pressed.touch()
+            pressed_file.touch()
             tab.wait_for_selector("#overlay-title:text('Game 1 of 2 is over')")
         shot(tab, f"{width}-real-over")
         tab.click("#overlay-button")
@@ -331,8 +335,8 @@ def test_a_game_with_all_of_it_on_a_real_server(
 
 
 @contextlib.contextmanager
-def held(tab: Any, what: str, touch: bool) -> Iterator[None]:
-    """A key is down, or a finger on a button."""
+def hold(tab: Any, what: str, touch: bool) -> Iterator[None]:
+    """Hold a key, or a finger on a button."""
     if touch:
         box = tab.locator(what).bounding_box()
         finger = tab.context.new_cdp_session(tab)

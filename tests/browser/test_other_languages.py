@@ -1,4 +1,4 @@
-"""Pages in other languages: words that are longer than the English ones, and lines from right to left."""
+"""Pages in other languages: words that are longer than the English ones, and text that runs from right to left."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ IS_LEFT_OF = "([one, other]) => find(one).right <= find(other).left".replace(
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_a_long_word_on_the_button_that_starts_is_whole_and_moves_nothing(
+def test_a_long_word_on_the_start_button_stays_in_one_line_and_moves_nothing(
     world: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
@@ -41,7 +41,7 @@ def test_a_long_word_on_the_button_that_starts_is_whole_and_moves_nothing(
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
 
 
-def test_browsers_write_the_same_languages_from_right_to_left(tab: Any) -> None:
+def test_the_browser_and_hippodrome_agree_which_languages_run_from_right_to_left(tab: Any) -> None:
     names = ["".join(letters) for letters in product(string.ascii_lowercase, repeat=2)]
     names += ["ary", "heb", "prs", "skr", "fil", "ku-Arab", "pa-Arab", "ar-Latn", "he-IL", "ur-Latn-PK", "zh-Hant"]
     tab.goto("about:blank")
@@ -52,7 +52,7 @@ def test_browsers_write_the_same_languages_from_right_to_left(tab: Any) -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_from_right_to_left_the_stages_of_waiting_are_marked_at_the_right(
+def test_in_hebrew_the_stages_of_waiting_are_marked_at_the_right(
     world: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
@@ -70,7 +70,7 @@ def test_from_right_to_left_the_stages_of_waiting_are_marked_at_the_right(
 
 
 @pytest.mark.parametrize(("width", "height"), SIZES)
-def test_from_right_to_left_words_are_turned_and_the_game_is_not(
+def test_in_hebrew_the_words_run_from_right_to_left_and_the_game_is_not_mirrored(
     world: World, tab: Any, width: int, height: int
 ) -> None:
     tab.set_viewport_size({"width": width, "height": height})
@@ -90,14 +90,14 @@ def test_from_right_to_left_words_are_turned_and_the_game_is_not(
         assert tab.evaluate(IS_LEFT_OF, ["#screen", ".controls"])
     else:
         assert tab.evaluate(IS_LEFT_OF, ["#episode", "#total"])
-    assert tab.inner_text("#score") == "\u200e-3.5"  # a sign that keeps the minus before its number
+    assert tab.inner_text("#score") == "\u200e-3.5"  # U+200E keeps the minus before its number
     assert tab.inner_text("#total") == ENGLISH["total"].replace("{score}", "\u200e-1,234")
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-right-to-left")
 
 
-def test_the_sentence_about_empty_places_is_the_studys_own_with_its_colon(world: World, tab: Any) -> None:
+def test_the_lobby_shows_the_studys_own_sentence_about_empty_places(world: World, tab: Any) -> None:
     own = "{players} places, {here} prises\u00a0: un joueur automatique prend l'autre."
     world.more, world.step = {"texts": {"takesPlace": own}, "players": 3}, 2
     world.state = {**LOBBY, "players": 3, "here": 2, "then": "policies", "proposed": True}

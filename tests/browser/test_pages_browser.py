@@ -1,4 +1,4 @@
-"""The pages in a real Chromium: what their scripts do, and that they fit a telephone."""
+"""Step pages and the game page in a real Chromium: what their scripts do, and that they fit a phone."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.trial.conftest import Running, grid_agent
 STEPS = Path(__file__).resolve().parents[2] / "steps"
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 MODULES = re.compile(r'(<script type="module" nonce="[^"]*")>.*?(</script>)', re.DOTALL)
-NOWHERE = "ws://127.0.0.1:9/"  # where nobody listens
+NOWHERE = "ws://127.0.0.1:9/"  # no server listens there
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PROJECT = Project(
     id="demo",
@@ -53,35 +53,35 @@ PLAYING = {"state": "playing", "episode": 1, "score": 70, "frameRate": 30}
 
 @dataclass
 class World:
-    """A control plane that shows what it is told to, and a trial server that notes what it hears."""
+    """A fake control plane, which shows the pages that a test sets, and a fake trial server, which notes what it receives."""
 
     step: int = 0
     source: str = "<p>Hi</p>"
     state: dict[str, Any] = field(default_factory=lambda: {"state": "queued", "seconds": 0, "attempt": 1})
     posts: list[dict[str, str]] = field(default_factory=list)
-    heard: list[dict[str, Any]] = field(default_factory=list)
+    received: list[dict[str, Any]] = field(default_factory=list)
     connections: list[Any] = field(default_factory=list)
     slow: float = 0.0
     may_answer: threading.Event = field(default_factory=threading.Event)
     """Forms are answered once this is set."""
     joined: bool = True
-    """Whether the game page carries its script, or loads the modules of it."""
+    """Whether the game page carries its script, or loads its modules one by one."""
     trial: dict[str, Any] = field(default_factory=dict)
-    """The section of the study."""
+    """The section `trial` of the study."""
     more: dict[str, Any] = field(default_factory=dict)
     """Other fields of the project."""
     closed: bool = False
-    """The study is not live any more."""
-    polled: list[float] = field(default_factory=list)
-    """When the page has asked for the state."""
+    """Whether the study is closed."""
+    polls: list[float] = field(default_factory=list)
+    """The times (monotonic) at which the page has asked for the state."""
     texts: dict[str, str] = field(default_factory=dict)
     """The pages that the game page shows, by the key that names each."""
     controls: dict[str, Any] = field(default_factory=dict)
-    """What the trial server says of the controls besides the usual."""
-    spoken: str = "hippodrome.1"
+    """Fields of the trial server's first message that differ from the usual."""
+    subprotocol: str = "hippodrome.1"
     """The subprotocol of the trial server."""
-    stands: dict[str, Any] = field(default_factory=lambda: PLAYING)
-    """Where the trial stands: what its server answers to a page that has heard nothing for some time."""
+    trial_state: dict[str, Any] = field(default_factory=lambda: PLAYING)
+    """What the trial server answers to `requestUI`."""
     started: dict[str, Any] = field(default_factory=lambda: PLAYING)
     """What the trial server answers to `start`."""
     before_pictures: Callable[[], object] = lambda: None
@@ -103,23 +103,23 @@ class World:
         self.state = {**self.state, "state": "ready", "url": self.game_url, "token": "TOKEN", "userId": "P1"}
 
     def commands(self, name: str) -> list[Any]:
-        return [each[name] for each in list(self.heard) if name in each]
+        return [each[name] for each in list(self.received) if name in each]
 
-    def given(self) -> list[str]:
-        """The commands that the participant has given: a page that hears nothing for some time asks `requestUI`."""
+    def player_commands(self) -> list[str]:
+        """The participant's commands, without `requestUI`: a page sends that by itself when it receives nothing for some time."""
         return [command for command in self.commands("command") if command != "requestUI"]
 
     def wait_for(self, message: dict[str, Any]) -> None:
         until = time.monotonic() + PATIENCE / 1000
-        while message not in self.heard:
-            assert time.monotonic() < until, self.heard
+        while message not in self.received:
+            assert time.monotonic() < until, self.received
             time.sleep(0.02)
 
     # the trial server
 
     def play(self, connection: Any) -> None:
         self.connections.append(connection)
-        assert connection.subprotocol == self.spoken
+        assert connection.subprotocol == self.subprotocol
         controls = {
             "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
             "actionSpace": ["noop", "fire", "left", "right", "upleft"],
@@ -128,16 +128,16 @@ class World:
         }  # fmt: skip
         for text in connection:
             message = json.loads(text)
-            self.heard.append(message)
+            self.received.append(message)
             if "token" in message:
                 connection.send(json.dumps(controls))
                 self.before_pictures()
                 connection.send(pack(1, RED * 4))
                 connection.send(pack(2, BLUE * 4, RED * 4))
             elif message.get("command") == "requestUI":
-                connection.send(json.dumps(self.stands))
+                connection.send(json.dumps(self.trial_state))
             elif message.get("command") == "start":
-                self.stands = self.started
+                self.trial_state = self.started
                 connection.send(json.dumps(self.started))
             elif message.get("command") == "pause":
                 connection.send(json.dumps({"state": "paused", "episode": 1, "score": 70, "frameRate": 30}))
@@ -162,7 +162,7 @@ def world() -> Iterator[World]:
 
         def do_GET(self) -> None:
             if "poll" in self.path:
-                here.polled.append(time.monotonic())
+                here.polls.append(time.monotonic())
                 time.sleep(here.slow)
                 self.reply(400 if here.closed else 200, "application/json", json.dumps(here.state), {})
             elif here.closed:
@@ -189,7 +189,7 @@ def world() -> Iterator[World]:
         lambda connection: here.play(connection),  # noqa: PLW0108 - a test may put another `play` there
         "127.0.0.1",
         0,
-        select_subprotocol=lambda _, offered: here.spoken if here.spoken in offered else None,
+        select_subprotocol=lambda _, offered: here.subprotocol if here.subprotocol in offered else None,
     )
     here.url = f"http://127.0.0.1:{web.server_port}/"
     here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"
@@ -225,7 +225,7 @@ def test_the_example_fits_a_telephone(world: World, tab: Any, path: Path) -> Non
     assert small == []
 
 
-def test_answers_survive_a_reload_and_go_when_they_are_sent(world: World, tab: Any) -> None:
+def test_answers_survive_a_reload_and_are_deleted_when_they_are_sent(world: World, tab: Any) -> None:
     world.source = """<input name=a id=a><input type=checkbox name=b value=1><input type=checkbox name=b value=2 id=b2>
         <input type=radio name=r value=x><input type=radio name=r value=y id=y><select name=s id=s><option>one<option>two</select>
         <textarea name=t id=t></textarea><input type=password name=p id=p>"""
@@ -272,7 +272,7 @@ def test_a_second_click_sends_nothing(world: World, tab: Any) -> None:
     assert len(world.posts) == 1
 
 
-def test_a_form_that_is_too_large_stays(world: World, tab: Any) -> None:
+def test_a_form_that_is_too_large_is_not_sent(world: World, tab: Any) -> None:
     world.source = "<textarea name=t id=t></textarea>"
     tab.goto(world.url)
     tab.fill("#t", "x" * 300_000)
@@ -282,7 +282,7 @@ def test_a_form_that_is_too_large_stays(world: World, tab: Any) -> None:
     assert world.posts == []
 
 
-def test_how_much_too_long_is_said_in_characters(world: World, tab: Any) -> None:
+def test_the_page_says_by_how_many_characters_an_answer_is_too_long(world: World, tab: Any) -> None:
     world.source = "<label>Story <textarea name=t id=t></textarea></label><input name=other value=short>"
     tab.goto(world.url)
     tab.evaluate("document.getElementById('t').value = '\\u{1F600}'.repeat(80_000)")  # 320 KB, and encoded 960 KB
@@ -303,7 +303,7 @@ def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
     assert tab.evaluate("document.activeElement.name") == "r"
 
 
-def test_offline_the_first_click_only_warns(world: World, lone_tab: Any) -> None:
+def test_without_a_connection_the_first_click_only_warns(world: World, lone_tab: Any) -> None:
     lone_tab.goto(world.url)
     lone_tab.context.set_offline(True)
     lone_tab.click("text=Continue")
@@ -397,7 +397,7 @@ def play(world: World, tab: Any) -> None:
     tab.wait_for_selector("#overlay-button:visible")
 
 
-def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> None:
+def test_the_page_goes_from_waiting_to_the_game_without_a_reload(world: World, tab: Any) -> None:
     world.step = 2
     tab.goto(world.url)
     tab.evaluate("window.same = true")
@@ -409,11 +409,11 @@ def test_from_waiting_to_playing_without_a_reload(world: World, tab: Any) -> Non
     tab.wait_for_selector("#overlay-button:visible")
     assert tab.evaluate("window.same") is True
     assert tab.title().startswith("Ready")
-    assert world.heard[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
+    assert world.received[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
 
 
-def test_the_button_to_start_shows_once_the_first_picture_has_put_it_in_its_place(world: World, tab: Any) -> None:
-    """A tap on a button that moves meanwhile would be lost."""
+def test_the_start_button_appears_with_the_first_picture(world: World, tab: Any) -> None:
+    """A button that appeared earlier would move with the first picture, and a tap on it would be lost."""
     pictures = threading.Event()
     world.before_pictures = lambda: pictures.wait(PATIENCE / 1000)
     tab.add_init_script("addEventListener('animationstart', (event) => event.target.getAnimations()[0].pause())")
@@ -427,7 +427,7 @@ def test_the_button_to_start_shows_once_the_first_picture_has_put_it_in_its_plac
     assert tab.evaluate("document.getElementById('screen').width") == 2
 
 
-def test_the_button_to_start_shows_also_if_no_picture_comes(world: World, tab: Any) -> None:
+def test_the_start_button_appears_even_if_no_picture_comes(world: World, tab: Any) -> None:
     pictures = threading.Event()
     world.before_pictures = lambda: pictures.wait(PATIENCE / 1000)
     world.step = 2
@@ -470,12 +470,12 @@ def test_frames_are_drawn_in_order_and_acknowledged(world: World, tab: Any) -> N
     assert tab.evaluate("document.getElementById('screen').width") == 2
 
 
-def test_keys_are_held_and_let_go(world: World, tab: Any) -> None:
+def test_keys_are_sent_as_held_and_released(world: World, tab: Any) -> None:
     play(world, tab)
     tab.keyboard.down("ArrowLeft")
-    tab.keyboard.down("ArrowLeft")  # what a keyboard does while a key is held
+    tab.keyboard.down("ArrowLeft")  # a keyboard repeats a key that is held
     world.wait_for({"action": "left", "held": True})
-    tab.keyboard.down("KeyA")  # the same action by another key
+    tab.keyboard.down("KeyA")  # another key with the same action
     tab.keyboard.up("ArrowLeft")
     tab.keyboard.up("KeyA")
     world.wait_for({"action": "left", "held": False})
@@ -486,13 +486,13 @@ def test_keys_are_held_and_let_go(world: World, tab: Any) -> None:
     world.wait_for({"command": "pause"})
     tab.keyboard.press("KeyR")
     world.wait_for({"command": "reset"})
-    said = [each for each in world.heard if each.get("action") == "left"]
+    said = [each for each in world.received if each.get("action") == "left"]
     assert said == [{"action": "left", "held": True}, {"action": "left", "held": False}]
-    assert world.given()[0] == "start"  # the first key starts the game
+    assert world.player_commands()[0] == "start"  # the first key starts the game
     assert tab.evaluate("scrollY") == 0
 
 
-def test_the_legend_lists_what_is_offered(world: World, tab: Any) -> None:
+def test_the_legend_lists_the_controls_of_the_project(world: World, tab: Any) -> None:
     play(world, tab)
     legend = tab.eval_on_selector_all("#legend > span", "all => all.map((each) => each.textContent)")
     assert legend == ["←↑→ move", "Space fire", "P start and pause", "R begin again"]
@@ -503,7 +503,7 @@ def test_the_legend_lists_what_is_offered(world: World, tab: Any) -> None:
     assert legend == ["← move", "Space start"]
 
 
-def test_leaving_the_window_lets_go_of_all_keys(world: World, tab: Any) -> None:
+def test_leaving_the_window_releases_the_key(world: World, tab: Any) -> None:
     play(world, tab)
     tab.keyboard.down("ArrowRight")
     world.wait_for({"action": "right", "held": True})
@@ -511,7 +511,7 @@ def test_leaving_the_window_lets_go_of_all_keys(world: World, tab: Any) -> None:
     world.wait_for({"action": "right", "held": False})
 
 
-def test_buttons_are_there_for_what_the_project_offers(world: World, tab: Any) -> None:
+def test_each_control_of_the_project_has_a_button(world: World, tab: Any) -> None:
     play(world, tab)
     names = tab.eval_on_selector_all(
         "#controls button", "all => all.map(each => each.getAttribute('aria-label') ?? each.textContent)"
@@ -545,14 +545,14 @@ def test_the_game_fits_the_window_and_nothing_moves(world: World, tab: Any, widt
 @pytest.mark.parametrize(
     ("width", "height"), [(360, 640), (360, 740), (390, 844), (320, 568), (740, 360), (667, 375), (768, 1024)]
 )
-def test_the_game_fits_what_is_held_in_the_hand(world: World, chromium: Any, width: int, height: int) -> None:
+def test_the_game_fits_phones_and_tablets(world: World, chromium: Any, width: int, height: int) -> None:
     context = chromium.new_context(
         viewport={"width": width, "height": height}, has_touch=True, is_mobile=True, reduced_motion="reduce"
     )
     page = context.new_page()
     play(world, page)
     check_places(page, width, height)
-    assert page.is_hidden("#legend")  # there are no keys
+    assert page.is_hidden("#legend")  # these devices have no keyboard
     before = page.evaluate(PLACES)
     page.locator("#overlay-button").tap()
     page.wait_for_selector("#mode[data-state=playing]:text('Playing')")
@@ -578,7 +578,7 @@ def check_places(page: Any, width: int, height: int) -> None:
         assert bottom <= height
     picture = page.locator("#screen").bounding_box()
     assert min(picture["width"], picture["height"]) >= 200
-    assert abs(picture["width"] - picture["height"]) < 2  # as this game's frames are
+    assert abs(picture["width"] - picture["height"]) < 2  # this game's frames are square
 
 
 def test_a_thumb_slides_from_one_button_to_the_next(world: World, tab: Any) -> None:
@@ -604,7 +604,7 @@ def test_a_lost_connection_is_made_again_where_the_server_is_now(world: World, t
     tab.wait_for_selector("#overlay-button:visible")
 
 
-def test_a_game_taken_over_elsewhere_comes_back_only_when_asked(world: World, tab: Any) -> None:
+def test_a_game_opened_elsewhere_comes_back_only_after_a_click(world: World, tab: Any) -> None:
     play(world, tab)
     world.connections[0].close(4409, "opened elsewhere")
     tab.wait_for_selector("text=Play here instead")
@@ -627,7 +627,9 @@ def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None
 def tell(world: World, **said: Any) -> None:
     said = {"frameRate": 30, "episode": 1, "score": 70, "episodeScore": 30, **said}
     if "state" in said:
-        world.stands = {name: value for name, value in said.items() if name not in ("nextIn", "startsIn", "timeLeft")}
+        world.trial_state = {
+            name: value for name, value in said.items() if name not in ("nextIn", "startsIn", "timeLeft")
+        }
     world.connections[0].send(json.dumps(said))
 
 
@@ -640,8 +642,8 @@ def test_the_header_has_the_score_of_this_game_and_the_total(world: World, tab: 
     assert tab.evaluate("document.documentElement.scrollWidth") <= 360
 
 
-def test_a_break_shows_the_score_and_counts_down(world: World, standing: Any) -> None:
-    tab = standing
+def test_a_break_shows_the_score_and_counts_down(world: World, stopped_clock_tab: Any) -> None:
+    tab = stopped_clock_tab
     play(world, tab)
     tab.keyboard.down("ArrowLeft")
     world.wait_for({"action": "left", "held": True})
@@ -650,11 +652,11 @@ def test_a_break_shows_the_score_and_counts_down(world: World, standing: Any) ->
     assert tab.inner_text("#overlay-title") == "Game 1 of 2 is over"
     assert tab.inner_text("#overlay-score") == "Your score: 30"
     world.wait_for({"action": "left", "held": False})
-    before = world.given()
+    before = world.player_commands()
     tab.keyboard.press("ArrowRight")
     tab.keyboard.press("Space")  # fires here
     world.wait_for({"action": "fire", "held": False})
-    assert world.given() == before, "no key of the game ends the break"
+    assert world.player_commands() == before, "no key of the game ends the break"
     tab.clock.run_for(2_000)
     assert tab.inner_text("#overlay-hint") == "The next game begins in 1 second."
     tab.click("text=Go on now")
@@ -663,7 +665,7 @@ def test_a_break_shows_the_score_and_counts_down(world: World, standing: Any) ->
     assert tab.inner_text("#overlay-score") == ""
 
 
-def test_a_control_of_the_projects_own_is_a_button_that_says_its_word(world: World, tab: Any) -> None:
+def test_a_control_of_the_projects_own_is_a_button_that_sends_its_command(world: World, tab: Any) -> None:
     play(world, tab)
     said = {"UI": ["trainOnline", "reallyGood"], "words": ["reallyGood"], "actionSpace": ["noop"], "state": "ready"}
     world.connections[0].send(json.dumps(said))
@@ -676,18 +678,18 @@ def test_a_control_of_the_projects_own_is_a_button_that_says_its_word(world: Wor
     world.wait_for({"command": "reallyGood"})
 
 
-def page_that_follows(tab: Any, *, within: int) -> None:
-    """It comes before so many milliseconds have passed on the clock that stands."""
+def wait_for_next_page(tab: Any, *, within: int) -> None:
+    """Let time pass on the stopped clock, at most `within` ms, until the next page is shown."""
     for _ in range(0, within, 10):
         if tab.is_visible("text=Next page"):
             return
         tab.clock.run_for(10)
-        tab.wait_for_timeout(100)  # for the site to answer
+        tab.wait_for_timeout(100)  # until the site has answered
     raise AssertionError
 
 
-def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: World, standing: Any) -> None:
-    tab = standing
+def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: World, stopped_clock_tab: Any) -> None:
+    tab = stopped_clock_tab
     play(world, tab)
     world.step = 3
     world.source = "<h1>Next page</h1>"
@@ -698,11 +700,11 @@ def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: W
     assert tab.is_visible("#screen")
     assert tab.is_visible("#overlay-score")
     tab.clock.run_for(100)
-    page_that_follows(tab, within=4_000)
+    wait_for_next_page(tab, within=4_000)
 
 
-def test_who_has_seen_the_last_picture_goes_on_at_once(world: World, standing: Any) -> None:
-    tab = standing
+def test_a_participant_can_go_on_from_the_last_picture_at_once(world: World, stopped_clock_tab: Any) -> None:
+    tab = stopped_clock_tab
     play(world, tab)
     world.step = 3
     world.source = "<h1>Next page</h1>"
@@ -710,8 +712,8 @@ def test_who_has_seen_the_last_picture_goes_on_at_once(world: World, standing: A
     tab.wait_for_selector("#overlay-button:text('Go on')")
     assert tab.evaluate("document.activeElement.id") == "overlay-button"
     tab.keyboard.press("Enter")
-    page_that_follows(tab, within=3_900)
-    assert {"command": "start"} not in world.heard
+    wait_for_next_page(tab, within=3_900)
+    assert {"command": "start"} not in world.received
 
 
 def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, tab: Any) -> None:
@@ -726,7 +728,7 @@ def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, t
     tab.wait_for_function(f"() => {pixel} === '255,0,0,255'")
 
 
-def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None:
+def test_without_ui_pause_the_page_offers_no_pause(world: World, tab: Any) -> None:
     play(world, tab)
     for score, ui in enumerate((["left", "start"], ["left"]), 1):
         said = {"UI": ui, "actionSpace": ["noop", "left"], "state": "ready", "episode": 1}
@@ -736,14 +738,14 @@ def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None
         tab.wait_for_function(f"() => document.getElementById('score').textContent === '{score}'")
         assert tab.inner_text("#legend") == "← move\nSpace start"
         assert tab.locator("[data-command=toggle]:visible").count() == 0
-        before = world.given()
+        before = world.player_commands()
         tab.keyboard.press("KeyP")
         tab.keyboard.press("Space")
         tab.keyboard.press("ArrowLeft")
         world.wait_for({"action": "left", "held": False})
-        assert world.given() == before
-        world.heard.clear()
-        tell(world, state="paused")  # as when the page was away
+        assert world.player_commands() == before
+        world.received.clear()
+        tell(world, state="paused")  # as after an absence of the page
         tab.wait_for_selector("#overlay-button:visible")
         tab.keyboard.press("Space")
         world.wait_for({"command": "start"})
@@ -751,7 +753,7 @@ def test_without_ui_pause_nothing_offers_a_pause(world: World, tab: Any) -> None
 
 @pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
 def test_two_games_on_a_real_server(world: World, tab: Any, tmp_path: Path, width: int, height: int) -> None:
-    """From one game through the break into the next and to the end, with pictures for people to look at."""
+    """The page shows the first game, the break, the second game and the end. It saves screenshots for people to look at."""
     tab.set_viewport_size({"width": width, "height": height})
     ui = dict.fromkeys(("left", "right", "up", "down", "start", "pause"), True)
     server = Running(tmp_path, grid_agent(40), {"maxEpisodes": 2, "betweenEpisodes": 600, "ui": ui}, {})
@@ -785,9 +787,7 @@ def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
 
 
 @pytest.mark.parametrize("width", [360, 1200])
-def test_a_server_lost_in_mid_game_is_told_and_the_game_comes_back_by_itself(
-    world: World, tab: Any, width: int
-) -> None:
+def test_the_page_says_that_the_server_was_lost_and_goes_on_with_the_next(world: World, tab: Any, width: int) -> None:
     tab.set_viewport_size({"width": width, "height": 740})
     play(world, tab)
     world.state = {"state": "ready", "seconds": 9, "attempt": 1, "url": NOWHERE, "token": "T", "userId": "P1"}
@@ -805,13 +805,13 @@ def test_a_server_lost_in_mid_game_is_told_and_the_game_comes_back_by_itself(
     assert len(world.connections) == 2
 
 
-def test_a_first_server_is_not_said_to_be_another(world: World, tab: Any) -> None:
+def test_the_page_of_a_first_server_does_not_say_that_the_game_moves(world: World, tab: Any) -> None:
     world.step = 2
     tab.goto(world.url)
     assert tab.locator("h1:visible").all_inner_texts() == ["Your game is getting ready"]
 
 
-def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World, lone_tab: Any) -> None:
+def test_the_page_says_what_may_help_if_the_server_cannot_be_reached(world: World, lone_tab: Any) -> None:
     world.step = 2
     world.ready()
     world.state["url"] = NOWHERE
@@ -828,9 +828,7 @@ def test_a_server_that_is_never_reached_is_told_with_what_may_help(world: World,
     lone_tab.wait_for_selector("#overlay-button:visible")
 
 
-def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_asked_for_once_more(
-    world: World, lone_tab: Any
-) -> None:
+def test_a_page_that_waits_for_long_reloads_itself(world: World, lone_tab: Any) -> None:
     world.step = 2
     loads: list[str] = []
     lone_tab.on("request", lambda request: request.url == world.url and loads.append(request.url))
@@ -848,7 +846,7 @@ def test_a_page_that_waits_for_long_loads_itself_again_so_that_the_server_is_ask
 
 @pytest.mark.parametrize("width", [360, 1200])
 @pytest.mark.parametrize("reason", ["lost", "refused", "no capacity", "full"])
-def test_a_page_of_a_game_that_failed_for_good_says_so_and_has_a_button(
+def test_the_page_of_a_game_that_failed_for_good_offers_to_try_again(
     world: World, tab: Any, width: int, reason: str
 ) -> None:
     tab.set_viewport_size({"width": width, "height": 740})
@@ -861,36 +859,36 @@ def test_a_page_of_a_game_that_failed_for_good_says_so_and_has_a_button(
     shot(tab, f"{width}-3-{reason.replace(' ', '-')}")
 
 
-def test_a_game_that_does_not_start_can_be_asked_for_again(world: World, tab: Any) -> None:
+def test_the_button_of_a_failed_game_asks_for_it_again(world: World, tab: Any) -> None:
     world.step = 2
     world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True}
     tab.goto(world.url)
     tab.click("button:text('Try again')")
-    tab.wait_for_selector("#wait:visible")  # although the record still says failed
+    tab.wait_for_selector("#wait:visible")  # although the server's record still says `failed`
     assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "restart"}]
     world.ready()
     tab.wait_for_selector("#overlay-button:visible")
 
 
-def test_a_broken_frame_costs_a_connection_and_not_the_game(world: World, tab: Any) -> None:
+def test_after_a_broken_frame_the_page_connects_again(world: World, tab: Any) -> None:
     play(world, tab)
     world.connections[0].send(pack(3, RED * 4)[:-4] + b"nonsense")
-    reconnected(world, tab)
+    wait_for_reconnection(world, tab)
 
 
-def test_the_servers_words_are_shown(world: World, tab: Any) -> None:
+def test_the_page_shows_an_error_of_the_server_as_plain_text(world: World, tab: Any) -> None:
     play(world, tab)
     world.connections[0].send(json.dumps({"error": "that is <b>not</b> possible"}))
     tab.wait_for_selector("#trouble:text('That is <b>not</b> possible')")
 
 
-# What a server says that is run by an agent gone wrong, or by somebody who hates us
+# Messages of a server whose agent is broken or hostile
 
 
 XSS = "<img src=x onerror=window.xss=1><script>window.xss=1</script>"
 
 
-def test_the_words_of_a_hostile_server_stay_words(world: World, tab: Any) -> None:
+def test_messages_of_a_hostile_server_never_become_markup(world: World, tab: Any) -> None:
     play(world, tab)
     for said in (
         {"UI": ["left", "start", XSS], "actionSpace": [XSS, "left", *(f"a{n}" for n in range(5000)), 7, None]},
@@ -920,7 +918,7 @@ def test_the_words_of_a_hostile_server_stay_words(world: World, tab: Any) -> Non
     assert tab.evaluate("document.querySelectorAll('#controls button').length") < 100
     assert tab.evaluate("window.xss") is None
     world.connections[0].send("no JSON")
-    reconnected(world, tab)
+    wait_for_reconnection(world, tab)
 
 
 def test_participants_may_change_the_frame_rate_if_the_project_lets_them(world: World, tab: Any) -> None:
@@ -953,20 +951,20 @@ def test_pictures_of_absurd_sizes_are_refused(
 ) -> None:
     play(world, tab)
     world.connections[0].send(struct.pack("!BIHHB", *header) + deflated_zeros(unpacked) if header else b"\0\0")
-    reconnected(world, tab)
+    wait_for_reconnection(world, tab)
     assert tab.evaluate("document.getElementById('screen').width * document.getElementById('screen').height") < 100_000
 
 
 def deflated_zeros(number: int) -> bytes:
-    """What unpacks to so many zeros: each megabyte stands for itself, so that only one has to be packed."""
+    """Compressed data that unpack to so many zeros. Each megabyte is complete by itself, so only one has to be compressed."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
     megabytes, rest = divmod(number, 1 << 20)
     megabyte = deflate.compress(bytes(1 << 20)) + deflate.flush(zlib.Z_FULL_FLUSH)
     return megabyte * megabytes + deflate.compress(bytes(rest)) + deflate.flush()
 
 
-def reconnected(world: World, tab: Any) -> None:
-    """The page has given up the connection and made another, on which it plays."""
+def wait_for_reconnection(world: World, tab: Any) -> None:
+    """Wait until the page has closed its connection and plays on another."""
     until = time.monotonic() + 60
     while len(world.connections) < 2:
         assert time.monotonic() < until
@@ -981,7 +979,7 @@ def reconnected(world: World, tab: Any) -> None:
 def test_a_page_carries_the_same_rules_as_the_style_sheet(tab: Any, sheet: str) -> None:
     whole = (frame.WEB / sheet).read_text(encoding="utf-8")
     read = "css => { const s = new CSSStyleSheet(); s.replaceSync(css); return [...s.cssRules].map((r) => r.cssText) }"
-    written, carried = (  # browsers keep some values as they were written
+    written, carried = (  # browsers keep some values as they are written
         [" ".join(rule.split()).replace(", ", ",").replace(": ", ":") for rule in tab.evaluate(read, css)]
         for css in (whole, frame._plain(sheet, whole))
     )
@@ -990,7 +988,7 @@ def test_a_page_carries_the_same_rules_as_the_style_sheet(tab: Any, sheet: str) 
 
 
 def test_the_game_also_plays_with_its_modules_loaded_one_by_one(world: World, tab: Any) -> None:
-    """They are what browsers take for modules; the page carries them joined only to save requests."""
+    """Each file is a valid module; the page carries them joined only to save requests."""
     loaded: list[str] = []
 
     def answer(route: Any) -> None:

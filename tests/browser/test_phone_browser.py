@@ -1,5 +1,5 @@
-"""The game page on a phone: how large the picture is, what thumbs reach, and what is said of a connection that is dead."""
-# ruff: noqa: F811 - fixtures of other tests of pages
+"""The game page on a phone: size of the picture, buttons for thumbs, messages, and a dead connection."""
+# ruff: noqa: F811 - fixtures are imported from test_pages_browser
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "p
 
 
 @pytest.fixture(scope="module")
-def pocket(chromium: Any) -> Iterator[Any]:
-    """What the phones of all tests share."""
+def phone_context(chromium: Any) -> Iterator[Any]:
+    """The browser context that the phones of all tests share."""
     context = chromium.new_context(viewport={"width": 360, "height": 640}, has_touch=True, is_mobile=True)
     context.set_default_timeout(PATIENCE)
-    context.new_page()  # its window stays, as in `narrow`
+    context.new_page()  # keeps a window open, as in `narrow`
     yield context
     context.close()
 
 
 @pytest.fixture
-def phone(pocket: Any) -> Iterator[Any]:
+def phone(phone_context: Any) -> Iterator[Any]:
     """A page on a phone of 360 by 640 pixels."""
-    with own_page(pocket) as page:
+    with own_page(phone_context) as page:
         yield page
 
 
 def play(world: World, phone: Any, size: tuple[int, int], trial: dict[str, Any], ui: list[str]) -> None:
-    """Shows a running game that is drawn by objects, with a line of its own above it."""
+    """Open the page of a running game that is drawn by objects and shows a line of text above its picture."""
     width, height = size
     phone.set_viewport_size({"width": width, "height": height})
     scene = {**SCENE, **trial.get("scene", {})}
-    world.spoken = "hippodrome.3"
+    world.subprotocol = "hippodrome.3"
     world.trial = {**trial, "scene": scene, "ui": dict.fromkeys(ui, True)}
     world.controls = {
         "UI": ui, "scene": scene, "assets": [], "maxEpisodes": 3, "actionSpace": ["noop", "up", "left", "right", "down", "wait"],
@@ -89,12 +89,12 @@ def test_a_wide_picture_on_a_phone_held_sideways_is_larger_than_upright(world: W
     assert sideways > 1.15 * box(phone, "#screen")["width"]
 
 
-def test_on_a_small_phone_held_sideways_all_buttons_can_be_reached(world: World, phone: Any) -> None:
+def test_the_whole_page_fits_a_small_phone_held_sideways(world: World, phone: Any) -> None:
     play(world, phone, (568, 320), {"scene": {"width": 480, "height": 384}}, ALL)
     assert overflow(phone) == [0, 0]
 
 
-def test_words_above_the_picture_go_on_in_a_second_line(world: World, phone: Any) -> None:
+def test_words_above_the_picture_wrap_into_a_second_line(world: World, phone: Any) -> None:
     play(world, phone, (568, 320), {"pace": "turns", "scene": {"width": 640, "height": 480}}, ALL)
     tell(world, state="playing", toAct=True, score=123456, episodeScore=123456)
     phone.wait_for_selector("#total:text('Total 123,456')")
@@ -127,7 +127,9 @@ JUMPS = {"keys": {"ArrowLeft": "left", "ArrowUp": "up", "ArrowRight": "right"}}
 
 
 @pytest.mark.parametrize("size", [(360, 640), (320, 568), (640, 360), (568, 320)], ids=str)
-def test_the_left_thumb_goes_and_the_right_thumb_jumps(world: World, phone: Any, size: tuple[int, int]) -> None:
+def test_left_and_right_are_under_the_left_thumb_and_jump_under_the_right(
+    world: World, phone: Any, size: tuple[int, int]
+) -> None:
     play(world, phone, size, JUMPS, ["up", "left", "right", "start", "pause"])
     assert overflow(phone) == [0, 0]
     shot(phone, f"{size[0]}-thumbs")
@@ -149,17 +151,17 @@ def test_two_thumbs_hold_two_buttons_at_once(world: World, phone: Any) -> None:
     for touching in (fingers[:1], fingers):
         devtools.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": touching})
     world.wait_for({"key": "ArrowUp", "held": True})
-    assert {"key": "ArrowRight", "held": True} in world.heard
-    assert {"key": "ArrowRight", "held": False} not in world.heard
+    assert {"key": "ArrowRight", "held": True} in world.received
+    assert {"key": "ArrowRight", "held": False} not in world.received
     devtools.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
     world.wait_for({"key": "ArrowRight", "held": False})
     world.wait_for({"key": "ArrowUp", "held": False})
 
 
-def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: World, phone: Any) -> None:
+def test_the_countdown_covers_little_of_the_first_picture(world: World, phone: Any) -> None:
     play(world, phone, (360, 640), {"resetFreeze": 2}, ALL)
     tell(world, state="playing", startsIn=2)
-    world.stands |= {"startsIn": 2}
+    world.trial_state |= {"startsIn": 2}
     phone.wait_for_selector("#overlay-title:text('Get ready')")
     shot(phone, "360-freeze")
     assert box(phone, "#overlay")["height"] < box(phone, "#screen")["height"] / 4
@@ -169,10 +171,10 @@ def test_while_the_first_picture_stands_still_little_of_it_is_covered(world: Wor
     assert box(phone, "#overlay")["height"] == box(phone, "#screen")["height"]
 
 
-def test_a_page_that_is_twice_as_large_has_the_picture_beside_the_buttons_and_the_keys_below_these(
+def test_at_a_zoom_of_200_percent_the_picture_is_beside_the_buttons_and_the_keys_are_below_them(
     world: World, chromium: Any
 ) -> None:
-    """As at a window of 1280 by 800 pixels and a zoom of 200 %."""
+    """The window has 1280 by 800 pixels of the screen, which are 640 by 400 of the page."""
     context = chromium.new_context(viewport={"width": 640, "height": 400}, device_scale_factor=2)
     page = context.new_page()
     play(world, page, (640, 400), JUMPS, ["up", "left", "right", "start", "pause"])
@@ -185,7 +187,7 @@ def test_a_page_that_is_twice_as_large_has_the_picture_beside_the_buttons_and_th
     assert abs(keys["x"] + keys["width"] / 2 - buttons["x"] - buttons["width"] / 2) < 20
 
 
-def test_the_last_picture_is_covered_by_no_message_and_its_score_is_announced(world: World, phone: Any) -> None:
+def test_no_message_covers_the_last_picture_and_its_score_is_announced(world: World, phone: Any) -> None:
     hold_timers(phone, LAST_PICTURE)
     play(world, phone, (360, 640), {}, ALL)
     world.connections[0].send(json.dumps({"error": "That move is not possible now"}))
@@ -201,8 +203,8 @@ def test_the_last_picture_is_covered_by_no_message_and_its_score_is_announced(wo
 HANGS = "The connection hangs. Please stay on this page."
 
 
-def silent(world: World, heard: list[dict[str, Any]]) -> None:
-    """From its start on, the game's server neither says nor answers anything."""
+def fall_silent(world: World, heard: list[dict[str, Any]]) -> None:
+    """Make the trial server send its first message and nothing more."""
 
     def speak(connection: Any) -> None:
         world.connections.append(connection)
@@ -217,39 +219,37 @@ def silent(world: World, heard: list[dict[str, Any]]) -> None:
     world.ready()
 
 
-def test_a_picture_that_stands_still_as_the_connection_is_dead_is_explained_within_six_seconds(
-    world: World, standing: Any
-) -> None:
+def test_within_six_seconds_the_page_says_that_the_connection_hangs(world: World, stopped_clock_tab: Any) -> None:
     heard: list[dict[str, Any]] = []
-    silent(world, heard)
-    standing.goto(world.url)
-    standing.wait_for_selector("#mode[data-state=playing]", state="attached")
-    standing.clock.run_for(6_000)
-    assert standing.inner_text("#trouble") == HANGS
-    shot(standing, "360-hangs")
-    standing.evaluate(
+    fall_silent(world, heard)
+    stopped_clock_tab.goto(world.url)
+    stopped_clock_tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    stopped_clock_tab.clock.run_for(6_000)
+    assert stopped_clock_tab.inner_text("#trouble") == HANGS
+    shot(stopped_clock_tab, "360-hangs")
+    stopped_clock_tab.evaluate(
         """() => {
             const title = document.getElementById("overlay-title"), trouble = document.getElementById("trouble");
             const note = () => title.textContent && (window.beside ??= trouble.textContent);
             new MutationObserver(note).observe(title, { childList: true });
         }"""
     )
-    standing.clock.run_for(7_000)
-    standing.wait_for_selector("#overlay-title:text('Connection lost')")
-    assert standing.evaluate("window.beside") == "", "what hangs is not said of a connection that is lost"
+    stopped_clock_tab.clock.run_for(7_000)
+    stopped_clock_tab.wait_for_selector("#overlay-title:text('Connection lost')")
+    assert stopped_clock_tab.evaluate("window.beside") == "", "what hangs is not said of a connection that is lost"
 
 
-def test_an_answer_takes_the_explanation_away(world: World, standing: Any) -> None:
+def test_a_message_of_the_server_clears_the_sentence_about_the_connection(world: World, stopped_clock_tab: Any) -> None:
     heard: list[dict[str, Any]] = []
-    silent(world, heard)
-    standing.goto(world.url)
-    standing.wait_for_selector("#mode[data-state=playing]", state="attached")
-    standing.clock.run_for(6_000)
-    assert standing.inner_text("#trouble") == HANGS
+    fall_silent(world, heard)
+    stopped_clock_tab.goto(world.url)
+    stopped_clock_tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    stopped_clock_tab.clock.run_for(6_000)
+    assert stopped_clock_tab.inner_text("#trouble") == HANGS
     tell(world, state="playing", episodeScore=30)
-    standing.wait_for_selector("#score:text('30')")
-    standing.clock.run_for(1_000)
-    assert standing.inner_text("#trouble") == ""
+    stopped_clock_tab.wait_for_selector("#score:text('30')")
+    stopped_clock_tab.clock.run_for(1_000)
+    assert stopped_clock_tab.inner_text("#trouble") == ""
 
 
 MESSAGE = 8_000  # ms for which the page shows one, as web/game/overlay.js has it
@@ -298,7 +298,7 @@ def test_scores_of_any_kind_stand_in_one_line_above_the_picture(world: World, ph
 
 
 @pytest.mark.parametrize(("score", "shown"), [(0.1 + 0.2, "0.3"), (999.996, "1,000"), (1234.5, "1,235"), (-7, "-7")])
-def test_of_a_score_up_to_a_thousand_two_decimals_are_shown(world: World, phone: Any, score: float, shown: str) -> None:
+def test_scores_below_a_thousand_have_at_most_two_decimals(world: World, phone: Any, score: float, shown: str) -> None:
     play(world, phone, (360, 640), {}, ALL)
     tell(world, state="playing", score=score, episodeScore=score)
     phone.wait_for_selector(f"#score:text-is('{shown}')")

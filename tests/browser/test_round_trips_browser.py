@@ -1,4 +1,4 @@
-"""What `trial/wire/round_trips.py` takes for granted of a browser: it answers pings by itself, whatever its page does."""
+"""The assumption of `trial/wire/round_trips.py`: a browser answers pings by itself, even while its page is busy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WANTED = 10  # round trips while the page is busy
 
 
 class Pinging(threading.Thread):
-    """A server that pings each client ten times a second, and keeps what it is told."""
+    """A server that pings each client ten times a second, and keeps the measured round trips."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -57,9 +57,9 @@ def pinging() -> Iterator[Pinging]:
 
 @pytest.fixture
 def site(pinging: Pinging) -> Iterator[tuple[str, list[float]]]:
-    """The address of a page, and the round trips of the time in which the site held back what the page had asked for.
+    """The address of a page, and the round trips that were measured while its request for `/held` was not answered.
 
-    At `held` it answers after so many round trips as are WANTED, or when they do not come.
+    The site answers `/held` after WANTED round trips, or after PATIENCE.
     """
     meanwhile: list[float] = []
 
@@ -84,10 +84,10 @@ def site(pinging: Pinging) -> Iterator[tuple[str, list[float]]]:
     web.server_close()
 
 
-def test_a_page_that_is_busy_does_not_hold_up_the_browsers_answer(
+def test_a_busy_page_does_not_delay_the_browsers_pongs(
     chromium: Any, pinging: Pinging, site: tuple[str, list[float]]
 ) -> None:
-    """Its thread waits for an answer of its site, which comes after so many round trips as are wanted."""
+    """The page is busy with a synchronous request, which its site answers after WANTED round trips."""
     page, (address, meanwhile) = chromium.new_page(), site
     page.goto(address)
     page.evaluate(f"""() => new Promise((open) => {{

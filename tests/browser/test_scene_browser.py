@@ -1,5 +1,5 @@
 """Games that are drawn by objects, in a real Chromium on a real trial server."""
-# ruff: noqa: F811 - fixtures of other tests of pages
+# ruff: noqa: F811 - fixtures are imported from test_pages_browser
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def draw_cook(folder: Path, noise: int = 0) -> None:
 
 
 def play(world: World, tab: Any, folder: Path, width: int = 1280, height: int = 800, noise: int = 0) -> Running:
-    """A page that shows the game of a server that has just begun."""
+    """Open the page of a game that has just begun on a real server."""
     draw_cook(folder / "agent" / "assets", noise)
     trial = {"actionSpace": ["noop", "right"], "scene": SCENE, "maxEpisodes": 1}
     server = Running(folder, AGENT, trial, {})
@@ -147,7 +147,7 @@ def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -
 
 
 def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> None:
-    """The page asks for an image whose last bytes are held back; then they come."""
+    """The test holds back the last bytes of an image that the page has asked for; then it sends them."""
     held: list[Any] = []
 
     def hold(route: Any) -> None:
@@ -205,7 +205,7 @@ def test_images_are_not_loaded_again_when_the_connection_comes_back(game: Any, w
         again.wait()
 
 
-def big(number: int) -> bytes:
+def png_of_size(number: int) -> bytes:
     """A PNG of a few bytes that says it has so many pixels on each side."""
     head = b"IHDR" + struct.pack("!IIBBBBB", number, number, 1, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + struct.pack("!I", 13) + head + struct.pack("!I", zlib.crc32(head))
@@ -218,9 +218,7 @@ SIZE_OF = """async (bytes) => {
 
 
 @pytest.mark.parametrize(("form", "options"), [("PNG", {}), ("JPEG", {}), ("WEBP", {}), ("WEBP", {"lossless": True})])
-def test_the_page_knows_how_large_an_image_is_before_it_is_decoded(
-    tab: Any, form: str, options: dict[str, Any]
-) -> None:
+def test_the_page_reads_the_size_of_an_image_without_decoding_it(tab: Any, form: str, options: dict[str, Any]) -> None:
     out = io.BytesIO()
     Image.new("RGB", (300, 77), "red").save(out, form, **options)
     sizes = (ROOT / "web/game/sprites.js").read_text()
@@ -236,12 +234,12 @@ def test_the_page_knows_how_large_an_image_is_before_it_is_decoded(
 
 
 def test_a_hostile_server_cannot_fill_the_memory_with_images_or_scenes(world: World, tab: Any) -> None:
-    """It announces an image of gigabytes, sends one of absurd size, and a scene that unpacks to gigabytes."""
-    world.spoken = "hippodrome.3"
+    """It announces an image of a terabyte, sends one of 60,000 x 60,000 pixels, and a scene that unpacks to 256 MB."""
+    world.subprotocol = "hippodrome.3"
     world.trial = {"scene": SCENE}
     lost: list[int] = []
     about = json.dumps({"type": "image/png"}).encode()
-    image = struct.pack("!I", len(about)) + about + big(60_000)
+    image = struct.pack("!I", len(about)) + about + png_of_size(60_000)
 
     def play(connection: Any) -> None:
         for text in connection:
@@ -263,7 +261,7 @@ def test_a_hostile_server_cannot_fill_the_memory_with_images_or_scenes(world: Wo
     world.step = 2
     world.ready()
     tab.goto(world.url)
-    tab.wait_for_selector("#overlay-button:visible")  # both images are given up
+    tab.wait_for_selector("#overlay-button:visible")  # once the page has given up both images
     assert lost == [1]
     tab.click("#overlay-button")
     tab.wait_for_selector("text=Connection lost")

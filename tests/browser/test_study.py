@@ -1,4 +1,4 @@
-"""The example study as participants meet it: in a real Chromium, wide and narrow, with keyboard, mouse and fingers."""
+"""Participants take part in the example study in a real Chromium, wide and narrow, by keyboard, mouse and touch."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ CANVAS = """() => {
 }"""
 
 
-def look_at(visitor: Any, what: str) -> None:
-    """Keep a picture of the page, and check what can be checked of any page."""
+def check_page(visitor: Any, what: str) -> None:
+    """Save a screenshot and the size of the page, and check that it fits and has no flaws."""
     visitor.shot(what)
-    visitor.weigh(what)
+    visitor.record_size(what)
     page = visitor.page
     assert page.evaluate("document.documentElement.scrollWidth") <= visitor.width, what
     assert page.evaluate(FLAWS) == [], what
@@ -41,7 +41,7 @@ def give_consent(visitor: Any) -> None:
     visitor.open()
     assert visitor.step == "1"
     visitor.invited = visitor.page.locator("h1").inner_text()
-    look_at(visitor, "1-consent")
+    check_page(visitor, "1-consent")
     for box in visitor.page.get_by_role("checkbox").all():
         box.check()
     visitor.send("2")
@@ -49,7 +49,7 @@ def give_consent(visitor: Any) -> None:
 
 def answer_questionnaire(visitor: Any) -> None:
     page = visitor.page
-    look_at(visitor, "2-questionnaire")
+    check_page(visitor, "2-questionnaire")
     page.get_by_label("How old are you?").fill("33")
     page.get_by_label("A few times a week").check()
     page.get_by_label("An arcade machine").check()
@@ -66,8 +66,8 @@ def wait_for_game(visitor: Any, state: str = "ready") -> None:
     visitor.page.wait_for_function("state => document.getElementById('mode').dataset.state === state", arg=state)
 
 
-def see_motion(visitor: Any) -> dict[str, Any]:
-    """The canvas shows a coloured picture, and changes."""
+def wait_for_motion(visitor: Any) -> dict[str, Any]:
+    """Wait until the canvas changes, and check that its picture has colours."""
     before = visitor.page.evaluate(CANVAS)
     visitor.page.wait_for_function(f"before => ({CANVAS})().sum !== before", arg=before["sum"])
     after: dict[str, Any] = visitor.page.evaluate(CANVAS)
@@ -76,8 +76,8 @@ def see_motion(visitor: Any) -> dict[str, Any]:
     return after
 
 
-def stands_still(visitor: Any) -> None:
-    """The canvas no longer changes, once what was under way has arrived."""
+def wait_for_standstill(visitor: Any) -> None:
+    """Wait until the canvas has not changed for 0.8 seconds."""
     before, since, until = None, time.monotonic(), time.monotonic() + 15
     while time.monotonic() - since < 0.8:
         now = visitor.page.evaluate(CANVAS)["sum"]
@@ -104,7 +104,7 @@ def answer_survey(visitor: Any) -> None:
 
 
 def hold_finger(visitor: Any, button: Any, ms: int) -> None:
-    """A finger on a button, for so long."""
+    """Hold a finger on a button for so many milliseconds."""
     box = button.bounding_box()
     touch = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
     session = visitor.context.new_cdp_session(visitor.page)
@@ -113,7 +113,7 @@ def hold_finger(visitor: Any, button: Any, ms: int) -> None:
     session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
-def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> None:
+def test_two_participants_take_part_at_once_one_wide_and_one_narrow(visit: Any, study: Any) -> None:
     wide, narrow = visit("wide", 1280, pictures=True), visit("narrow", 360, pictures=True)
     for visitor in (wide, narrow):
         give_consent(visitor)
@@ -121,23 +121,23 @@ def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> Non
         visitor.shot("3-waiting")
     for visitor in (wide, narrow):
         wait_for_game(visitor)
-        look_at(visitor, "3-ready")
+        check_page(visitor, "3-ready")
 
     wide.page.keyboard.press("ArrowLeft")
     wait_for_game(wide, "playing")
     for key in ("ArrowLeft", "ArrowRight", "ArrowUp"):
         wide.page.keyboard.down(key)
-        see_motion(wide)
+        wait_for_motion(wide)
         wide.page.wait_for_timeout(250)
         wide.page.keyboard.up(key)
-    look_at(wide, "3-playing")
+    check_page(wide, "3-playing")
 
     narrow.page.locator("#overlay-button").tap()
     wait_for_game(narrow, "playing")
     for label in ("Left", "Right"):
         hold_finger(narrow, narrow.page.get_by_role("button", name=label, exact=True), 400)
-        see_motion(narrow)
-    look_at(narrow, "3-playing")
+        wait_for_motion(narrow)
+    check_page(narrow, "3-playing")
     assert {process.environ()["USER_ID"] for process in servers_of(study.data)} >= {"wide", "narrow"}
     assert set(wide.sockets).isdisjoint(narrow.sockets)
 
@@ -145,29 +145,29 @@ def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> Non
     narrow.page.get_by_role("button", name="Pause").tap()
     for visitor in (wide, narrow):
         wait_for_game(visitor, "paused")
-        stands_still(visitor)
-        look_at(visitor, "3-paused")
+        wait_for_standstill(visitor)
+        check_page(visitor, "3-paused")
     wide.page.keyboard.press("ArrowUp")
     wait_for_game(wide, "playing")
-    see_motion(wide)
+    wait_for_motion(wide)
 
     for visitor in (wide, narrow):
         end_game(visitor)
-        look_at(visitor, "4-survey")
+        check_page(visitor, "4-survey")
         answer_survey(visitor)
-        look_at(visitor, "5-debrief")
+        check_page(visitor, "5-debrief")
         code = visitor.page.locator(".code").inner_text()
         assert len(code) == 10
         wording = "personal request" if visitor.invited.startswith("Help us") else "plain list"
         assert f"You saw the {wording}." in visitor.page.locator("main").inner_text()
         assert code in (study.data / "ms-pacman" / "users" / visitor.name / "participant.json").read_text()
         visitor.open()
-        assert visitor.page.locator(".code").inner_text() == code  # a reload keeps it
+        assert visitor.page.locator(".code").inner_text() == code  # a reload shows the same wording
         assert visitor.answers("2")["plan"] == "Eat.\r\nDo not be eaten — „nie“."
         assert visitor.answers("2")["devices"] == ["computer", "arcade"]
         assert visitor.answers("3")["outcome"] == "stopped"
         assert visitor.answers("4")["notes"] == "No <b>thanks</b> & bye"
-        visitor.complete()
+        visitor.check_all()
 
     left = wait_until_gone(study.data, {"wide", "narrow"})
     assert left.words() == []
@@ -177,7 +177,7 @@ def test_two_participants_at_once_wide_and_narrow(visit: Any, study: Any) -> Non
         assert actions <= {step["actionName"] for step in steps if step["by"] == "human"}
 
 
-def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
+def test_the_game_goes_on_after_a_reload_and_in_a_second_tab(visit: Any, study: Any) -> None:
     visitor = visit("tabs")
     give_consent(visitor)
     visitor.page.get_by_label("How old are you?").fill("44")
@@ -186,14 +186,14 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     wait_for_game(visitor)
     visitor.page.keyboard.press("ArrowLeft")
     wait_for_game(visitor, "playing")
-    see_motion(visitor)
+    wait_for_motion(visitor)
 
     visitor.page.reload()
     wait_for_game(visitor, "paused")
-    stands_still(visitor)
+    wait_for_standstill(visitor)
     visitor.page.keyboard.press("ArrowRight")
     wait_for_game(visitor, "playing")
-    see_motion(visitor)
+    wait_for_motion(visitor)
 
     first, visitor.page = visitor.page, visitor.tab()
     visitor.page.goto(visitor.link)
@@ -202,12 +202,12 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     assert "another tab" in first.locator("#overlay-title").inner_text()
     first.bring_to_front()
     second, visitor.page, visitor.pictures = visitor.page, first, True
-    look_at(visitor, "3-elsewhere")
+    check_page(visitor, "3-elsewhere")
     visitor.page, visitor.pictures = second, False
     visitor.page.bring_to_front()
     visitor.page.keyboard.press("ArrowUp")
     wait_for_game(visitor, "playing")
-    see_motion(visitor)
+    wait_for_motion(visitor)
     visitor.page = first
     visitor.page.bring_to_front()
     visitor.page.get_by_role("button", name="Play here instead").click()
@@ -215,14 +215,14 @@ def test_a_reload_in_mid_game_and_a_second_tab(visit: Any, study: Any) -> None:
     second.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
     end_game(visitor)
 
-    assert len(set(visitor.sockets)) == 1  # one server all the time
-    visitor.complete()
+    assert len(set(visitor.sockets)) == 1  # the same server throughout
+    visitor.check_all()
     steps = visitor.steps_played()
     assert len({step["trial"] for step in steps}) == 1
     assert [step["step"] for step in steps] == list(range(1, len(steps) + 1))
 
 
-def test_a_draft_survives_a_reload_and_goes_when_it_is_sent(visit: Any) -> None:
+def test_a_draft_survives_a_reload_and_is_deleted_when_it_is_sent(visit: Any) -> None:
     visitor = visit("draft")
     give_consent(visitor)
     page = visitor.page
@@ -241,10 +241,10 @@ def test_a_draft_survives_a_reload_and_goes_when_it_is_sent(visit: Any) -> None:
     visitor.send("3")
     assert page.evaluate("Object.keys(localStorage).filter(key => key.startsWith('hippodrome:'))") == []
     assert visitor.answers("2")["plan"] == "Half a tho"
-    visitor.complete()
+    visitor.check_all()
 
 
-def test_consent_with_the_keyboard_alone(visit: Any) -> None:
+def test_a_participant_can_consent_with_the_keyboard_alone(visit: Any) -> None:
     visitor = visit("keys")
     visitor.open()
     page = visitor.page
@@ -269,10 +269,10 @@ def test_consent_with_the_keyboard_alone(visit: Any) -> None:
     page.keyboard.press("Enter")
     page.wait_for_selector("body[data-step='2']")
     assert visitor.answers("1") == {"adult": "yes", "consent": "yes"}
-    visitor.complete()
+    visitor.check_all()
 
 
-def test_the_server_is_lost_in_mid_game(visit: Any, study: Any) -> None:
+def test_a_server_lost_in_mid_game_is_replaced(visit: Any, study: Any) -> None:
     visitor = visit("unlucky")
     give_consent(visitor)
     visitor.page.get_by_label("How old are you?").fill("66")
@@ -281,20 +281,20 @@ def test_the_server_is_lost_in_mid_game(visit: Any, study: Any) -> None:
     wait_for_game(visitor)
     visitor.page.keyboard.press("ArrowLeft")
     wait_for_game(visitor, "playing")
-    see_motion(visitor)
+    wait_for_motion(visitor)
     until = time.monotonic() + PATIENCE / 1000
-    while not study.steps_written("unlucky"):  # of a game that is killed at once nothing is kept
+    while not study.steps_written("unlucky"):  # a server that is killed earlier has stored nothing
         assert time.monotonic() < until
         visitor.page.wait_for_timeout(100)
     for process in servers_of(study.data, {"unlucky"}):
         process.kill()
-    wait_for_game(visitor, "ready")  # on another server, without a hand on this page
+    wait_for_game(visitor, "ready")  # on another server; the participant has done nothing
     assert len(set(visitor.sockets)) == 2
     visitor.page.keyboard.press("ArrowLeft")
     wait_for_game(visitor, "playing")
-    see_motion(visitor)
+    wait_for_motion(visitor)
     end_game(visitor)
-    assert visitor.went == {"127.0.0.1"}  # (a connection that breaks off is a complaint of Chromium's)
+    assert visitor.hosts == {"127.0.0.1"}  # not `check_all`: Chromium complains of the lost connection
     assert len({step["trial"] for step in visitor.steps_played()}) == 2
 
 
@@ -309,10 +309,10 @@ def test_pages_work_without_scripts(visit: Any) -> None:
     visitor.send("3")
     assert "The game needs JavaScript" in visitor.page.locator("main").inner_text()
     assert visitor.answers("2")["age"] == "77"
-    visitor.complete()
+    visitor.check_all()
 
 
-def test_a_link_that_is_wrong_says_so(visit: Any, study: Any) -> None:
+def test_a_wrong_link_is_answered_with_an_error_page(visit: Any, study: Any) -> None:
     visitor = visit("lost", 360)
     for link, status in ((study.link.replace("ms-pacman", "nobody"), 404), (study.link + "&userId=a/b", 400)):
         answer = visitor.page.goto(link)
@@ -320,10 +320,10 @@ def test_a_link_that_is_wrong_says_so(visit: Any, study: Any) -> None:
         assert visitor.page.evaluate(FLAWS) == []
     visitor.pictures = True
     visitor.shot("0-broken-link")
-    assert visitor.went == {"127.0.0.1"}
+    assert visitor.hosts == {"127.0.0.1"}
 
 
-def test_two_clicks_on_a_button_send_once(visit: Any, study: Any) -> None:
+def test_two_clicks_on_a_button_send_one_form(visit: Any, study: Any) -> None:
     visitor = visit("twice")
     visitor.open()
     for box in visitor.page.get_by_role("checkbox").all():
@@ -334,4 +334,4 @@ def test_two_clicks_on_a_button_send_once(visit: Any, study: Any) -> None:
     while not servers_of(study.data, {"twice"}) and time.monotonic() < began + PATIENCE / 1000:
         visitor.page.wait_for_timeout(100)
     assert len({process.environ()["SERVER"] for process in servers_of(study.data, {"twice"})}) == 1
-    visitor.complete()
+    visitor.check_all()

@@ -1,4 +1,4 @@
-"""A participant who teaches, in a real Chromium: large buttons, keys, and a picture that says what was heard."""
+"""A participant teaches the car in a real Chromium with large buttons and keys, and the picture shows each word."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def come_to_the_game(page: Any, link: str) -> None:
 
 
 def words(step: dict[str, Any]) -> list[str]:
-    """What the car heard before this step."""
+    """The words that the car received before this step."""
     return [said["command"] for said in step.get("messages", ()) if said.get("command") in WORDS]
 
 

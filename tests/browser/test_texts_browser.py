@@ -1,4 +1,4 @@
-"""A study's own words in a real browser: whatever they hold, pages show them as they are; none becomes code or markup."""
+"""A study's own texts in a real browser: pages show each character as it is; none becomes code or markup."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ WORDS = st.lists(
 ).map("".join)
 
 
-def said(texts: Texts, name: str) -> str:
-    """The text with the names of its places in them."""
+def with_place_names(texts: Texts, name: str) -> str:
+    """The text with each placeholder replaced by its name."""
     known = places(ENGLISH[name])
     return PLACE.sub(lambda place: place[1] if place[1] in known else place[0], texts[name])
 
 
-@example(own={"start": "{a$"})  # twice, one behind the other
+@example(own={"start": "{a$"})  # each text stands twice, once right behind itself
 @given(own=st.dictionaries(st.sampled_from(sorted(ENGLISH)), WORDS, min_size=1, max_size=12))
-def test_a_script_says_what_the_study_says(tab: Any, own: dict[str, str]) -> None:
+def test_a_script_shows_the_studys_own_texts(tab: Any, own: dict[str, str]) -> None:
     texts, lines, wanted = Texts({name: text for name, text in own.items() if name != LANGUAGE}), [], []
     for name in own.keys() - {LANGUAGE}:
         given_places = ", ".join(map(json.dumps, places(ENGLISH[name])))
-        named, text = f"TEXT.{name}" + (f"({given_places})" if given_places else ""), said(texts, name)
+        named, text = f"TEXT.{name}" + (f"({given_places})" if given_places else ""), with_place_names(texts, name)
         lines += [named, f"`a${{{named}}}{{b`", f"`${{{named}}}${{{named}}}`"]
         wanted += [text, f"a{text}{{b", f"{text}{text}"]
     assert tab.evaluate(in_script(f"[{', '.join(lines)}]", texts)) == wanted
@@ -96,7 +96,7 @@ VIEWS: dict[str, Callable[[Project], str]] = {
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_no_text_is_code_or_markup_in_a_page(tab: Any, view: str) -> None:
+def test_no_text_becomes_code_or_markup_in_a_page(tab: Any, view: str) -> None:
     english, hostile = (
         tab.evaluate(READ, VIEWS[view](msgspec.structs.replace(PROJECT, texts=own))) for own in ({}, OWN)
     )

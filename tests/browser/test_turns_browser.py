@@ -20,8 +20,10 @@ def in_turns(world: World) -> World:
 
 
 @pytest.mark.parametrize(("width", "height"), [(360, 740), (1280, 800)])
-def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, standing: Any, width: int, height: int) -> None:
-    tab = standing
+def test_the_page_says_whose_turn_it_is_and_how_long_it_lasts(
+    in_turns: World, stopped_clock_tab: Any, width: int, height: int
+) -> None:
+    tab = stopped_clock_tab
     tab.set_viewport_size({"width": width, "height": height})
     play(in_turns, tab)
     tell(in_turns, state="playing", toAct=True, turnEndsIn=8.5)
@@ -43,7 +45,7 @@ def test_it_says_whose_turn_it_is_and_how_long(in_turns: World, standing: Any, w
     assert tab.inner_text("#announce") == "Paused"
 
 
-def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) -> None:
+def test_the_key_that_starts_the_game_makes_no_move(in_turns: World, tab: Any) -> None:
     play(in_turns, tab)
     tell(in_turns, state="ready", toAct=False)
     tab.wait_for_selector("#mode[data-state=ready]", state="attached")
@@ -57,8 +59,8 @@ def test_the_press_that_starts_the_game_is_no_move(in_turns: World, tab: Any) ->
     in_turns.wait_for({"action": "up", "held": True})
 
 
-def test_a_page_for_turns_says_nothing_of_turns_to_who_still_plays_in_real_time(world: World, tab: Any) -> None:
-    """The study was registered anew; the server runs what was registered before."""
+def test_a_page_for_turns_says_nothing_of_turns_in_a_game_in_real_time(world: World, tab: Any) -> None:
+    """The study was registered again with `pace: turns`; the server still runs the earlier registration."""
     world.trial = {"pace": "turns"}
     world.controls = {"player": "left", "players": ["left", "right"]}
     play(world, tab)

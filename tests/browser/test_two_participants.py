@@ -13,13 +13,13 @@ from bots.links import with_user
 from local.rehearsal.study_process import StudyProcess
 from tests.browser.conftest import Hold
 from tests.browser.test_pages_browser import FLAWS, shot
-from tests.browser.test_together_browser import asleep, names, shows
+from tests.browser.test_together_browser import asleep, players_shown, wait_for_text
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 CHANGES = {
     "afterAbsent: policy\n": "afterAbsent: end\n",
-    "  patience: 30\n": "  patience: 300\n",  # a busy machine may take long to bring the second
+    "  patience: 30\n": "  patience: 300\n",  # on a busy machine the second participant may come late
 }
 
 
@@ -61,15 +61,15 @@ class Person:
             self.page.locator("form.page button:not([type=button])").last.click()
             self.page.wait_for_selector(f"body[data-step='{step}']")
 
-    def sees(self, title: str) -> None:
+    def wait_for_title(self, title: str) -> None:
         self.page.wait_for_selector(f"#overlay-title:text('{title}'):visible")
 
-    def saw(self, title: str) -> None:
-        """This has covered the picture since `NOTE_TITLES` or the last call, or does so soon."""
+    def wait_for_earlier_title(self, title: str) -> None:
+        """Wait until the overlay has shown this title at any time since `NOTE_TITLES` or the last call."""
         self.page.wait_for_function("title => window.titles.includes(title)", arg=title)
         self.page.evaluate("window.titles = []")
 
-    def plays(self) -> None:
+    def wait_until_playing(self) -> None:
         self.page.wait_for_selector("#mode[data-state=playing]", state="attached")
 
     def answers(self, step: str = "3") -> dict[str, Any]:
@@ -80,7 +80,7 @@ class Person:
 
 @pytest.fixture
 def come(chromium: Any, study: StudyProcess) -> Iterator[Any]:
-    """A participant who waits in the lobby: `come("ada")`."""
+    """Makes a participant who waits in the lobby: `come("ada")`."""
     people: list[Person] = []
 
     def arrive(name: str, *, narrow: bool = False) -> Person:
@@ -96,11 +96,11 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Any]:
 
 ELSEWHERE = "The game was opened in another tab or on another device"
 SEATS = (["You: Red", "Blue"], ["Red", "You: Blue"])
-"""What the two read of who plays which player. Seats are drawn by lot."""
+"""What each of the two pages says about the players. Places are drawn by lot."""
 
 
 def assert_one_is_red_and_one_blue(*two: Person) -> None:
-    assert sorted(names(person.page) for person in two) == sorted(SEATS)
+    assert sorted(players_shown(person.page) for person in two) == sorted(SEATS)
 
 
 def press(person: Person, key: str, button: str) -> None:
@@ -112,10 +112,10 @@ def press(person: Person, key: str, button: str) -> None:
 
 def test_two_people_meet_in_the_lobby_and_play_together(come: Any) -> None:
     ada = come("ada")
-    shows(ada.page, "#lobby-here", "You are the first of 2")
+    wait_for_text(ada.page, "#lobby-here", "You are the first of 2")
     bert = come("bert", narrow=True)
     for person in (ada, bert):
-        person.plays()
+        person.wait_until_playing()
         assert person.page.evaluate(FLAWS) == []
     assert_one_is_red_and_one_blue(ada, bert)
     press(ada, "ArrowRight", "Right")
@@ -125,16 +125,16 @@ def test_two_people_meet_in_the_lobby_and_play_together(come: Any) -> None:
     ada.page.evaluate(NOTE_TITLES)
     # A phone whose screen is locked: the game is held, and goes on when its participant is back.
     with asleep(bert.page):
-        ada.sees("Waiting for the other participant")
-        shows(ada.page, "#overlay-hint", "the game ends for everybody")
-    ada.saw("The game goes on")
+        ada.wait_for_title("Waiting for the other participant")
+        wait_for_text(ada.page, "#overlay-hint", "the game ends for everybody")
+    ada.wait_for_earlier_title("The game goes on")
     for person in (ada, bert):
-        person.plays()
+        person.wait_until_playing()
     # A reload in the game.
     bert.page.reload()
-    ada.saw("The game goes on")
+    ada.wait_for_earlier_title("The game goes on")
     for person in (ada, bert):
-        person.plays()
+        person.wait_until_playing()
     # Sideways.
     bert.page.set_viewport_size({"width": 740, "height": 360})
     overflow = (
@@ -142,10 +142,10 @@ def test_two_people_meet_in_the_lobby_and_play_together(come: Any) -> None:
     )
     assert bert.page.evaluate(overflow) == [0, 0]
     shot(bert.page, "740-two-players")
-    # One stays away: the game ends for both, each is told why, and goes on with the study.
+    # One stays away: the game ends for both, and both learn why and go on with the study.
     bert.page.goto("about:blank")
-    ada.sees("Waiting for the other participant")
-    ada.sees("The game has ended")
+    ada.wait_for_title("Waiting for the other participant")
+    ada.wait_for_title("The game has ended")
     assert "not your fault" in ada.page.inner_text("#overlay-hint")
     shot(ada.page, "1280-two-players-ended")
     ada.page.click("#overlay-button")
@@ -171,7 +171,7 @@ def test_the_game_waits_for_a_participant_who_looks_at_another_tab(come: Any) ->
     ida = come("ida")
     theo = come("theo")
     theo.page.evaluate(LOOKS_AWAY, True)
-    ida.sees("Waiting for the other participant")
+    ida.wait_for_title("Waiting for the other participant")
     ida.page.wait_for_function("() => document.getElementById('people').textContent.includes('away')")
     ida.page.evaluate(NOTE_TITLES)
     ida.page.wait_for_timeout(5_000)  # longer than the countdown
@@ -179,8 +179,8 @@ def test_the_game_waits_for_a_participant_who_looks_at_another_tab(come: Any) ->
     assert theo.page.get_attribute("#mode", "data-state") != "playing"
     theo.page.evaluate(LOOKS_AWAY, False)
     for person in (ida, theo):
-        person.plays()
-    # In the game a glance at another tab holds nobody up; who stays there is away.
+        person.wait_until_playing()
+    # In the game a short look at another tab does not hold the game; a participant who stays there is away.
     ida.page.evaluate(NOTE_TITLES)
     theo.page.evaluate(LOOKS_AWAY, True)
     theo.page.wait_for_timeout(1_000)
@@ -188,15 +188,15 @@ def test_the_game_waits_for_a_participant_who_looks_at_another_tab(come: Any) ->
     theo.page.wait_for_timeout(3_500)
     assert ida.page.evaluate("window.titles") == []
     theo.page.evaluate(LOOKS_AWAY, True)
-    ida.sees("Waiting for the other participant")
+    ida.wait_for_title("Waiting for the other participant")
     theo.page.evaluate(LOOKS_AWAY, False)
-    ida.saw("The game goes on")
+    ida.wait_for_earlier_title("The game goes on")
     for person in (ida, theo):
-        person.plays()
+        person.wait_until_playing()
 
 
 def keys_pressed(data: Path) -> dict[str, set[str]]:
-    """By player, the actions that their participant has chosen."""
+    """For each player, the actions that its participant has chosen."""
     found: dict[str, set[str]] = {}
     for path in (data / "two-players" / "sessions").glob("*/trials/*/*.gz"):
         for line in read(path.read_bytes()):
@@ -213,14 +213,14 @@ def test_two_tabs_and_a_reload_in_the_lobby_are_one_participant(come: Any) -> No
     second = eva.tab()
     second.goto(eva.link)
     for page in (eva.page, second):
-        shows(page, "#lobby-here", "You are the first of 2")
+        wait_for_text(page, "#lobby-here", "You are the first of 2")
         page.wait_for_timeout(2_500)
         assert page.inner_text("#lobby-here") == "You are the first of 2"
     assert "You have waited for 0" not in eva.page.inner_text("#lobby-clock")
     assert eva.page.inner_text("#lobby-note") == "", "the reload has not begun the waiting anew"
     otto = come("otto")
-    otto.plays()
-    assert names(otto.page) in SEATS
+    otto.wait_until_playing()
+    assert players_shown(otto.page) in SEATS
     elsewhere = "() => document.getElementById('overlay-title').textContent.includes('another tab')"
     until = 60
     while not any(page.evaluate(elsewhere) for page in (eva.page, second)):
@@ -229,37 +229,37 @@ def test_two_tabs_and_a_reload_in_the_lobby_are_one_participant(come: Any) -> No
         assert until, "one of the two tabs has the game, and the other says so"
 
 
-def test_a_link_that_two_people_open_is_one_participant_whose_last_page_plays(come: Any, chromium: Any) -> None:
-    """The other page says so, and takes the game back by a click alone. The partner plays on after each change."""
+def test_two_people_with_one_link_are_one_participant_and_the_last_page_plays(come: Any, chromium: Any) -> None:
+    """The other page says so, and takes the game back only after a click. The partner plays on after each change."""
     gwen, hans = come("gwen"), come("hans")
     for person in (gwen, hans):
-        person.plays()
+        person.wait_until_playing()
     other = chromium.new_context()
     try:
         second = other.new_page()
         second.set_default_timeout(45_000)
         second.goto(gwen.link)
-        gwen.sees(ELSEWHERE)
+        gwen.wait_for_title(ELSEWHERE)
         second.wait_for_selector("#mode[data-state=playing]", state="attached")
-        hans.plays()
-        gwen.page.wait_for_timeout(3_000)  # a page that takes the game back by itself would do so by now
+        hans.wait_until_playing()
+        gwen.page.wait_for_timeout(3_000)  # a page that takes the game back by itself would have done so by now
         assert second.locator("#overlay-title:text('another tab'):visible").count() == 0
         gwen.page.locator("#overlay-button").click()
-        gwen.plays()
+        gwen.wait_until_playing()
         second.wait_for_selector(f"#overlay-title:text('{ELSEWHERE}'):visible")
-        hans.plays()
+        hans.wait_until_playing()
         second.locator("#overlay-button").click()
-        gwen.sees(ELSEWHERE)
+        gwen.wait_for_title(ELSEWHERE)
         second.close()
-        hans.sees("Waiting for the other participant")
-        # What the page says is true also now, and says the way back.
-        gwen.sees(ELSEWHERE)
+        hans.wait_for_title("Waiting for the other participant")
+        # The other page's words are still true, and say how to get the game back.
+        gwen.wait_for_title(ELSEWHERE)
         assert gwen.page.inner_text("#overlay-hint") == "If you have closed it there, go on here."
         shot(gwen.page, "1280-two-players-elsewhere")
         gwen.page.locator("#overlay-button").click()
-        hans.plays()
+        hans.wait_until_playing()
     finally:
         other.close()
     for person in (gwen, hans):
-        person.plays()
+        person.wait_until_playing()
     assert_one_is_red_and_one_blue(gwen, hans)

@@ -11,7 +11,7 @@ import pytest
 
 from bots.links import with_user
 from local.rehearsal.study_process import StudyProcess
-from tests.browser.conftest import PATIENCE, SHOTS, Hold, note_texts, noted
+from tests.browser.conftest import PATIENCE, SHOTS, Hold, note_texts, wait_for_noted
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
@@ -22,7 +22,7 @@ SHORT = {
     "  episodeSeconds: 60\n": "  episodeSeconds: 25\n",
     "  absent: 15\n": "  absent: 4\n",
     "  countdown: 3\n": "  countdown: 2\n",
-    "  patience: 30\n": "  patience: 300\n",  # a busy machine may take long to bring the second
+    "  patience: 30\n": "  patience: 300\n",  # on a busy machine the second participant may come late
 }
 ALONE = {"  patience: 30\n": "  patience: 10\n"}
 SAYS = "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)"
@@ -39,13 +39,13 @@ def study(hold: Hold) -> StudyProcess:
 
 @pytest.fixture(scope="module")
 def without_others(hold: Hold) -> StudyProcess:
-    """The example, whose participants soon go on without others."""
+    """The example, in which a participant waits only ten seconds for another."""
     return hold("two-players", ALONE)
 
 
 @pytest.fixture
 def come(chromium: Any, study: StudyProcess) -> Iterator[Come]:
-    """A participant at the game step, in a browser of their own: `come("ada", 1280)`. Nothing may go wrong in it."""
+    """Makes a participant at the game step, in a browser of their own: `come("ada", 1280)`. Any error in it fails."""
     contexts, complaints = [], []
 
     def arrive(name: str, width: int, study: StudyProcess = study) -> Any:
@@ -73,7 +73,7 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Come]:
     assert complaints == []
 
 
-def says(page: Any, selector: str, text: str) -> None:
+def wait_for_text(page: Any, selector: str, text: str) -> None:
     page.wait_for_function(SAYS, arg=[selector, text])
 
 
@@ -90,14 +90,16 @@ def recorded(study: StudyProcess, session: str) -> list[dict[str, Any]]:
 
 def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProcess) -> None:
     wide = come("ada", 1280)
-    says(wide, "#lobby-here", "You are the first of 2")
+    wait_for_text(wide, "#lobby-here", "You are the first of 2")
     phone = come("bo", 360)
     for page in (wide, phone):
         page.wait_for_selector("#play:not([hidden])")
         page.wait_for_function(PLAYS)
-    colours = ["red", "blue"] if "You are red" in wide.inner_text(".hud") else ["blue", "red"]  # seats are drawn by lot
+    colours = (
+        ["red", "blue"] if "You are red" in wide.inner_text(".hud") else ["blue", "red"]
+    )  # places are drawn by lot
     for page, colour in zip((wide, phone), colours, strict=True):
-        says(page, ".hud", f"You are {colour}")
+        wait_for_text(page, ".hud", f"You are {colour}")
     SHOTS.mkdir(exist_ok=True)
     wide.screenshot(path=SHOTS / "1280-two-players.png")
     phone.screenshot(path=SHOTS / "360-two-players.png")
@@ -117,22 +119,22 @@ def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProce
         player: {step["players"][player]["actionName"] for step in steps if step["players"][player]["by"] == "human"}
         for player in ("red", "blue")
     }
-    assert walked == {colours[0]: {"right"}, colours[1]: {"left"}}  # each moved their own figure, and no other
+    assert walked == {colours[0]: {"right"}, colours[1]: {"left"}}  # each participant moved only their own figure
 
 
-def test_one_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, study: StudyProcess) -> None:
+def test_a_participant_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, study: StudyProcess) -> None:
     wide, phone = come("cy", 1280), come("di", 360)
     for page in (wide, phone):
         page.wait_for_function(PLAYS)
     for each in ("#overlay-title", "#overlay-hint", "#trouble"):
         note_texts(wide, each)
     phone.goto("about:blank")
-    noted(wide, "#overlay-title", "Waiting for the other participant")
-    noted(wide, "#overlay-hint", "a computer player takes their place")
-    noted(wide, "#trouble", "A computer player has taken the place")
+    wait_for_noted(wide, "#overlay-title", "Waiting for the other participant")
+    wait_for_noted(wide, "#overlay-hint", "a computer player takes their place")
+    wait_for_noted(wide, "#trouble", "A computer player has taken the place")
     wide.wait_for_function(PLAYS)
     phone.goto(with_user(study.link, "di"))
-    noted(wide, "#trouble", "The other participant is back")
+    wait_for_noted(wide, "#trouble", "The other participant is back")
     phone.wait_for_function(PLAYS)
     for page in (wide, phone):
         page.wait_for_selector("body[data-step='4']")
@@ -145,10 +147,12 @@ def test_one_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, s
     assert by[-1] != "policy"
 
 
-def test_one_who_finds_no_other_goes_on_and_is_told_apart(come: Come, without_others: StudyProcess) -> None:
+def test_a_participant_without_a_partner_goes_on_and_gets_another_completion_code(
+    come: Come, without_others: StudyProcess
+) -> None:
     study = without_others
     page = come("ed", 360, study)
-    says(page, "#lobby-then", "you go on to the next part of the study without this game")
+    wait_for_text(page, "#lobby-then", "you go on to the next part of the study without this game")
     page.wait_for_selector("body[data-step='4']")
     page.wait_for_selector("text=There was nobody to play with")
     page.get_by_label("Yes").check()

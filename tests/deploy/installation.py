@@ -48,7 +48,7 @@ KEYS = {"AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS
 
 
 @dataclass
-class Ran:
+class CommandResult:
     """A command that has ended."""
 
     code: int
@@ -243,7 +243,7 @@ class Installed(MotoWorld):
 
     # -- commands -------------------------------------------------------------------------------------------------
 
-    def run(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> Ran:
+    def run(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> CommandResult:
         """Run a command in this process, as its users do."""
         capsys.readouterr()
         with pytest.MonkeyPatch.context() as patch:
@@ -252,7 +252,7 @@ class Installed(MotoWorld):
             code = main(arguments)
         printed = capsys.readouterr()
         assert "Traceback" not in printed.err
-        return Ran(code, printed.out, printed.err)
+        return CommandResult(code, printed.out, printed.err)
 
     @contextlib.contextmanager
     def served(self) -> Iterator[dict[str, str]]:
@@ -282,7 +282,7 @@ def environment(endpoint: str = "") -> dict[str, str]:
     return {**kept, **KEYS, **quiet, **more, "PYTHONPATH": str(ROOT), "COLUMNS": "160", "PYTHONUTF8": "1"}
 
 
-def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> Ran:
+def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> CommandResult:
     """Run a command as a process of its own."""
     with tempfile.TemporaryFile("w+") as errors:
         ran = preloaded.start("deploy", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
@@ -294,7 +294,7 @@ def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: 
         err = errors.read()
     assert "Traceback" not in err, err
     assert ran.returncode is not None
-    return Ran(ran.returncode, out, err)
+    return CommandResult(ran.returncode, out, err)
 
 
 @pytest.fixture

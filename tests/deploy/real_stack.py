@@ -73,7 +73,7 @@ class RealStack:
         ec2 = self.client("ec2")
         self.vpc = ec2.create_vpc(CidrBlock="10.86.0.0/16")["Vpc"]["VpcId"]
         self.subnet = ec2.create_subnet(VpcId=self.vpc, CidrBlock="10.86.64.0/18")["Subnet"]["SubnetId"]
-        self.certificate = request(self.world, SITE)
+        self.certificate = request_certificate(self.world, SITE)
         self.policy = self.client("iam").create_policy(PolicyName="hippodrome-researcher", PolicyDocument=POLICY)[
             "Policy"
         ]["Arn"]
@@ -110,20 +110,20 @@ class RealStack:
                 )
         return ""
 
-    def users(self) -> list[str]:
+    def certificate_users(self) -> list[str]:
         """What ACM says uses the certificate: moto's own list."""
         return acm_backends[ACCOUNT][REGION]._certificates[self.certificate].in_use_by
 
     def _delete_SiteDomain(self) -> str:
         if not self.in_use:
             return ""
-        self.users().append(BALANCER)
-        self.clock.after(self.in_use, lambda: self.users().remove(BALANCER))
+        self.certificate_users().append(BALANCER)
+        self.clock.after(self.in_use, lambda: self.certificate_users().remove(BALANCER))
         return ""
 
     def _delete_SiteCertificate(self) -> str:
-        if self.users() or self.clock.time < self.refused_until:
-            return said(f"Certificate {self.certificate} in account {ACCOUNT} is in use.", "Acm")
+        if self.certificate_users() or self.clock.time < self.refused_until:
+            return passed_on(f"Certificate {self.certificate} in account {ACCOUNT} is in use.", "Acm")
         self.client("acm").delete_certificate(CertificateArn=self.certificate)
         return ""
 
@@ -131,25 +131,25 @@ class RealStack:
         iam = self.client("iam")
         entities = iam.list_entities_for_policy(PolicyArn=self.policy)
         if any(entities[f"Policy{kind}"] for kind in ("Users", "Groups", "Roles")):
-            return said("Cannot delete a policy attached to entities.", "Iam")
+            return passed_on("Cannot delete a policy attached to entities.", "Iam")
         if len(iam.list_policy_versions(PolicyArn=self.policy)["Versions"]) > 1:
-            return said("This policy has more than one version.", "Iam")
+            return passed_on("This policy has more than one version.", "Iam")
         iam.delete_policy(PolicyArn=self.policy)
         return ""
 
     def _delete_SweepRole(self) -> str:
         iam = self.client("iam")
         if iam.list_attached_role_policies(RoleName=self.role)["AttachedPolicies"]:
-            return said("Cannot delete entity, must detach all policies first.", "Iam")
+            return passed_on("Cannot delete entity, must detach all policies first.", "Iam")
         if iam.list_role_policies(RoleName=self.role)["PolicyNames"]:
-            return said("Cannot delete entity, must delete policies first.", "Iam")
+            return passed_on("Cannot delete entity, must delete policies first.", "Iam")
         iam.delete_role(RoleName=self.role)
         return ""
 
     def _delete_SiteRecord(self) -> str:
         zones = self.client("route53").list_hosted_zones()["HostedZones"]
         if not any(one["Id"].endswith(self.world.zone.rpartition("/")[2]) for one in zones):
-            return said(f"No hosted zone found with ID: {self.world.zone}", "Route53")
+            return passed_on(f"No hosted zone found with ID: {self.world.zone}", "Route53")
         return ""
 
     def _delete_StartQueue(self) -> str:
@@ -159,13 +159,13 @@ class RealStack:
 
     def _delete_SubnetA(self) -> str:
         if interfaces(self.world):
-            return said(f"The subnet '{self.subnet}' has dependencies and cannot be deleted.", "Ec2")
+            return passed_on(f"The subnet '{self.subnet}' has dependencies and cannot be deleted.", "Ec2")
         self.client("ec2").delete_subnet(SubnetId=self.subnet)
         return ""
 
     def _delete_Vpc(self) -> str:
         if interfaces(self.world):
-            return said(f"The vpc '{self.vpc}' has dependencies and cannot be deleted.", "Ec2")
+            return passed_on(f"The vpc '{self.vpc}' has dependencies and cannot be deleted.", "Ec2")
         self.client("ec2").delete_vpc(VpcId=self.vpc)
         return ""
 
@@ -193,7 +193,7 @@ class RealStack:
                 client.change_resource_record_sets(HostedZoneId=self.world.zone, ChangeBatch=batch)
         client.delete_hosted_zone(Id=self.world.zone)
 
-    def interface(self, seconds: float) -> None:
+    def add_interface(self, seconds: float) -> None:
         """An interface of a task that has ended, which AWS takes away after so long."""
         ec2 = self.client("ec2")
         made = ec2.create_network_interface(SubnetId=self.subnet)["NetworkInterface"]["NetworkInterfaceId"]
@@ -203,7 +203,7 @@ class RealStack:
 POLICY = '{"Version":"2012-10-17","Statement":[{"Effect":"Allow","Action":"s3:ListBucket","Resource":"*"}]}'
 
 
-def said(sentence: str, service: str) -> str:
+def passed_on(sentence: str, service: str) -> str:
     """As CloudFormation passes on what a service says."""
     return (
         f'Resource handler returned message: "{sentence} (Service: {service}, Status Code: 400, Request ID: 0a1b)" '
@@ -215,7 +215,7 @@ def resource(logical: str, kind: str, physical: str) -> dict[str, Any]:
     return {"LogicalResourceId": logical, "ResourceType": kind, "PhysicalResourceId": physical}
 
 
-def request(world: World, domain: str, region: str = REGION) -> str:
+def request_certificate(world: World, domain: str, region: str = REGION) -> str:
     """A certificate that is validated by DNS."""
     acm = world.account.client("acm", region)
     return str(acm.request_certificate(DomainName=domain, ValidationMethod="DNS")["CertificateArn"])
@@ -225,11 +225,11 @@ def validation_record(world: World, arn: str) -> str:
     """The name of the certificate's record, put into the zone as CloudFormation does."""
     described = world.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
     record = described["DomainValidationOptions"][0]["ResourceRecord"]
-    put(world, record["Name"], record["Value"])
+    put_cname(world, record["Name"], record["Value"])
     return str(record["Name"])
 
 
-def put(world: World, name: str, value: str) -> None:
+def put_cname(world: World, name: str, value: str) -> None:
     """A CNAME in the zone."""
     change = {
         "Action": "UPSERT",
@@ -256,7 +256,7 @@ def same_record(world: World, arn: str, like: str, region: str) -> None:
     other.describe = described  # type: ignore[method-assign]
 
 
-def names(world: World) -> set[tuple[str, str]]:
+def zone_records(world: World) -> set[tuple[str, str]]:
     """The records of the zone, but for its own."""
     found = world.account.client("route53").list_resource_record_sets(HostedZoneId=world.zone)["ResourceRecordSets"]
     return {(one["Name"], one["Type"]) for one in found if one["Type"] not in {"NS", "SOA"}}

@@ -61,7 +61,7 @@ class Build:
 
 
 @dataclass
-class Town(Installed):
+class RegisterWorld(Installed):
     """`Installed` with what `register` calls."""
 
     looks: int = 2  # at a build until it ends
@@ -79,7 +79,7 @@ class Town(Installed):
         super().__init__()
         self._inside = threading.local()
 
-    def __enter__(self) -> Town:
+    def __enter__(self) -> RegisterWorld:
         super().__enter__()
         ours: tuple[str, Any] = ("before-call", self._before_call)
         botocore.handlers.BUILTIN_HANDLERS.append(ours)
@@ -123,7 +123,7 @@ class Town(Installed):
                 if self.interrupt is not None and len(self.made) > self.interrupt:
                     raise KeyboardInterrupt
         if action == "ecr:DescribeImages":
-            self._land()
+            self._store_pushed()
         answer = {
             "lambda:Invoke": self._invoke,
             "codebuild:StartBuild": self._start_build,
@@ -203,7 +203,7 @@ class Town(Installed):
             imageManifest=json.dumps(manifest | {"config": {"size": 1, "digest": digest}}),
         )
 
-    def _land(self) -> None:
+    def _store_pushed(self) -> None:
         """What `fake_docker` has pushed since."""
         pushed = self.docker / "pushed" if self.docker else None
         if pushed and pushed.exists():
@@ -278,9 +278,9 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture
-def town(machine: None) -> Iterator[Town]:
+def register_world(machine: None) -> Iterator[RegisterWorld]:
     """An installation, and a machine without Docker."""
-    with Town() as world:
+    with RegisterWorld() as world:
         yield world
 
 
@@ -298,6 +298,6 @@ def configure(folder: Path, *changes: tuple[str, str]) -> None:
     (folder / "config.yml").write_text(text)
 
 
-def bodies(town: Town) -> dict[str, bytes]:
+def bodies(register_world: RegisterWorld) -> dict[str, bytes]:
     """What the bucket holds of the study `maze`, by key."""
-    return {key: town.get(key) for key in town.keys("maze/")}
+    return {key: register_world.get(key) for key in register_world.keys("maze/")}

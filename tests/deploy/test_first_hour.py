@@ -69,11 +69,11 @@ def types(running: RunningInstallation, capsys: Any, command: str, answer: str =
     assert first_hour.differs(first_hour.shown()[command], said, running.root_domain) == "", said
 
 
-def test_one_server_is_rehearsed(running: RunningInstallation, capsys: Any) -> None:
+def test_the_rehearsal_with_one_server_prints_what_the_page_shows(running: RunningInstallation, capsys: Any) -> None:
     types(running, capsys, REHEARSE)
 
 
-def test_bots_prove_what_the_page_says(
+def test_the_rehearsal_with_bots_prints_what_the_page_shows(
     running: RunningInstallation, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -96,7 +96,7 @@ def played(running: RunningInstallation) -> None:
 
 
 @pytest.mark.parametrize("command", [STATUS, DATA, COST])
-def test_what_came_of_it_is_shown(
+def test_the_results_are_shown_as_the_page_says(
     running: RunningInstallation,
     played: None,
     capsys: Any,

@@ -105,7 +105,7 @@ def pattern(message: str) -> str:
 
 
 @pytest.mark.parametrize("message", STOPS)
-def test_what_stops_is_said_with_a_remedy(
+def test_failures_that_stop_deploy_are_reported_with_a_remedy(
     world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     STOPS[message](world)
@@ -115,7 +115,7 @@ def test_what_stops_is_said_with_a_remedy(
 
 
 @pytest.mark.parametrize("message", GOES_ON)
-def test_what_mends_itself_is_said_and_it_goes_on(
+def test_failures_that_pass_are_reported_and_deploy_goes_on(
     world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str], message: str
 ) -> None:
     GOES_ON[message](world)
@@ -124,7 +124,7 @@ def test_what_mends_itself_is_said_and_it_goes_on(
     assert done
 
 
-def test_where_nothing_is_wrong_none_of_it_is_said(
+def test_without_failures_none_of_these_messages_is_printed(
     world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     done, said = deploying(world, game, capsys)

@@ -22,10 +22,10 @@ from console import formatting
         (5_000_000_000_000, "5,000.0 GB"),
     ],
 )
-def test_sizes(number: int, said: str) -> None:
+def test_sizes_are_formatted(number: int, said: str) -> None:
     assert formatting.size(number) == said
 
 
-def test_counts_and_durations() -> None:
+def test_counts_and_durations_are_formatted() -> None:
     assert [formatting.count(n, "server") for n in (0, 1, 1_200)] == ["0 servers", "1 server", "1,200 servers"]
     assert [formatting.duration(s) for s in (0.4, 89.4, 90, 900)] == ["0 s", "89 s", "2 min", "15 min"]

@@ -60,7 +60,7 @@ def erase(world: Installed) -> None:
         ),
     ],
 )
-def test_calls(
+def test_finding_and_removing_leftovers_takes_these_calls(
     installed: Installed,  # noqa: F811
     remove: Callable[[Installed], None],
     expected: dict[str, int],

@@ -15,10 +15,10 @@ from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.studies import study
-from tests.deploy.registering import Town, machine, town
+from tests.deploy.registering import RegisterWorld, machine, register_world
 from tests.infra.test_researchers import SHOWN
 
-__all__ = ["machine", "town"]
+__all__ = ["machine", "register_world"]
 
 AS_IAM = {
     "s3:ListObjectsV2": "s3:ListBucket",
@@ -34,26 +34,28 @@ REFUSED = {"logs:DescribeLogGroups"}  # knows no resources; `logs` goes on witho
     ["status", "cost --project maze", "links --new 2 --project maze", "logs next_step", "data {folder} --project maze"],
 )
 def test_a_command_of_researchers_needs_no_more_than_their_policy(
-    town: Town, capsys: Any, tmp_path: Path, command: str
+    register_world: RegisterWorld, capsys: Any, tmp_path: Path, command: str
 ) -> None:
     if evaluator() is None:
         pytest.skip(MISSING)
-    SecretCache(town.platform.documents).get_or_create()
-    town.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
-    town.participant("alice", answered=2)
-    town.record("alice", nonce="n")
-    town.platform.tasks.run(TaskRequest(f"s{'a' * 20}-1", "hippodrome", "hippodrome", 0.25, 0.5, {"TOKEN": "t"}))
+    SecretCache(register_world.platform.documents).get_or_create()
+    register_world.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
+    register_world.participant("alice", answered=2)
+    register_world.record("alice", nonce="n")
+    register_world.platform.tasks.run(
+        TaskRequest(f"s{'a' * 20}-1", "hippodrome", "hippodrome", 0.25, 0.5, {"TOKEN": "t"})
+    )
     for action in REFUSED:
-        town.refuse(action, lambda _: True, "AccessDeniedException", "not a researcher's")
-    town.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/next_step")
-    town.asked.clear()
-    ran = town.run(capsys, *command.format(folder=tmp_path / "out").split())
+        register_world.refuse(action, lambda _: True, "AccessDeniedException", "not a researcher's")
+    register_world.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/next_step")
+    register_world.asked.clear()
+    ran = register_world.run(capsys, *command.format(folder=tmp_path / "out").split())
     assert ran.code == Exit.DONE, ran.err
-    made = {AS_IAM.get(action, action) for action, _ in town.asked} - FREE
+    made = {AS_IAM.get(action, action) for action, _ in register_world.asked} - FREE
     assert made, "it has asked for something"
     assert made - SHOWN.keys() - REFUSED == set()
-    judge = Judge(account_of(town))
-    keys = {told["Key"] for action, told in town.asked if action == "s3:GetObject"}
-    bucket = f"arn:aws:s3:::{town.env['BUCKET']}"
+    judge = Judge(account_of(register_world))
+    keys = {told["Key"] for action, told in register_world.asked if action == "s3:GetObject"}
+    bucket = f"arn:aws:s3:::{register_world.env['BUCKET']}"
     assert [key for key in keys if not judge.may("ResearcherPolicy", Ask("s3:GetObject", f"{bucket}/{key}"))] == []
     assert KEY not in keys

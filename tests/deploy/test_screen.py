@@ -34,7 +34,7 @@ def make(*arguments: str) -> str:
     return run_make("-n", *arguments).stdout.splitlines()[-1]
 
 
-def test_progress_is_a_line_where_nobody_watches(capsys: Any) -> None:
+def test_progress_is_a_line_without_a_terminal(capsys: Any) -> None:
     with screen.progress() as bar:
         bar.advance(bar.add_task("Uploading", total=3), 3)
     assert capsys.readouterr().err == "Uploading …\n"
@@ -69,7 +69,7 @@ def test_a_project_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "1x", "x" * 31, "pilot-", "pilot_2", "ärger"])
-def test_a_stack_is_named_so_that_its_bucket_can_be(name: str) -> None:
+def test_the_name_of_a_stack_must_fit_its_bucket(name: str) -> None:
     assert options.stack_name("x" * 30)
     assert options.stack_name("pilot-2") == "pilot-2"
     with pytest.raises(Problem, match="cannot be the name"):
@@ -77,33 +77,33 @@ def test_a_stack_is_named_so_that_its_bucket_can_be(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["default", "Default", "xn--pilot", "sthree-x", "amzn-s3-demo-x"])
-def test_no_installation_has_a_name_that_aws_keeps(name: str) -> None:
+def test_names_that_aws_reserves_are_refused(name: str) -> None:
     assert options.stack_name("default-2") == "default-2"
     with pytest.raises(Problem, match="AWS keeps that name"):
         options.stack_name(name)
 
 
 @pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
-def test_make_means_the_study_that_is_named(target: str) -> None:
+def test_make_passes_the_project_to_deploy(target: str) -> None:
     words = " ".join(make(target, "PROJECT=../maze", "ARGS=--json").split())
     assert f'deploy {target} --project "../maze/" --json' in words
     assert "--project" not in make(target)
 
 
-def test_make_cost_and_register_take_the_folder() -> None:
+def test_make_cost_passes_the_folder_and_make_destroy_does_not() -> None:
     assert 'deploy cost "../my study"' in make("cost", "PROJECT=../my study")
     assert "PROJECT" not in make("destroy", "PROJECT=../maze")
     assert "maze" not in make("destroy", "PROJECT=../maze")
 
 
-def test_make_help_stands_in_columns() -> None:
+def test_make_help_is_aligned_in_columns() -> None:
     shown = run_make("help").stdout.splitlines()
     assert len(shown) > 15
     assert {line.index(line[18:].lstrip()) for line in shown} == {20}
 
 
 @pytest.mark.parametrize(("code", "ends"), [(0, 0), (3, 0), (1, 2), (4, 2)])
-def test_make_takes_a_plan_with_something_to_do_for_no_error(tmp_path: Path, code: int, ends: int) -> None:
+def test_make_plan_with_changes_is_no_error(tmp_path: Path, code: int, ends: int) -> None:
     (tmp_path / "bin").mkdir()
     python = tmp_path / "bin" / "python"
     python.write_text(f"#!/bin/sh\nexit {code}\n")
@@ -115,7 +115,7 @@ def test_make_takes_a_plan_with_something_to_do_for_no_error(tmp_path: Path, cod
     assert (f"Error {code}" in ran.stderr) is bool(ends)
 
 
-def test_a_python_without_packages_goes_on_with_that_of_make(tmp_path: Path) -> None:
+def test_deploy_in_a_python_without_packages_continues_in_that_of_make(tmp_path: Path) -> None:
     """`-S` hides the packages, as another Python of the machine would."""
     shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "-I", "-S", "-c", "import sys; sys.path.insert(0, '.'); import deploy.__main__"]
@@ -140,7 +140,7 @@ def test_the_list_of_commands_fits_a_terminal(capsys: Any, monkeypatch: Any) -> 
     assert "..." not in listed
 
 
-def test_the_end_of_the_input_is_a_no(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_the_input_declines(monkeypatch: pytest.MonkeyPatch) -> None:
     def ends() -> str:
         raise EOFError
 

@@ -46,7 +46,7 @@ def at_once(act: Callable[[int], object]) -> None:
 
 
 @pytest.mark.usefixtures("restless_threads")
-def test_of_many_processes_that_create_a_document_at_once_one_wins(installed: Installed) -> None:
+def test_only_one_of_many_processes_creates_a_document(installed: Installed) -> None:
     with installed.served() as env:
         place = urlsplit(env["AWS_ENDPOINT_URL"])
         for document in range(20):
@@ -64,7 +64,7 @@ def test_of_many_processes_that_create_a_document_at_once_one_wins(installed: In
 
 
 @pytest.mark.usefixtures("restless_threads")
-def test_a_task_has_one_address_whoever_asks_first() -> None:
+def test_a_task_has_the_same_address_for_all_threads() -> None:
     with MotoWorld() as world:
         task = world.platform.tasks.run(MotoBackend(world).request(name()))
         found: list[str] = []
@@ -72,7 +72,7 @@ def test_a_task_has_one_address_whoever_asks_first() -> None:
         assert len(set(found)) == 1
 
 
-def test_clients_are_made_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clients_of_threads_are_made_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """botocore's sessions are not thread-safe."""
     under_way, most = set[int](), 0
 

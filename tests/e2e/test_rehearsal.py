@@ -289,7 +289,7 @@ def test_a_study_that_is_held_already(project: Any, hold: Any) -> None:
     assert "6 of 6" in text
 
 
-def test_the_copy_differs_only_where_it_must(project: Any, tmp_path: Path) -> None:
+def test_the_copy_differs_from_the_study_only_where_it_must(project: Any, tmp_path: Path) -> None:
     import yaml
 
     folder = project(live=False, ui={"fire": True})

@@ -9,7 +9,7 @@ from typing import Any
 
 from console.problem import Exit
 from deploy.__main__ import main
-from tests.deploy.installation import Ran
+from tests.deploy.installation import CommandResult
 from tests.export.data_world import into_folder
 
 
@@ -21,12 +21,12 @@ class Place:
         self.data, self.out = tmp / "data", tmp / "out"
         self.put = into_folder(self.data)
 
-    def run(self, *more: str, out: Path | None = None) -> Ran:
+    def run(self, *more: str, out: Path | None = None) -> CommandResult:
         self._capsys.readouterr()
         code = main(["data", str(out or self.out), "--project", "maze", "--from", str(self.data), *more])
         printed = self._capsys.readouterr()
         assert "This should not have happened" not in printed.err, printed.err
-        return Ran(code, printed.out, printed.err)
+        return CommandResult(code, printed.out, printed.err)
 
     def rows(self, name: str = "answers") -> list[dict[str, str]]:
         return rows(self.out / f"{name}.csv")

@@ -7,7 +7,7 @@ from typing import Any
 
 from console.problem import Exit
 from deploy.__main__ import main
-from tests.deploy.installation import Installed, Ran
+from tests.deploy.installation import CommandResult, Installed
 from tests.export.data_world import crowd, into_folder
 from tests.export.place import Place, rows
 
@@ -26,11 +26,11 @@ def project_folder(tmp: Path, config: str = LOCAL) -> Path:
     return folder
 
 
-def told(capsys: Any, *arguments: str) -> Ran:
+def told(capsys: Any, *arguments: str) -> CommandResult:
     capsys.readouterr()
     code = main(["data", *arguments])
     printed = capsys.readouterr()
-    return Ran(code, printed.out, printed.err)
+    return CommandResult(code, printed.out, printed.err)
 
 
 def test_a_study_of_this_machine_is_converted_without_a_word_about_aws(

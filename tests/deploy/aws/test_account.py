@@ -42,7 +42,7 @@ def credentials(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "testing")
 
 
-def test_credentials_and_a_region_that_are_missing_are_told_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_credentials_and_a_missing_region_are_reported_together(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
@@ -55,7 +55,7 @@ def test_credentials_and_a_region_that_are_missing_are_told_at_once(monkeypatch:
 
 
 @pytest.mark.parametrize(("chosen", "profile"), [(None, "default"), ("lab", "lab")])
-def test_credentials_of_aws_login_are_handed_on_by_a_command(
+def test_the_advice_on_credentials_of_aws_login_works(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, chosen: str | None, profile: str
 ) -> None:
     """What is advised works: here with a command that prints credentials as AWS's command line does."""
@@ -84,7 +84,7 @@ def test_credentials_of_aws_login_are_handed_on_by_a_command(
     assert found.get_frozen_credentials().access_key == HANDED_ON["AccessKeyId"]
 
 
-def test_clients_are_made_one_after_the_other_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_client_is_made_once_and_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """botocore's sessions are not made for threads; the commands look at many things at once."""
     under_way, most, made = 0, 0, []
     counting = threading.Lock()
@@ -117,7 +117,7 @@ def test_clients_are_made_one_after_the_other_and_once(monkeypatch: pytest.Monke
     assert sorted(made) == sorted([*SERVICES, "s3"])  # the platform has its own, with shorter timeouts
 
 
-def test_where_the_region_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_region_comes_from_the_option_or_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Problem, match="No AWS region"):
         open_account()
     monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-west-1")
@@ -127,7 +127,7 @@ def test_where_the_region_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
     assert open_account(region="us-east-1").client("s3").meta.region_name == "us-east-1"
 
 
-def test_a_profile_that_is_not_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_profile_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "config").write_text("[profile lab]\nregion = eu-west-1\n[default]\n")
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "config"))
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")

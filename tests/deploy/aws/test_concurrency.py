@@ -34,19 +34,19 @@ class Lambda(Account):
 REFUSED = ClientError({"Error": {"Code": "AccessDeniedException"}}, "GetAccountSettings")
 
 
-def test_at_least_half_of_the_account_is_left_for_pages_or_what_the_least_mappings_leave() -> None:
+def test_queues_take_at_most_half_of_the_executions_or_the_least_that_lambda_allows() -> None:
     least = 3 * concurrency.LEAST  # Lambda's MaximumConcurrency is 2 at least, and there are three mappings
     for limit in range(8, 1001):
         assert concurrency.workers(limit) <= max(limit / 2, least), limit
 
 
-def test_a_new_account_and_a_usual_one() -> None:
+def test_the_concurrency_of_new_and_usual_accounts() -> None:
     assert concurrency.parameters(10) == {"StartConcurrency": "2"}
     assert concurrency.parameters(50) == {"StartConcurrency": "20"}
     assert concurrency.parameters(1000) == {"StartConcurrency": Template.read().defaults["StartConcurrency"]}
 
 
-def test_the_template_takes_what_lambda_takes() -> None:
+def test_the_template_and_concurrency_py_agree_about_mappings() -> None:
     template = Template.read().body
     parameter = template["Parameters"]["StartConcurrency"]
     assert (parameter["MinValue"], parameter["MaxValue"]) == (2, 1000)
@@ -68,7 +68,7 @@ def test_the_template_takes_what_lambda_takes() -> None:
         pytest.param(REFUSED, {"StartConcurrency": "2"}, "2", id="nobody tells: as it was"),
     ],
 )
-def test_deploying_chooses_by_what_the_account_has_left(
+def test_settings_choose_the_concurrency_by_unreserved_executions(
     answer: int | ClientError, before: dict[str, str], chosen: str
 ) -> None:
     found = StackSettings().parameters(Lambda(answer), Template.read().defaults, {**LEFT, **before}, "code")

@@ -37,7 +37,7 @@ def left(account: Account) -> list[Version]:
     return [*VersionedBucket(account, NAME).versions()]
 
 
-def test_versions_and_delete_markers_go(account: Account) -> None:
+def test_versions_and_delete_markers_are_deleted(account: Account) -> None:
     put(account, "a", "a", "b")
     account.client("s3").delete_object(Bucket=NAME, Key="b")
     deleted: list[Version] = []
@@ -51,14 +51,14 @@ def test_versions_and_delete_markers_go(account: Account) -> None:
     ]
 
 
-def test_what_is_written_meanwhile_goes_too(account: Account) -> None:
+def test_objects_that_are_written_meanwhile_are_deleted_too(account: Account) -> None:
     put(account, "a")
     late = iter([("b",), ("c",)])
     VersionedBucket(account, NAME).empty(lambda _: put(account, *next(late, ())))
     assert left(account) == []
 
 
-def test_only_what_lies_below_the_prefix_is_listed(account: Account) -> None:
+def test_only_keys_below_the_prefix_are_listed(account: Account) -> None:
     put(account, "maze/users/ann/1", "maze/users/anna/1", "maze/users/ann", "other/1")
     bucket = VersionedBucket(account, NAME)
     assert [one.key for one in bucket.versions("maze/users/ann/")] == ["maze/users/ann/1"]
@@ -74,7 +74,9 @@ def test_unfinished_uploads_are_aborted(account: Account) -> None:
     assert [*bucket.uploads("maze/")] == []
 
 
-def test_what_is_refused_is_told_and_not_noted_as_deleted(account: Account, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_deletions_are_reported_and_not_counted_as_deleted(
+    account: Account, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put(account, "a", "b", "c")
     monkeypatch.setattr(versioned, "BATCH", 2)
     versions = left(account)

@@ -50,7 +50,7 @@ def test_every_handler_becomes_a_function(built: dict[str, build.Function]) -> N
     assert "web" not in built
 
 
-def test_what_functions_share_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_functions_share_are_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tree = build._Tree(packages.ROOT)
     assert tree.sources("lambdas.web") is tree.sources("lambdas.web")
     read, text = [], packages.Wheel._text
@@ -65,7 +65,7 @@ def test_what_functions_share_is_read_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(read) == len(set(read))
 
 
-def test_each_carries_only_what_it_imports(built: dict[str, build.Function]) -> None:
+def test_each_zip_carries_only_what_its_function_imports(built: dict[str, build.Function]) -> None:
     assert "web/frame.html" in names(built["next_step"])
     assert "lambdas/web.py" in names(built["next_step"])
     assert not any(name.startswith("web/") for name in names(built["sweep"]))
@@ -83,7 +83,7 @@ def test_each_carries_only_what_it_imports(built: dict[str, build.Function]) -> 
         assert {Path(one).stem for one in others} <= allowed
 
 
-def test_nothing_goes_in_that_is_not_needed_to_run(built: dict[str, build.Function]) -> None:
+def test_zips_hold_only_what_is_needed_to_run(built: dict[str, build.Function]) -> None:
     for function in built.values():
         for name in names(function):
             assert name.split("/")[0] not in RUNTIME, name
@@ -209,7 +209,7 @@ def copy_of_project(folder: Path) -> Path:
 
 
 @pytest.mark.explores
-def test_same_input_same_bytes(
+def test_the_same_input_gives_the_same_bytes(
     built: dict[str, build.Function], tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     target = request.node.callspec.params["built"]
@@ -230,7 +230,7 @@ def test_same_input_same_bytes(
         assert hashlib.sha256(packed).digest() == hashlib.sha256(function.pack()).digest()
 
 
-def test_a_change_changes_only_the_functions_that_import_it(tmp_path: Path) -> None:
+def test_a_changed_file_changes_only_the_zips_that_import_it(tmp_path: Path) -> None:
     copy = copy_of_project(tmp_path)
     before = {function.name: function.key for function in build.functions(LAMBDA, copy)}
     with (copy / "hippodrome" / "servers" / "sweep.py").open("a") as file:
@@ -239,7 +239,7 @@ def test_a_change_changes_only_the_functions_that_import_it(tmp_path: Path) -> N
     assert {name for name in before if before[name] != after[name]} == {"sweep"}
 
 
-def test_line_ends_do_not_matter(tmp_path: Path) -> None:
+def test_line_ends_do_not_change_the_zip(tmp_path: Path) -> None:
     copy = copy_of_project(tmp_path)
     before = {function.name: function.key for function in build.functions(LAMBDA, copy)}
     for path in copy.rglob("*.py"):
@@ -276,7 +276,7 @@ def test_imports_are_found(text: str, package: bool, expected: set[str]) -> None
     assert build.imported(build.SourceModule(text, package), "p.q.m") == expected
 
 
-def test_a_module_that_no_package_has_is_a_sentence(tmp_path: Path) -> None:
+def test_a_module_without_a_package_is_reported_in_a_sentence(tmp_path: Path) -> None:
     copy = copy_of_project(tmp_path)
     with (copy / "lambdas" / "sweep.py").open("a") as file:
         file.write("\nimport no_such_module_at_all\n")
@@ -284,7 +284,7 @@ def test_a_module_that_no_package_has_is_a_sentence(tmp_path: Path) -> None:
         build.functions(LAMBDA, copy)
 
 
-def test_a_mistake_in_the_code_is_a_sentence(tmp_path: Path) -> None:
+def test_a_syntax_error_is_reported_in_a_sentence(tmp_path: Path) -> None:
     copy = copy_of_project(tmp_path)
     (copy / "lambdas" / "sweep.py").write_text("def (:")
     with pytest.raises(Problem, match="is not Python: line 1"):
@@ -305,7 +305,7 @@ def test_pins_agree_with_the_requirements() -> None:
     assert all(len(pin.sha256) == 64 for pin in pins.values())
 
 
-def test_pins_are_what_was_tested() -> None:
+def test_the_pinned_versions_are_those_that_tests_run_with() -> None:
     """What goes into the zips is what these tests run with."""
     import importlib.metadata
 
@@ -342,7 +342,7 @@ def test_a_wheel_is_compared_with_its_record(tmp_path: Path) -> None:
         packages.Wheel(tmp_path / "torn-1.0-py3-none-any.whl").check()
 
 
-def test_what_of_a_wheel_goes_in(tmp_path: Path) -> None:
+def test_the_zip_takes_only_the_needed_files_of_a_wheel(tmp_path: Path) -> None:
     wheel = packages.Wheel(
         make_wheel(
             tmp_path,
@@ -390,7 +390,7 @@ def test_an_interrupted_download_leaves_nothing_behind(tmp_path: Path) -> None:
     assert Brings(LAMBDA, pins, tmp_path).wheels(pins)["thing"].modules == {"thing"}
 
 
-def test_wheels_are_kept(tmp_path: Path) -> None:
+def test_wheels_are_cached(tmp_path: Path) -> None:
     pins = {"thing": Pin("thing", "1.0")}
     first, second = Brings(LAMBDA, pins, tmp_path), Brings(LAMBDA, pins, tmp_path)
     first.wheels(pins)
@@ -414,19 +414,19 @@ def test_a_damaged_wheel_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob("*.whl"))
 
 
-def test_pip_refusing_is_a_sentence(tmp_path: Path) -> None:
+def test_a_failure_of_pip_is_reported_in_a_sentence(tmp_path: Path) -> None:
     pins = {"hippodrome-no-such-package": Pin("hippodrome-no-such-package", "1.0")}
     with pytest.raises(Problem, match="could not be downloaded") as caught:
         WheelCache(LAMBDA, pins, tmp_path).wheels(pins)
     assert any("hippodrome-no-such-package" in line for line in caught.value.details)
 
 
-def test_what_is_not_pinned_is_a_sentence(tmp_path: Path) -> None:
+def test_an_unpinned_package_is_reported_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(Problem, match="does not pin"):
         WheelCache(LAMBDA, {}, tmp_path).wheels(["thing"])
 
 
-def test_the_cache_is_where_caches_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_cache_is_in_the_systems_folder_for_caches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "linux")
     assert packages.cache_folder() == tmp_path / "hippodrome"
@@ -435,7 +435,7 @@ def test_the_cache_is_where_caches_are(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert packages.cache_folder() == tmp_path / "local" / "hippodrome"
 
 
-def test_target_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_target_comes_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("HIPPODROME_TARGET", raising=False)
     assert Target.from_env() == Target("3.13", "aarch64")
     monkeypatch.setenv("HIPPODROME_TARGET", "here")
@@ -455,7 +455,7 @@ def test_zips_hold_bytecode_that_python_takes_without_looking_at_the_source(
     assert done.stdout.strip().endswith(".pyc")
 
 
-def test_without_that_python_there_is_no_bytecode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_targets_python_there_is_no_bytecode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bytecode.shutil, "which", lambda name: None)
     assert bytecode.compiler("3.99") is None
 

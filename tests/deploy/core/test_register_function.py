@@ -14,45 +14,51 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, SecretCache
 from testing.studies import study
 from tests.deploy.installation import STACK
-from tests.deploy.registering import Town, machine, town
+from tests.deploy.registering import RegisterWorld, machine, register_world
 
-__all__ = ["machine", "town"]
+__all__ = ["machine", "register_world"]
 
 
-def hide(town: Town) -> None:
-    account = open_account(region=town.region)
+def hide(register_world: RegisterWorld) -> None:
+    account = open_account(region=register_world.region)
     register_function.hide_secrets(account, find_installation(account, STACK))
 
 
-def test_secrets_of_an_earlier_version_go_out_of_the_list(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
-    town.register(study(secret="of-old"), msgspec.structs.replace(study(), id="other", secret="others-of-old"))
-    hide(town)
-    assert b"of-old" not in town.get(MASTER_LIST)
+def test_secrets_of_an_earlier_version_are_removed_from_the_list(
+    register_world: RegisterWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    register_world.register(
+        study(secret="of-old"), msgspec.structs.replace(study(), id="other", secret="others-of-old")
+    )
+    hide(register_world)
+    assert b"of-old" not in register_world.get(MASTER_LIST)
     assert "2 secrets of an earlier version went out" in capsys.readouterr().err
-    found = ProjectCache(town.platform, SecretCache(town.platform.documents)).project("maze")
+    found = ProjectCache(register_world.platform, SecretCache(register_world.platform.documents)).project("maze")
     assert found
     assert found.secret == "of-old"
 
 
-def test_where_there_are_none_nobody_is_asked(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
-    hide(town)
-    town.register(study(secret="", salt="s"))
-    hide(town)
-    assert "lambda:Invoke" not in town.made
-    assert KEY not in list(town.keys())
+def test_without_such_secrets_the_function_is_not_called(
+    register_world: RegisterWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hide(register_world)
+    register_world.register(study(secret="", salt="s"))
+    hide(register_world)
+    assert "lambda:Invoke" not in register_world.made
+    assert KEY not in list(register_world.keys())
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("trouble", ["function", "list", "old"])
-def test_what_cannot_be_done_now_is_said(
-    town: Town, capsys: pytest.CaptureFixture[str], monkeypatch: Any, trouble: str
+def test_a_failure_says_that_the_next_registration_moves_the_secrets(
+    register_world: RegisterWorld, capsys: pytest.CaptureFixture[str], monkeypatch: Any, trouble: str
 ) -> None:
-    town.register(study(secret="of-old"))
+    register_world.register(study(secret="of-old"))
     if trouble == "function":
-        town.function_error = True
+        register_world.function_error = True
     elif trouble == "list":
-        town.put(MASTER_LIST, b"{")
+        register_world.put(MASTER_LIST, b"{")
     else:
         monkeypatch.setattr("lambdas.update_project_master_list.handler", lambda *_: {"problems": ["steps: missing"]})
-    hide(town)
+    hide(register_world)
     assert "the next `register` moves them" in " ".join(capsys.readouterr().err.split())

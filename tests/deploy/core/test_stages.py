@@ -43,24 +43,24 @@ class World:
         self.calls += 1
 
 
-def test_a_plan_is_data_that_can_be_compared() -> None:
+def test_plans_can_be_compared() -> None:
     world = World()
     assert world.plan(["task", "timer"]) == [PlanStep(world.remove, ("task",)), PlanStep(world.remove, ("timer",))]
 
 
-def test_a_plan_is_executed_in_its_order_and_what_it_did_is_looked_at() -> None:
+def test_the_steps_of_a_plan_are_executed_in_order() -> None:
     world = World(*THINGS)
     assert world.executor.converge(world.look, world.plan) == []
     assert (world.removed, world.slept) == ([*THINGS], [])
 
 
-def test_where_nothing_is_nothing_is_done() -> None:
+def test_without_things_to_remove_there_is_only_one_look() -> None:
     world = World()
     assert world.executor.converge(world.look, world.plan) == []
     assert world.calls == 1
 
 
-def test_without_note_the_first_failure_ends_it() -> None:
+def test_without_note_the_first_failure_ends_the_run() -> None:
     world = World(*THINGS)
     world.refuses["timer"] = 1
     with pytest.raises(ConnectionError, match="timer"):
@@ -68,7 +68,7 @@ def test_without_note_the_first_failure_ends_it() -> None:
     assert world.removed == ["task"]
 
 
-def test_with_note_one_failure_keeps_nothing_else_and_is_tried_again() -> None:
+def test_with_note_the_other_steps_go_on_and_the_failed_one_is_tried_again() -> None:
     world = World(*THINGS)
     world.refuses["timer"] = 1
     noted: list[Exception] = []
@@ -90,7 +90,7 @@ def test_interrupted_at_any_call_the_next_run_ends_clean(call: int) -> None:
     assert sorted(world.removed) == sorted(THINGS)
 
 
-def test_what_appears_while_it_works_is_found_and_removed_too() -> None:
+def test_things_that_appear_meanwhile_are_removed_too() -> None:
     world = World("task")
     appearing = iter(["task 2", "task 3"])
     remove = world.remove
@@ -104,7 +104,7 @@ def test_what_appears_while_it_works_is_found_and_removed_too() -> None:
     assert (world.removed, world.slept) == (["task", "task 2", "task 3"], [])
 
 
-def test_what_is_left_when_time_is_over_is_the_answer() -> None:
+def test_the_result_is_what_is_left_when_time_is_over() -> None:
     world = World(*THINGS)
     world.refuses["name"] = 1000
     assert world.executor.converge(world.look, world.plan, note=lambda _: None, seconds=60, pause=20) == ["name"]
@@ -117,7 +117,7 @@ def test_the_first_plan_is_executed_even_without_time() -> None:
     assert world.removed == [*THINGS]
 
 
-def test_rounds_are_counted_by_plans() -> None:
+def test_rounds_limit_the_number_of_plans() -> None:
     world = World("task")
     world.refuses["task"] = 1000
     noted: list[Exception] = []
@@ -125,14 +125,14 @@ def test_rounds_are_counted_by_plans() -> None:
     assert len(noted) == 3
 
 
-def test_what_only_has_to_be_waited_for_is_waited_for() -> None:
+def test_things_without_a_plan_are_waited_for() -> None:
     world = World()
     looks = iter([["saving"], ["saving"], []])
     assert world.executor.converge(lambda: next(looks), lambda _: [], pause=0, seconds=60) == []
     assert world.slept == [0, 0]
 
 
-def test_waiting_ends_when_nothing_is_found_and_says_what_is_left_otherwise() -> None:
+def test_waiting_ends_when_nothing_is_left_or_returns_what_is_left() -> None:
     world = World()
     looks = iter([["a", "b"], ["b"], []])
     assert world.executor.wait(lambda: next(looks), 600, pause=20) == []
@@ -141,14 +141,14 @@ def test_waiting_ends_when_nothing_is_found_and_says_what_is_left_otherwise() ->
     assert world.slept == [20, 20, 20, 20, 20]
 
 
-def test_time_is_over_by_the_clock_too() -> None:
+def test_waiting_ends_by_the_clock_too() -> None:
     ticks = iter(range(0, 1000, 50))
     slept: list[float] = []
     assert Executor(slept.append, clock=lambda: float(next(ticks))).wait(lambda: ["b"], 90) == ["b"]
     assert len(slept) == 1
 
 
-def test_a_try_that_fails_is_repeated_after_what_helps() -> None:
+def test_a_failed_try_is_repeated_if_the_remedy_helped() -> None:
     tries: list[int] = []
     helped: list[Exception] = []
 
@@ -162,7 +162,7 @@ def test_a_try_that_fails_is_repeated_after_what_helps() -> None:
     assert (len(tries), len(helped)) == (3, 2)
 
 
-def test_a_try_that_nothing_helps_is_not_repeated() -> None:
+def test_a_failed_try_is_not_repeated_without_a_remedy() -> None:
     tries: list[int] = []
 
     def act() -> None:
@@ -174,7 +174,7 @@ def test_a_try_that_nothing_helps_is_not_repeated() -> None:
     assert len(tries) == 1
 
 
-def test_the_last_try_fails_as_it_does() -> None:
+def test_the_failure_of_the_last_try_is_raised() -> None:
     tries: list[int] = []
 
     def act() -> None:

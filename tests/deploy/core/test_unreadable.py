@@ -41,14 +41,14 @@ def prepare(world: Installed, *projects: Project) -> None:
             world.put(step_key(project.id, file), source.encode())
 
 
-def spoil(world: Installed) -> None:
+def add_broken_entry(world: Installed) -> None:
     """An entry beside the good one that HIPPO might have written; a step of it is missing."""
     listed = json.loads(world.get(MASTER_LIST))
     listed["projects"].append({"id": "broken", "live": True, "steps": {"2": "consent.html"}})
     world.put(MASTER_LIST, json.dumps(listed).encode())
 
 
-def found(account: Account) -> list[Finding]:
+def findings_of(account: Account) -> list[Finding]:
     """What doctor says that is not good. Never an id, and never without a remedy."""
     findings = [one for one in examine(context(account), CHECKS) if one.mark is not Mark.GOOD]
     assert not any(USER in one.text + one.advice for one in findings)
@@ -56,16 +56,18 @@ def found(account: Account) -> list[Finding]:
     return findings
 
 
-def test_where_all_can_be_read_doctor_says_so(world: Installed, account: Account) -> None:
+def test_doctor_says_that_all_documents_can_be_read(world: Installed, account: Account) -> None:
     world.participant(USER, answered=2)
     world.record(USER)
     lines = [(one.mark, one.check) for one in examine(context(account), CHECKS)]
     assert lines == [(Mark.GOOD, "documents"), (Mark.GOOD, "pages")]
 
 
-def test_doctor_names_an_entry_of_the_list_of_projects(world: Installed, account: Account, capsys: Any) -> None:
-    spoil(world)
-    (line,) = found(account)
+def test_doctor_names_an_unreadable_entry_of_the_list_of_projects(
+    world: Installed, account: Account, capsys: Any
+) -> None:
+    add_broken_entry(world)
+    (line,) = findings_of(account)
     assert (line.mark, line.check) == (Mark.BAD, "project broken")
     assert "counts as closed" in line.text
     assert "Register it again" in line.advice
@@ -78,50 +80,52 @@ def test_doctor_looks_for_the_pages_of_an_entry_that_hippo_wrote(world: Installe
     world.put(MASTER_LIST, json.dumps(listed).encode())
     SecretCache(world.platform.documents).get_or_create()
     world.put(step_key("theirs", "consent", ""), b"<p>")
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check, line.text) == (Mark.BAD, "project theirs", "Step finalStep: bye.html is missing.")
 
 
-def test_doctor_misses_what_tickets_and_links_are_derived_from(installed: Installed, account: Account) -> None:
+def test_doctor_names_the_missing_secret(installed: Installed, account: Account) -> None:
     prepare(installed, study(secret="", salt="s"))
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check, line.text) == (
         Mark.BAD,
         "secret",
         "_secret.json is gone: pages answer with an error.",
     )
     SecretCache(installed.platform.documents).get_or_create()
-    assert found(account) == []
+    assert findings_of(account) == []
 
 
-def test_doctor_names_a_servers_record(world: Installed, account: Account) -> None:
+def test_doctor_names_an_unreadable_record_of_a_server(world: Installed, account: Account) -> None:
     label = ids.server_label("maze", USER)
     world.put(server.key(label), b"{")
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check) == (Mark.BAD, "servers")
     assert server.key(label) in line.text
 
 
-def test_doctor_names_a_lobbys_document_and_counts_those_of_sessions(installed: Installed, account: Account) -> None:
+def test_doctor_names_an_unreadable_lobby_and_counts_unreadable_sessions(
+    installed: Installed, account: Account
+) -> None:
     pairs = study(players=2)
     prepare(installed, pairs)
     SecretCache(installed.platform.documents).get_or_create()
     good = SessionDocument("s." + "0" * 20, 2, (Member(USER, None, 0),))
     installed.put(session_key("maze", good.id), good.to_json())
-    assert found(account) == []
+    assert findings_of(account) == []
     installed.put("_lobbies/maze.json", b"{")
     installed.put(session_key("maze", "s." + "1" * 20), b'{"members": 7}')
-    lobby, session = found(account)
+    lobby, session = findings_of(account)
     assert (lobby.mark, lobby.text[:23]) == (Mark.LOOK, "_lobbies/maze.json cann")
     assert (session.mark, session.check) == (Mark.BAD, "project maze")
     assert session.text.startswith("The documents of 1 of the latest 2 sessions cannot be read")
 
 
-def test_doctor_counts_participants_records(world: Installed, account: Account) -> None:
+def test_doctor_counts_unreadable_records_of_participants(world: Installed, account: Account) -> None:
     for user in ("alice", "bob"):
         world.participant(user)
     world.put(participant_key("maze", USER), b'{"arrived": 7}')
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check) == (Mark.LOOK, "project maze")
     assert line.text.startswith("1 record of the latest 3 participants cannot be read")
 
@@ -130,10 +134,10 @@ def test_doctor_counts_participants_records(world: Installed, account: Account) 
     ("key", "mark"),
     [("_places/maze.json", Mark.BAD), ("maze/places/3.json", Mark.BAD), ("_spares/maze.json", Mark.LOOK)],
 )
-def test_doctor_names_places_and_pools(world: Installed, account: Account, key: str, mark: Mark) -> None:
+def test_doctor_names_unreadable_places_and_pools(world: Installed, account: Account, key: str, mark: Mark) -> None:
     world.register(study(max_servers=4, max_participants=16, warm_servers=1))
     world.put(key, b"[")
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check, line.text.startswith(f"{key} cannot be read")) == (mark, "project maze", True)
 
 
@@ -149,30 +153,30 @@ def test_doctor_names_a_page_that_does_not_render(
     world: Installed, account: Account, source: bytes, mark: Mark, says: str
 ) -> None:
     world.put(step_key("maze", "survey"), source)
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.check) == (mark, "project maze")
     assert says in line.text
 
 
 def test_doctor_names_a_page_that_is_missing(world: Installed, account: Account) -> None:
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=step_key("maze", "consent-1"))
-    (line,) = found(account)
+    (line,) = findings_of(account)
     assert (line.mark, line.text) == (Mark.BAD, "Step 1: consent-1.html is missing.")
 
 
-def test_the_trouble_of_one_project_hides_nothing_of_another(world: Installed, account: Account) -> None:
+def test_doctor_names_the_problems_of_every_project(world: Installed, account: Account) -> None:
     prepare(world, study(), msgspec.structs.replace(study(), id="other"))
-    spoil(world)
+    add_broken_entry(world)
     world.put(step_key("maze", "survey"), b"{% if %}")
     world.put(step_key("other", "survey"), b"{% if %}")
-    assert [one.check for one in found(account)] == ["project broken", "project maze", "project other"]
+    assert [one.check for one in findings_of(account)] == ["project broken", "project maze", "project other"]
 
 
 # Other commands
 
 
-def test_status_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
-    spoil(world)
+def test_status_names_unreadable_documents_and_goes_on(world: Installed, capsys: Any) -> None:
+    add_broken_entry(world)
     world.participant(USER)
     world.put(server.key(ids.server_label("maze", "bob")), b"{")
     ran = world.run(capsys, "status", "--json")
@@ -184,8 +188,8 @@ def test_status_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
     assert "No project broken: The entry of" in " ".join(world.run(capsys, "status").out.split())
 
 
-def test_stop_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
-    spoil(world)
+def test_stop_names_unreadable_documents_and_goes_on(world: Installed, capsys: Any) -> None:
+    add_broken_entry(world)
     world.record(USER)
     world.put(server.key(ids.server_label("maze", "bob")), b"{")
     ran = world.run(capsys, "stop", "--yes", "--json")
@@ -194,11 +198,11 @@ def test_stop_goes_on_and_names_it(world: Installed, capsys: Any) -> None:
     assert "1 record of servers cannot be read" in " ".join(ran.err.split())
 
 
-def test_erase_goes_on_and_names_it(
+def test_erase_names_unreadable_documents_and_goes_on(
     world: Installed, capsys: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # where the receipt goes
-    spoil(world)
+    add_broken_entry(world)
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)
     world.put("maze/places/3.json", b"[")
@@ -209,8 +213,10 @@ def test_erase_goes_on_and_names_it(
 
 
 @pytest.mark.parametrize(("project", "warned"), [("maze", False), ("broken", True)])
-def test_data_goes_on_and_names_it(world: Installed, capsys: Any, tmp_path: Any, project: str, warned: bool) -> None:
-    spoil(world)
+def test_data_names_unreadable_entries_of_its_own_project_alone(
+    world: Installed, capsys: Any, tmp_path: Any, project: str, warned: bool
+) -> None:
+    add_broken_entry(world)
     world.participant(USER, answered=2)
     world.participant(USER, answered=2, project=study(id="broken"))
     ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", project)

@@ -51,7 +51,7 @@ def test_the_servers_cost_what_fargate_charges_for_their_time() -> None:
     assert study_lines(MAZE.__class__(**{**vars(MAZE), "spot": False}), Prices())[0].usd.low == pytest.approx(25 * HOUR)
 
 
-def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
+def test_every_line_has_low_likely_and_high_in_order_and_grows_with_the_participants() -> None:
     few, many = (
         study_lines(MAZE, Prices()),
         study_lines(StudyToEstimate(**{**vars(MAZE), "participants": 1000}), Prices()),
@@ -64,7 +64,7 @@ def test_every_line_is_ordered_and_grows_with_the_participants() -> None:
     assert 0.5 < total(month).likely < 10
 
 
-def test_requests_that_a_server_has_signed_are_counted() -> None:
+def test_signing_requests_of_servers_are_counted() -> None:
     """Each is a request to the site, an invocation and a read: two of the certificate, the answer, a recording at least."""
     lines = {line.what: line for line in study_lines(MAZE, Prices())}
     looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS.likely)
@@ -75,7 +75,7 @@ def test_requests_that_a_server_has_signed_are_counted() -> None:
     )
 
 
-def test_queues_are_asked_by_five_pollers_each_day_and_night() -> None:
+def test_five_pollers_ask_each_queue_all_the_time() -> None:
     """Fewer are an optimization that a mapping with a maximum of its concurrency does not have."""
     (queues,) = [line for line in month_lines(Prices(), FixedResources(queues=3)) if "SQS" in line.what]
     asked = 3 * 5 * 730 * 3600 / 20
@@ -83,7 +83,7 @@ def test_queues_are_asked_by_five_pollers_each_day_and_night() -> None:
     assert queues.usd.high == pytest.approx(asked * Prices().sqs_request.usd)
 
 
-def test_what_the_pages_say_an_idle_installation_costs() -> None:
+def test_the_documentation_states_the_cost_of_an_idle_installation() -> None:
     """About two dollars likely; about nine where other things in the account have used up what is free."""
     idle = total(month_lines(Prices(), _fixed_resources()))
     assert _fixed_resources() == FixedResources(), "what stands in where there is no template"
@@ -100,7 +100,7 @@ def test_a_study_without_a_game_needs_no_servers() -> None:
     assert lines["HTTP API"].usd.likely > 0
 
 
-def test_a_server_for_every_opened_link_is_said(tmp_path: Path) -> None:
+def test_the_estimate_says_that_every_opened_link_starts_a_server(tmp_path: Path) -> None:
     """Those who look and leave are no participants, so no figure holds their servers."""
     said = "Every opened link starts a server."
     assert not any(said in line for line in assumptions(MAZE))
@@ -118,7 +118,7 @@ def test_a_server_for_every_opened_link_is_said(tmp_path: Path) -> None:
         assert _study(read_project(tmp_path), 1, None, spot=True).at_link is expected
 
 
-def test_the_high_end_is_a_game_of_moving_textures_and_that_is_said() -> None:
+def test_the_high_estimate_is_for_moving_textures_and_says_so() -> None:
     sent = {line.what: line.usd for line in study_lines(MAZE, Prices())}["Data to participants"]
     seconds = 30 * 60  # up to maxRuntime
     jpegs = MAZE.participants * seconds * MAZE.frame_rate * 77_000 / 1e9  # GB: the JPEG of a texture, 600 x 400 pixels
@@ -138,7 +138,7 @@ def test_a_month_is_counted_from_the_template() -> None:
     assert FixedResources().alarms == found.alarms  # what is reckoned where the template is not at hand
 
 
-def test_functions_are_as_large_as_the_estimate_says() -> None:
+def test_the_estimate_has_the_templates_memory_sizes() -> None:
     from deploy.cost.estimate import NEXT_STEP_GB, WORKER_GB
 
     resources = Template.read().resources({})
@@ -156,7 +156,7 @@ def test_every_price_has_its_unit_and_source() -> None:
     assert all(price.usd > 0 and price.unit and price.source for price in table)
 
 
-def test_other_regions_are_told_whose_prices_these_are() -> None:
+def test_the_note_of_another_region_says_whose_prices_these_are() -> None:
     assert "us-east-1" in Prices().note("ca-central-1")
     assert "a third more" in Prices().note("ca-central-1")
     assert "third" not in Prices().note(REGION)
@@ -183,7 +183,7 @@ def product(usage: str, usd: str) -> dict[str, Any]:
     }
 
 
-def test_todays_prices_of_a_region() -> None:
+def test_prices_of_a_region_are_read_from_the_price_list() -> None:
     found = current(
         PriceList(
             product("CAN1-Fargate-ARM-vCPU-Hours:perCPU", "0.03"),
@@ -227,7 +227,7 @@ def ran(minutes: float, *, spot: bool = False, earlier: tuple[PastAttempt, ...] 
     return Server(**given)
 
 
-def test_what_ran_is_counted_attempt_by_attempt() -> None:
+def test_spending_counts_each_attempt() -> None:
     start = NOW - timedelta(hours=6)
     first = PastAttempt(
         1, start, start + timedelta(seconds=30), start + timedelta(minutes=6), 2.0, 4.0, False, Reason.LOST
@@ -239,7 +239,7 @@ def test_what_ran_is_counted_attempt_by_attempt() -> None:
     assert found.usd.likely == pytest.approx(0.5 * (HOUR + 0.005) + 0.1 * (2 * HOUR + 0.005))
 
 
-def test_a_minute_is_billed_at_least_and_what_runs_costs_up_to_now() -> None:
+def test_at_least_a_minute_is_billed_and_running_servers_cost_up_to_now() -> None:
     assert spent([ran(0.1)], Prices(), NOW, {}).hours == pytest.approx(1 / 60)
     still = ran(0, closed=None, state=ServerState.READY, reason=None)
     assert spent([still], Prices(), NOW, {}).hours == pytest.approx(5)
@@ -247,13 +247,13 @@ def test_a_minute_is_billed_at_least_and_what_runs_costs_up_to_now() -> None:
     assert spent([ran(30)], Prices(), NOW, {}, since=NOW).hours == 0
 
 
-def test_old_records_without_a_size_are_reckoned_with_the_projects() -> None:
+def test_old_records_without_a_size_count_with_the_projects_size() -> None:
     found = spent([ran(60, cpu=0.0, memory=0.0)], Prices(), NOW, {"maze": (4.0, 8.0)})
     assert found.guessed == 1
     assert found.usd.likely == pytest.approx(4 * HOUR + 0.005)
 
 
-def test_spot_lies_between_its_discounts() -> None:
+def test_the_cost_on_spot_lies_between_its_discounts() -> None:
     usd = spent([ran(60, spot=True)], Prices(), NOW, {}).usd
     assert usd.low == pytest.approx(HOUR * 0.30 + 0.005)
     assert usd.low < usd.likely < usd.high < HOUR
@@ -262,7 +262,7 @@ def test_spot_lies_between_its_discounts() -> None:
 WARM_SERVER = "~0123456789abcdef0123"
 
 
-def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
+def test_waiting_and_play_of_a_warm_server_are_each_counted_once() -> None:
     begin = NOW - timedelta(hours=4)
     taken, over = begin + timedelta(hours=2), begin + timedelta(hours=2, minutes=30)
     name = "sxxxxxxxxxxxxxxxxxxxx-1"
@@ -275,19 +275,19 @@ def test_a_warm_servers_waiting_and_its_play_are_counted_once_each() -> None:
     assert spent([waited], Prices(), NOW, {}).hours == pytest.approx(2)
 
 
-def test_the_minute_that_is_billed_at_least_is_that_of_waiting_and_play_together() -> None:
+def test_the_minimum_of_a_minute_is_for_waiting_and_play_together() -> None:
     taken = NOW - timedelta(hours=1)
     waited = ran(0, user_id=WARM_SERVER, requested=taken - timedelta(seconds=50), closed=taken, reason=Reason.ASSIGNED)
     played = ran(0, warm_server_name="s-1", requested=taken, running=taken, closed=taken + timedelta(seconds=20))
     assert spent([waited, played], Prices(), NOW, {}).hours == pytest.approx(70 / 3600)
 
 
-def test_a_warm_server_that_nobody_took_was_waiting_all_the_time() -> None:
+def test_a_warm_server_without_a_participant_costs_its_whole_time() -> None:
     found = spent([ran(720, user_id=WARM_SERVER, reason=Reason.DEADLINE)], Prices(), NOW, {})
     assert (found.hours, found.attempts) == (pytest.approx(12), 1)
 
 
-def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
+def test_an_earlier_attempt_on_the_same_warm_server_is_not_counted_twice() -> None:
     start = NOW - timedelta(hours=6)
     first = PastAttempt(
         1, start, start, start + timedelta(minutes=6), 1.0, 2.0, False, Reason.LOST, warm_server_name="s-1"
@@ -296,7 +296,7 @@ def test_an_earlier_attempt_on_a_warm_server_is_no_other_server() -> None:
     assert (found.hours, found.attempts) == (pytest.approx(0.6), 1)
 
 
-def test_what_four_warm_servers_cost_reckoned_by_hand() -> None:
+def test_the_cost_of_four_warm_servers_is_that_calculated_by_hand() -> None:
     found = warm("maze", 4, 1, 2, Prices())
     assert found.on_demand.likely == pytest.approx(0.21748)  # 4 x (0.04048 + 2 x 0.004445 + 0.005)
     assert found.spot.likely == pytest.approx(0.089118)  # 4 x (0.35 x 0.04937 + 0.005)
@@ -316,7 +316,7 @@ trial: {game: Maze-v0}
 """
 
 
-def test_before_a_study_it_says_what_its_warm_servers_cost_an_hour_and_a_day(
+def test_the_estimate_says_what_warm_servers_cost_an_hour_and_a_day(
     installed: Installed,  # noqa: F811
     capsys: Any,
     tmp_path: Path,
@@ -338,7 +338,7 @@ def test_before_a_study_it_says_what_its_warm_servers_cost_an_hour_and_a_day(
     assert (spot[-2:], demand[-2:]) == (["0.089", "2.14"], ["0.22", "5.22"])
 
 
-def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_theirs_cost(
+def test_spending_has_a_line_for_waiting_and_the_present_cost_of_live_projects(
     installed: Installed,  # noqa: F811
     capsys: Any,
 ) -> None:
@@ -367,7 +367,7 @@ def test_after_a_study_waiting_has_its_own_line_and_live_projects_say_what_their
     assert "4 of 1 vCPU, 2 GB, on Spot" in text
 
 
-def test_before_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
+def test_the_estimate_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
     ran = process(
         {**environment("http://127.0.0.1:9"), "AWS_ACCESS_KEY_ID": ""},
         "cost",
@@ -386,21 +386,21 @@ def test_before_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
     assert found["prices"]["region"] == "us-east-1"
 
 
-def test_mistakes_in_config_yml_are_told(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_cost_reports_mistakes_in_config_yml(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
     (tmp_path / "config.yml").write_text("project:\n  id: maze\n  maxRuntime: soon\n")
     ran = installed.run(capsys, "cost", str(tmp_path))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "config.yml:3" in ran.err
 
 
-def test_no_server_outlasts_its_time(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_games_longer_than_max_runtime_are_refused(installed: Installed, capsys: Any) -> None:  # noqa: F811
     ran = installed.run(capsys, "cost", "--minutes", "30.5")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "runs 30.5 minutes: its maxRuntime is 30" in ran.err
     assert installed.run(capsys, "cost", "--minutes", "30").code == Exit.DONE
 
 
-def test_after_a_study(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: Any) -> None:  # noqa: F811
     other = msgspec.structs.replace(study(), id="other")
     installed.register(study(), other)
     for number in range(3):
@@ -417,7 +417,7 @@ def test_after_a_study(installed: Installed, capsys: Any) -> None:  # noqa: F811
     assert "No project named labyrinth" in installed.run(capsys, "cost", "--project", "labyrinth").err
 
 
-def bill(world: Installed, *answers: dict[str, float]) -> None:
+def answer_bill(world: Installed, *answers: dict[str, float]) -> None:
     """What Cost Explorer says to the next requests."""
     for services in answers:
         groups = [
@@ -427,9 +427,9 @@ def bill(world: Installed, *answers: dict[str, float]) -> None:
         world.answer("ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": groups}]})
 
 
-def test_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa: F811
     installed.register(study())
-    bill(
+    answer_bill(
         installed,
         {"AWS Lambda": 0.25, "Amazon Simple Storage Service": 0.5},
         {"Amazon Elastic Container Service": 12.5},
@@ -449,7 +449,7 @@ def test_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa
         ("DataUnavailableException", "Cost Explorer has no data of this account yet. Switch it on"),
     ],
 )
-def test_without_cost_explorer_there_is_everything_but_the_bill(
+def test_without_cost_explorer_only_the_bill_is_missing(
     installed: Installed,  # noqa: F811
     capsys: Any,
     code: str,
@@ -489,7 +489,7 @@ def test_as_a_process(installed: Installed) -> None:  # noqa: F811
     assert "Servers, from their own records" in plain.out
 
 
-def test_participants_who_play_together_share_a_server_and_wait_in_a_lobby() -> None:
+def test_participants_in_a_session_share_a_server_and_wait_in_a_lobby() -> None:
     alone, pairs = ({line.what: line for line in study_lines(one, Prices())} for one in (MAZE, PAIRS))
     servers = "Servers (Fargate Spot, 1 vCPU, 2 GB)"
     assert pairs[servers].usd.likely == pytest.approx(alone[servers].usd.likely / 2)
@@ -522,7 +522,7 @@ def test_a_lobby_of_thirty_for_an_hour_costs_less_than_a_dollar() -> None:
     assert 0.5 < s3 - without < 1
 
 
-def test_the_patience_of_the_configuration_counts(tmp_path: Path) -> None:
+def test_the_estimate_takes_the_patience_of_config_yml(tmp_path: Path) -> None:
     (tmp_path / "steps").mkdir()
     (tmp_path / "steps" / "consent.html").write_text("x")
     (tmp_path / "steps" / "thanks.html").write_text("x")
@@ -534,6 +534,6 @@ def test_the_patience_of_the_configuration_counts(tmp_path: Path) -> None:
     assert _study(read_project(tmp_path), 1, None, spot=True).patience == 900
 
 
-def test_a_link_that_starts_servers_ahead_costs_half_an_hour_for_each_group_that_does_not_come() -> None:
+def test_the_estimate_says_what_servers_cost_that_start_ahead_for_groups_that_do_not_come() -> None:
     lines = assumptions(replace(PAIRS, at_link=True))
     assert any("2 people who look and leave" in line and "35 minutes" in line for line in lines)

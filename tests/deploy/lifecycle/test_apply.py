@@ -34,7 +34,7 @@ def write_calls(world: World) -> list[str]:
 # -- making it ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_first_apply(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_first_apply_creates_the_stack(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.cloud.outputs = OUTPUTS
     outcome = apply(world.account, "hippodrome", FIRST)
     assert outcome.changed
@@ -59,7 +59,7 @@ def test_a_first_apply(world: World, capsys: pytest.CaptureFixture[str]) -> None
     assert "up to date" in said
 
 
-def test_nothing_changed_nothing_done(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_apply_without_changes_does_nothing(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.stand()
     outcome = apply(world.account, "hippodrome", AGAIN)
     assert not outcome.changed
@@ -69,7 +69,7 @@ def test_nothing_changed_nothing_done(world: World, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("status", ["UPDATE_COMPLETE", "UPDATE_ROLLBACK_COMPLETE"])
-def test_nothing_changed_after_updates_too(world: World, status: str) -> None:
+def test_apply_without_changes_does_nothing_after_updates_either(world: World, status: str) -> None:
     world.stand(status)
     assert not apply(world.account, "hippodrome", AGAIN).changed
     assert write_calls(world) == []
@@ -81,7 +81,7 @@ def test_white_space_that_cloudformation_cut_off_is_no_change(world: World) -> N
     assert not apply(world.account, "hippodrome", AGAIN).changed
 
 
-def test_what_cloudformation_makes_of_other_alphabets_is_no_change(world: World) -> None:
+def test_non_ascii_characters_that_cloudformation_replaces_are_no_change(world: World) -> None:
     """GetTemplate answers with question marks for whatever is not ASCII."""
     world.text += "# participants open …/next — 請\n"
     world.stand()
@@ -115,7 +115,7 @@ def test_a_missing_tag_is_a_change(world: World) -> None:
 
 
 @pytest.mark.parametrize("reason", [NOTHING, "No updates are to be performed."])
-def test_a_change_set_without_changes(world: World, reason: str) -> None:
+def test_a_change_set_without_changes_is_deleted(world: World, reason: str) -> None:
     world.stand()
     world.text += "\n# a comment\n"
     world.cloud.failing = reason
@@ -124,7 +124,7 @@ def test_a_change_set_without_changes(world: World, reason: str) -> None:
     assert not world.cloud.called("execute_change_set")
 
 
-def test_change_sets_of_interrupted_runs_are_removed_and_others_left(world: World) -> None:
+def test_only_change_sets_of_our_interrupted_runs_are_removed(world: World) -> None:
     world.stand()
     world.text += "\n# a comment\n"
     apply(world.account, "hippodrome", AGAIN)
@@ -134,7 +134,7 @@ def test_change_sets_of_interrupted_runs_are_removed_and_others_left(world: Worl
 # -- what CloudFormation does not want -----------------------------------------------------------------------------------
 
 
-def test_a_change_set_that_fails(world: World) -> None:
+def test_a_failed_change_set_is_reported_and_leaves_no_stack(world: World) -> None:
     world.cloud.validation = lambda: [
         invalid("Sweep", "may be looked at by nobody", status="SKIPPED"),
         invalid("Vpc", "the quota is used up", "WARN"),
@@ -146,7 +146,9 @@ def test_a_change_set_that_fails(world: World) -> None:
     assert world.cloud.stack is None  # no empty stack is left
 
 
-def test_what_validation_warns_of_is_told_and_stops_nothing(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_validation_are_shown_and_do_not_stop_apply(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
     world.cloud.validation = lambda: [
         invalid("Sweep", "may be looked at by nobody", "WARN", "SKIPPED"),
         invalid("Vpc", "the quota is used up", "WARN"),
@@ -157,7 +159,7 @@ def test_what_validation_warns_of_is_told_and_stops_nothing(world: World, capsys
     assert "nobody" not in said
 
 
-def test_a_template_that_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_template_is_reported(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(**_: Any) -> None:
         raise refusal("CreateChangeSet", "ValidationError", "Parameter MaxRuntime must be at least 5")
 
@@ -166,7 +168,7 @@ def test_a_template_that_is_refused(world: World, monkeypatch: pytest.MonkeyPatc
         apply(world.account, "hippodrome", FIRST)
 
 
-def test_a_creation_that_fails_and_the_next_run(world: World) -> None:
+def test_a_failed_creation_is_reported_and_the_next_run_creates_the_stack(world: World) -> None:
     reason = "Resource handler returned message: The maximum number of VPCs has been reached."
     world.cloud.operations = [
         [
@@ -188,7 +190,7 @@ def test_a_creation_that_fails_and_the_next_run(world: World) -> None:
 
 
 @pytest.mark.parametrize("status", ["ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"])
-def test_what_a_failed_creation_left_behind(world: World, status: str) -> None:
+def test_empty_buckets_of_a_failed_creation_are_deleted_and_full_ones_kept(world: World, status: str) -> None:
     s3 = world.account.client("s3")
     for name in ("empty", "full"):
         s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
@@ -204,7 +206,7 @@ def test_what_a_failed_creation_left_behind(world: World, status: str) -> None:
     assert "empty" not in left
 
 
-def test_an_update_that_fails(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_update_is_reported_with_its_cause(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.stand()
     world.cloud.operations = [
         [
@@ -220,7 +222,7 @@ def test_an_update_that_fails(world: World, capsys: pytest.CaptureFixture[str]) 
     assert "Sweep failed" in capsys.readouterr().err
 
 
-def test_an_update_whose_rollback_failed(world: World) -> None:
+def test_a_failed_rollback_is_continued_before_the_next_update(world: World) -> None:
     world.stand("UPDATE_ROLLBACK_FAILED")
     world.cloud.operations = [[("UPDATE_ROLLBACK_IN_PROGRESS", []), ("UPDATE_ROLLBACK_COMPLETE", [])]]
     apply(world.account, "hippodrome", AGAIN)
@@ -231,28 +233,28 @@ def test_an_update_whose_rollback_failed(world: World) -> None:
         apply(world.account, "hippodrome", AGAIN)
 
 
-def test_it_attaches_to_what_is_going_on(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_apply_waits_for_an_operation_in_progress(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.stand("UPDATE_IN_PROGRESS")
     world.cloud.script = [("UPDATE_IN_PROGRESS", []), ("UPDATE_IN_PROGRESS", []), ("UPDATE_COMPLETE", [])]
     assert not apply(world.account, "hippodrome", AGAIN).changed
     assert "waiting for that first" in capsys.readouterr().err
 
 
-def test_an_empty_shell_is_used(world: World) -> None:
+def test_a_stack_in_review_is_used(world: World) -> None:
     world.stand("REVIEW_IN_PROGRESS")
     outcome = apply(world.account, "hippodrome", FIRST)
     assert outcome.created
     assert world.cloud.called("create_change_set")[0]["ChangeSetType"] == "CREATE"
 
 
-def test_half_deleted(world: World) -> None:
+def test_a_half_deleted_stack_is_refused_with_advice(world: World) -> None:
     world.stand("DELETE_FAILED")
     with pytest.raises(Problem, match="half deleted") as caught:
         apply(world.account, "hippodrome", AGAIN)
     assert "destroy --stack hippodrome" in caught.value.advice
 
 
-def test_ctrl_c_while_it_is_made(world: World) -> None:
+def test_ctrl_c_during_the_creation_leaves_it_to_cloudformation(world: World) -> None:
     world.cloud.operations = [[("CREATE_IN_PROGRESS", [])] * 50]
     world.cloud.interrupt_after = 8
     with pytest.raises(Problem) as caught:
@@ -272,7 +274,7 @@ def replaced(kind: str, **more: Any) -> dict[str, Any]:
     return changed_resource("Thing", kind, "Name", **({"Replacement": "True"} | more))
 
 
-def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_change_that_loses_something_needs_a_yes(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.stand()
     world.cloud.changes = [replaced("AWS::SQS::Queue")]
     with pytest.raises(Problem) as caught:
@@ -284,7 +286,7 @@ def test_losing_something_needs_a_yes(world: World, capsys: pytest.CaptureFixtur
     assert apply(world.account, "hippodrome", StackSettings(max_runtime=30), ApplyRequest(yes=True)).changed
 
 
-def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
+def test_nothing_is_changed_if_the_certificate_for_new_server_names_fails(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(prepared: Prepared) -> None:
@@ -311,7 +313,9 @@ def test_nothing_is_changed_while_new_names_of_servers_have_no_certificate(
         (changed_resource("Thing", "AWS::S3::Bucket", "LifecycleConfiguration"), ""),
     ],
 )
-def test_what_counts_as_a_loss(world: World, change: dict[str, Any], danger: str) -> None:
+def test_replaced_and_removed_resources_with_data_are_dangers(
+    world: World, change: dict[str, Any], danger: str
+) -> None:
     (found,) = plans.of_change_set([change], world.built)
     assert danger in found.danger
     assert bool(danger) == bool(found.danger)
@@ -356,13 +360,13 @@ def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
     assert any("running servers are lost" in line for line in text)
 
 
-def test_a_plan_without_the_code_bucket(world: World) -> None:
+def test_a_plan_of_an_update_needs_the_code_bucket(world: World) -> None:
     world.stand()
     with pytest.raises(Problem, match="code bucket"):
         plan(world.account, "hippodrome", StackSettings(max_runtime=30))
 
 
-def test_a_plan_of_nothing(world: World) -> None:
+def test_a_plan_without_changes_says_so(world: World) -> None:
     world.stand()
     assert plan(world.account, "hippodrome", AGAIN).kind == "nothing"
     assert write_calls(world) == []
@@ -378,7 +382,7 @@ def command(world: World, monkeypatch: pytest.MonkeyPatch) -> Any:
     return lambda *arguments: deploy.main(list(arguments))
 
 
-def test_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_and_apply_have_their_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("plan", "--domain", DOMAIN) == Exit.CHANGES
     assert command("apply", "--domain", DOMAIN, "--dry-run") == Exit.CHANGES
     assert not world.cloud.calls
@@ -391,7 +395,7 @@ def test_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[st
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_answers_for_scripts(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_plan_and_apply_answer_in_json(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
     world.cloud.outputs = OUTPUTS
     command("plan", "--domain", DOMAIN, "--json")
     found = json.loads(capsys.readouterr().out)
@@ -403,19 +407,22 @@ def test_answers_for_scripts(world: World, command: Any, capsys: pytest.CaptureF
     assert found["outputs"] == OUTPUTS
 
 
-def test_a_mail_has_to_be_confirmed(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_apply_says_that_the_address_for_alarms_has_to_be_confirmed(
+    world: World, command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     command("apply", "--domain", DOMAIN, "--email", "me@example.org")
-    assert "me@example.org" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert "AWS has sent a mail to me@example.org: alarms come only after its link has been clicked." in said
 
 
-def test_the_account_of_the_buckets_name(world: World) -> None:
+def test_the_account_id_is_that_of_the_credentials(world: World) -> None:
     assert world.account.id == ACCOUNT
 
 
 @pytest.mark.parametrize(
     "status", ["CREATE_COMPLETE", "UPDATE_IN_PROGRESS", "UPDATE_ROLLBACK_FAILED", "ROLLBACK_COMPLETE"]
 )
-def test_somebody_elses_stack_of_that_name_is_left_alone(world: World, status: str) -> None:
+def test_a_foreign_stack_of_that_name_is_left_alone(world: World, status: str) -> None:
     world.cloud.stand(status, {"InstanceType": "t3.micro"}, "Resources: {}")
     assert world.cloud.stack
     world.cloud.stack["Tags"] = [{"Key": "owner", "Value": "somebody else"}]
@@ -426,7 +433,7 @@ def test_somebody_elses_stack_of_that_name_is_left_alone(world: World, status: s
 
 
 @pytest.mark.parametrize("update", [True, False])
-def test_after_an_update_the_list_of_projects_is_cleared_of_secrets(
+def test_an_update_removes_secrets_from_the_list_of_projects(
     world: World, monkeypatch: pytest.MonkeyPatch, update: bool
 ) -> None:
     """test_register_function.py has what that does."""
@@ -443,7 +450,7 @@ def test_after_an_update_the_list_of_projects_is_cleared_of_secrets(
     assert asked == (["hippodrome"] if update else [])
 
 
-def test_an_installation_that_was_made_by_hand_is_ours(world: World) -> None:
+def test_an_installation_without_our_tag_is_recognized(world: World) -> None:
     world.stand()
     assert world.cloud.stack
     world.cloud.stack["Tags"] = []
@@ -451,7 +458,7 @@ def test_an_installation_that_was_made_by_hand_is_ours(world: World) -> None:
     assert apply(world.account, "hippodrome", AGAIN).changed
 
 
-def test_without_a_study_neither_loads_what_reads_one() -> None:
+def test_apply_does_not_import_pydantic() -> None:
     """It takes a fifth of a second, in which nothing would be shown."""
     code = "import sys, deploy.__main__, deploy.lifecycle.apply; sys.exit('pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

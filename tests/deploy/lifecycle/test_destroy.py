@@ -118,7 +118,7 @@ def run(world: World, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> int:
     return deploy.main(["destroy", *arguments])
 
 
-def test_all_but_the_data(
+def test_destroy_deletes_all_but_the_data(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
@@ -144,7 +144,7 @@ def last_commands(said: str) -> list[list[str]]:
     return [shlex.split(line)[3:] for line in said.splitlines() if line.startswith("  python -m deploy ")]
 
 
-def test_the_commands_that_it_names_fetch_and_delete_what_it_kept(
+def test_the_commands_that_destroy_names_fetch_and_delete_the_kept_data(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     s3 = installed.account.client("s3")
@@ -161,7 +161,7 @@ def test_the_commands_that_it_names_fetch_and_delete_what_it_kept(
     assert buckets(installed) == set()
 
 
-def test_the_commands_that_it_names_keep_the_profile(
+def test_the_commands_that_destroy_names_keep_the_profile(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(installed, "--yes", "--profile", "my lab", monkeypatch=monkeypatch)
@@ -169,7 +169,7 @@ def test_the_commands_that_it_names_keep_the_profile(
     assert [command[-4:] for command in named] == [["--region", REGION, "--profile", "my lab"]] * 2
 
 
-def test_a_kept_bucket_without_participants_is_nothing_to_fetch(
+def test_for_a_kept_bucket_without_participants_destroy_names_no_command_that_fetches_data(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     installed.account.client("s3").delete_object(Bucket=DATA, Key="study/users/u1/participant.json")
@@ -182,7 +182,7 @@ def test_a_kept_bucket_without_participants_is_nothing_to_fetch(
     assert [command[0] for command in last_commands(said)] == ["destroy"]
 
 
-def test_a_kept_bucket_that_nobodys_data_were_ever_in_says_nothing_of_older_versions(
+def test_for_a_kept_bucket_that_never_held_data_destroy_names_no_older_versions(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     s3 = installed.account.client("s3")
@@ -196,7 +196,7 @@ def test_a_kept_bucket_that_nobodys_data_were_ever_in_says_nothing_of_older_vers
     assert "older versions" not in said
 
 
-def test_older_versions_are_kept_for_as_long_as_it_says() -> None:
+def test_destroy_and_the_template_agree_how_long_older_versions_are_kept() -> None:
     rules = template()["Resources"]["Bucket"]["Properties"]["LifecycleConfiguration"]["Rules"]
     (days,) = [rule["NoncurrentVersionExpiration"]["NoncurrentDays"] for rule in rules if rule["Id"] == "OldVersions"]
     assert days == remains.OLD_VERSIONS
@@ -205,7 +205,7 @@ def test_older_versions_are_kept_for_as_long_as_it_says() -> None:
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
-def test_kinds_of_which_nothing_is_left_are_counted_in_one_line(
+def test_kinds_without_remains_are_counted_in_one_line(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
@@ -224,7 +224,7 @@ def test_without_anything_left_there_is_no_table(
     assert capsys.readouterr().out == "2 kinds of things looked at: nothing left.\n"
 
 
-def test_what_is_left_has_a_row_with_its_name(
+def test_each_thing_that_is_left_has_a_row_with_its_name(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left = [ListedResource("log group", "/hippodrome/hippodrome/sweep")]
@@ -238,12 +238,12 @@ def test_what_is_left_has_a_row_with_its_name(
     assert lines[-1] == "1 other kind of things looked at: nothing left."
 
 
-def test_with_the_data(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_destroy_with_data_deletes_the_bucket(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
     assert buckets(installed) == set()
 
 
-def test_the_data_later(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_data_can_be_deleted_by_a_later_run(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     installed.cloud.resources = []  # CloudFormation forgets: the tag remains
     installed.cloud.stack = None
@@ -262,7 +262,7 @@ def test_other_installations_are_not_touched(installed: World, monkeypatch: pyte
     assert buckets(installed) == {"hippodrome-lab-bucket-1", "hippodrome-bucket-elsewhere", "hippodrome-notes"}
 
 
-def test_a_bucket_that_lost_its_tag_gets_it_before_the_stack_is_forgotten(installed: World) -> None:
+def test_a_bucket_without_our_tag_gets_it_before_the_stack_is_deleted(installed: World) -> None:
     s3 = installed.account.client("s3")
     s3.put_bucket_tagging(Bucket=DATA, Tagging={"TagSet": [{"Key": "owner", "Value": "lab"}]})
     removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
@@ -286,7 +286,7 @@ def test_a_dry_run_changes_nothing(
     assert {"kind": "log group", "name": "/hippodrome/hippodrome/left"} in found["things"]
 
 
-def test_when_only_data_are_left_there_is_something_to_do_with_data_alone(
+def test_when_only_data_are_left_a_run_without_data_has_nothing_to_do(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
@@ -297,12 +297,12 @@ def test_when_only_data_are_left_there_is_something_to_do_with_data_alone(
     assert "Nothing is left of" in capsys.readouterr().err
 
 
-def test_nothing_there(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_destroy_without_an_installation_is_done(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert run(world, "--dry-run", monkeypatch=monkeypatch) == Exit.DONE
 
 
-def test_without_anybody_to_ask(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_destroy_needs_yes(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(installed, monkeypatch=monkeypatch) == Exit.DECLINED
     assert not installed.cloud.called("delete_stack")
 
@@ -335,7 +335,7 @@ def test_tasks_are_stopped_first(installed: World, monkeypatch: pytest.MonkeyPat
     assert stop is not None
 
 
-def test_a_server_started_in_between(installed: World) -> None:
+def test_a_deletion_that_a_new_server_blocked_is_tried_again(installed: World) -> None:
     reason = "The Cluster cannot be deleted while it contains Tasks."
     failing = [
         ("DELETE_IN_PROGRESS", [("Cluster", "AWS::ECS::Cluster", "DELETE_FAILED", reason)]),
@@ -348,7 +348,7 @@ def test_a_server_started_in_between(installed: World) -> None:
     assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
 
 
-def test_what_is_in_the_way_is_told(installed: World) -> None:
+def test_a_failed_deletion_is_reported_and_keeps_the_data(installed: World) -> None:
     failing = [
         ("DELETE_IN_PROGRESS", [("Zone", "AWS::X::Y", "DELETE_FAILED", "You are not authorized")]),
         ("DELETE_FAILED", []),
@@ -362,7 +362,7 @@ def test_what_is_in_the_way_is_told(installed: World) -> None:
     assert buckets(installed) == set()
 
 
-def test_interrupted_and_repeated(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_run_after_an_interruption_finishes(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever step is interrupted, the next run finishes."""
     for step in ("_stop_servers", "_acme_records", "_task_definitions", "_bucket"):
         with monkeypatch.context() as patch:
@@ -379,7 +379,7 @@ def test_interrupted_and_repeated(installed: World, monkeypatch: pytest.MonkeyPa
     assert families(installed) == {"hippodrome-lab-study", "hippodrome-untagged"}
 
 
-def test_a_cluster_and_bucket_that_are_gone_already(installed: World) -> None:
+def test_a_missing_cluster_and_bucket_are_no_error(installed: World) -> None:
     installed.account.client("ecs").delete_cluster(cluster="hippodrome")
     removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
     removal._bucket(DATA, "data")
@@ -387,7 +387,7 @@ def test_a_cluster_and_bucket_that_are_gone_already(installed: World) -> None:
     assert buckets(installed) == set()
 
 
-def test_leftover_proofs_of_certificates_go_and_others_stay(installed: World) -> None:
+def test_challenge_records_of_ours_are_deleted_and_others_stay(installed: World) -> None:
     route53 = installed.account.client("route53")
 
     def put(name: str, kind: str, ttl: int, value: str) -> None:
@@ -410,7 +410,7 @@ def test_leftover_proofs_of_certificates_go_and_others_stay(installed: World) ->
     }
 
 
-def test_what_is_left_is_told(
+def test_remains_are_reported_with_the_command_that_removes_them(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """CloudFormation says DELETE_COMPLETE, but the listing still finds a queue of the stack."""
@@ -426,7 +426,7 @@ def test_what_is_left_is_told(
     assert remove in said.err
 
 
-def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_data_than_a_page_are_deleted(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", "5")  # a page; S3's has 1,000
     s3 = installed.account.client("s3")
     for number in range(23):
@@ -436,7 +436,7 @@ def test_data_are_deleted_however_many(installed: World, monkeypatch: pytest.Mon
     assert DATA not in buckets(installed)
 
 
-def test_every_listing_can_be_asked(world: World) -> None:
+def test_every_listing_exists_in_the_models_of_aws(world: World) -> None:
     """Each operation, answer path and key exists in AWS's own model of the service."""
     import boto3
 
@@ -452,7 +452,7 @@ def test_every_listing_can_be_asked(world: World) -> None:
             assert items.member.type_name == "string", listing
 
 
-def test_every_removal_is_a_command_of_aws(world: World) -> None:
+def test_every_removal_exists_in_the_models_of_aws(world: World) -> None:
     """Each operation exists in AWS's own model of the service, and has the option, which takes one name."""
     import boto3
 
@@ -485,17 +485,17 @@ PARTS = {  # what goes with something else, and has no listing of its own: its t
 }
 
 
-def test_everything_in_the_template_is_listed_or_a_part_of_what_is_listed() -> None:
+def test_every_type_of_the_template_is_listed_or_a_part_of_a_listed_one() -> None:
     types = {one["Type"] for one in template()["Resources"].values()}
     assert types - set(listings.KINDS) - set(PARTS) == {"AWS::Route53::RecordSet"}  # these are listed in their zone
     assert set(PARTS.values()) <= set(listings.KINDS)
 
 
-def test_the_code_bucket_carries_the_accounts_number(world: World) -> None:
+def test_the_name_of_the_code_bucket_holds_the_account_id(world: World) -> None:
     assert ACCOUNT in CodeBucket(world.account, "hippodrome").name
 
 
-def test_somebody_elses_stack_is_left_alone(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_foreign_stack_is_left_alone(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert installed.cloud.stack
     installed.cloud.stack |= {"Tags": [], "Parameters": []}
     before = buckets(installed)
@@ -504,7 +504,7 @@ def test_somebody_elses_stack_is_left_alone(installed: World, monkeypatch: pytes
     assert buckets(installed) == before
 
 
-def test_what_somebody_elses_deleted_stack_left_is_not_ours(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remains_of_a_foreign_deleted_stack_are_left_alone(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = "hippodrome-photographs"
     make_bucket(installed, theirs, [])
     assert installed.cloud.stack
@@ -516,22 +516,22 @@ def test_what_somebody_elses_deleted_stack_left_is_not_ours(installed: World, mo
     assert buckets(installed) == {theirs}
 
 
-def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warm_servers_are_stopped_also_those_that_start_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sweep of a live study goes on keeping servers warm until it is deleted itself."""
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     kept = study(task_definition="hippodrome", warm_servers=2)
-    with Installed() as town:
-        town.register(kept)
-        town.warm(kept, 2)
-        Servers(town.platform).start(StartServer(kept.id, "alice"))
+    with Installed() as installation:
+        installation.register(kept)
+        installation.warm(kept, 2)
+        Servers(installation.platform).start(StartServer(kept.id, "alice"))
         removal = Removal(open_account(), "hippodrome", Executor(lambda _: None))
         tries: list[int] = []
 
         def delete(self: Stack, title: str, without: Sequence[str]) -> None:
-            tries.append(len(list(town.platform.tasks.list())))
+            tries.append(len(list(installation.platform.tasks.list())))
             if len(tries) == 1:
-                town.warm(kept, 2)
+                installation.warm(kept, 2)
                 reason = "The Cluster cannot be deleted while Tasks are active."
                 failure = FailedResource("Cluster", "AWS::ECS::Cluster", "hippodrome", reason)
                 raise NotDeleted(Problem("The stack could not be deleted."), [failure])
@@ -539,4 +539,4 @@ def test_warm_servers_are_gone_too_those_that_come_again_meanwhile_as_well(monke
         monkeypatch.setattr(Stack, "delete", delete)
         removal.run(removal.look(), data=False)
         assert tries == [0, 0]
-        assert ([*town.platform.tasks.list()], town.records(), town.timers()) == ([], {}, {})
+        assert ([*installation.platform.tasks.list()], installation.records(), installation.timers()) == ([], {}, {})

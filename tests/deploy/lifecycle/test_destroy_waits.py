@@ -22,7 +22,17 @@ from hippodrome.model import ids
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import FakeCloudFormation, invalid, refusal
 from tests.deploy.lifecycle.test_destroy import DATA, buckets, families, installed, run
-from tests.deploy.real_stack import POLICY, SITE, Clock, RealStack, interfaces, names, put, request, same_record
+from tests.deploy.real_stack import (
+    POLICY,
+    SITE,
+    Clock,
+    RealStack,
+    interfaces,
+    put_cname,
+    request_certificate,
+    same_record,
+    zone_records,
+)
 from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
 
 __all__ = ["installed", "world"]
@@ -40,16 +50,16 @@ def stack(installed: World, clock: Clock) -> RealStack:
     return RealStack(installed, clock)
 
 
-def test_everything_that_aws_refuses_for_a_while_is_waited_for(
+def test_destroy_waits_for_everything_that_aws_refuses_for_a_while(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.in_use = 40 * 60
     stack.attach("ada", "lab", "guest")
-    stack.interface(600)
+    stack.add_interface(600)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert stack.cloud.stack
     assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
-    assert names(stack.world) == set()
+    assert zone_records(stack.world) == set()
     said = capsys.readouterr().err
     assert "This has to wait until" in said
     assert "10 to 60 minutes" in said
@@ -63,7 +73,7 @@ def test_everything_that_aws_refuses_for_a_while_is_waited_for(
 # -- the certificate
 
 
-def test_a_certificate_that_stays_in_use_is_told_and_another_run_goes_on(
+def test_a_certificate_that_stays_in_use_is_reported_and_another_run_finishes(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.in_use = 100 * 60
@@ -72,7 +82,7 @@ def test_a_certificate_that_stays_in_use_is_told_and_another_run_goes_on(
     assert "After 75 min ACM still says" in said
     assert "Run the same command later" in said
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    assert names(stack.world) == set()
+    assert zone_records(stack.world) == set()
 
 
 def test_a_certificate_that_is_refused_although_nothing_uses_it_is_tried_again(
@@ -84,11 +94,11 @@ def test_a_certificate_that_is_refused_although_nothing_uses_it_is_tried_again(
     assert len(stack.cloud.called("delete_stack")) == 5
 
 
-def test_a_certificate_that_somebody_else_here_uses_is_not_waited_for(
+def test_a_certificate_that_a_foreign_resource_uses_is_not_waited_for(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     theirs = f"arn:aws:elasticloadbalancing:{REGION}:{ACCOUNT}:loadbalancer/app/shop/0123456789abcdef"
-    stack.users().append(theirs)
+    stack.certificate_users().append(theirs)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
     assert f"is used by {theirs}" in capsys.readouterr().err
     assert stack.clock.slept == 0
@@ -97,32 +107,32 @@ def test_a_certificate_that_somebody_else_here_uses_is_not_waited_for(
 @pytest.mark.parametrize(
     ("domain", "region"), [(SITE, "us-east-1"), (f"*.{SITE}", REGION)], ids=["another region", "a wildcard"]
 )
-def test_a_validation_record_that_another_certificate_needs_stays_and_is_told(
+def test_a_validation_record_that_another_certificate_needs_stays_and_is_reported(
     stack: RealStack,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     domain: str,
     region: str,
 ) -> None:
-    other = request(stack.world, domain, region)
+    other = request_certificate(stack.world, domain, region)
     same_record(stack.world, other, stack.certificate, region)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    assert names(stack.world) == {(stack.record, "CNAME")}
+    assert zone_records(stack.world) == {(stack.record, "CNAME")}
     said = capsys.readouterr()
     assert f"it renews {other}" in said.err.replace(" as well", "")
     assert "aws route53 change-resource-record-sets" in said.err
     assert "Nothing else is left" in said.err
 
 
-def test_a_certificate_for_another_name_needs_no_record_of_ours(
+def test_a_certificate_for_another_name_does_not_keep_our_record(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    request(stack.world, f"other.{DOMAIN}", "us-east-1")
+    request_certificate(stack.world, f"other.{DOMAIN}", "us-east-1")
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    assert names(stack.world) == set()
+    assert zone_records(stack.world) == set()
 
 
-def test_a_region_that_may_not_be_asked_keeps_the_record(
+def test_the_record_stays_if_a_region_refuses_to_list_certificates(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     acm = stack.world.account.client("acm", "eu-west-3")
@@ -132,17 +142,19 @@ def test_a_region_that_may_not_be_asked_keeps_the_record(
 
     monkeypatch.setattr(acm, "get_paginator", denied)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    assert names(stack.world) == {(stack.record, "CNAME")}
+    assert zone_records(stack.world) == {(stack.record, "CNAME")}
     assert "whatever is in eu-west-3" in capsys.readouterr().err
 
 
-def test_a_record_that_leads_elsewhere_by_now_is_left_alone(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
-    put(stack.world, stack.record, "somewhere.example.net.")
+def test_a_validation_record_with_another_value_is_left_alone(
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_cname(stack.world, stack.record, "somewhere.example.net.")
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    assert names(stack.world) == {(stack.record, "CNAME")}
+    assert zone_records(stack.world) == {(stack.record, "CNAME")}
 
 
-def test_a_stack_that_was_deleted_by_hand_leaves_a_record_that_is_told(
+def test_the_record_of_a_stack_that_was_deleted_by_hand_is_reported(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.client("acm").delete_certificate(CertificateArn=stack.certificate)
@@ -157,7 +169,7 @@ def test_a_stack_that_was_deleted_by_hand_leaves_a_record_that_is_told(
 # -- the policy
 
 
-def test_a_hosted_zone_that_somebody_has_deleted_keeps_nothing(
+def test_a_deleted_hosted_zone_does_not_stop_destroy(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """CloudFormation cannot delete the site's records then: they are gone, and the rest follows without them."""
@@ -171,7 +183,7 @@ def test_a_hosted_zone_that_somebody_has_deleted_keeps_nothing(
     assert "the hosted zone, which is gone" in capsys.readouterr().err
 
 
-def test_a_policy_that_bounds_somebody_stops_it_before_anything_is_done(
+def test_a_policy_that_is_a_permissions_boundary_stops_destroy_at_once(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.attach(role="guest")
@@ -183,7 +195,7 @@ def test_a_policy_that_bounds_somebody_stops_it_before_anything_is_done(
     assert [one["PolicyArn"] for one in held] == [stack.policy]
 
 
-def test_a_policy_that_was_edited_by_hand_and_a_role_that_was_given_more(
+def test_an_edited_policy_and_a_role_with_more_policies_do_not_stop_destroy(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     iam = stack.client("iam")
@@ -211,10 +223,10 @@ def test_an_instance_in_the_network_is_not_waited_for(
     assert f"The instance {instance} is in the network" in capsys.readouterr().err
 
 
-def test_interfaces_that_never_go_are_named(
+def test_network_interfaces_that_stay_are_named(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stack.interface(10**9)
+    stack.add_interface(10**9)
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.FAILED
     assert interfaces(stack.world)[0] in capsys.readouterr().err
 
@@ -222,7 +234,7 @@ def test_interfaces_that_never_go_are_named(
 # -- and made again
 
 
-def test_made_again_within_a_minute(
+def test_apply_waits_until_the_names_of_deleted_queues_are_free(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.in_use = 0
@@ -255,7 +267,7 @@ def test_timers_that_are_still_being_deleted_are_waited_for(
     assert "still deleting the timers" in capsys.readouterr().err
 
 
-def test_what_was_deleted_long_ago_is_not_waited_for(stack: RealStack) -> None:
+def test_queues_that_were_deleted_over_a_minute_ago_are_not_waited_for(stack: RealStack) -> None:
     removal = Removal(stack.world.account, "hippodrome")
     removal.run(removal.look(), data=False)
     stack.clock.sleep(70)
@@ -291,7 +303,7 @@ SETTINGS = (
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
-def test_a_new_code_bucket_that_s3_is_still_at_work_on_is_waited_for(
+def test_apply_waits_until_s3_takes_settings_of_a_new_code_bucket(
     world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], setting: str
 ) -> None:
     bucket = CodeBucket(world.account, "hippodrome")
@@ -310,7 +322,7 @@ def test_a_new_code_bucket_that_s3_is_still_at_work_on_is_waited_for(
     assert not bucket.make()  # nothing is left to be set
 
 
-def test_a_code_bucket_that_s3_does_not_finish_is_told(
+def test_a_code_bucket_that_s3_never_finishes_is_reported(
     world: World, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refusing(**_: Any) -> Any:
@@ -321,9 +333,7 @@ def test_a_code_bucket_that_s3_does_not_finish_is_told(
         CodeBucket(world.account, "hippodrome").make()
 
 
-def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
-    stack: RealStack, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_apply_waits_for_the_remains_of_a_failed_creation(stack: RealStack, capsys: pytest.CaptureFixture[str]) -> None:
     assert stack.cloud.stack
     stack.in_use = 40 * 60
     stack.cloud.stack["StackStatus"] = "ROLLBACK_FAILED"
@@ -335,7 +345,7 @@ def test_what_a_failed_creation_has_left_is_waited_for_before_it_is_made_anew(
     assert "10 to 60 minutes" in capsys.readouterr().err
 
 
-def test_roles_that_are_the_whole_accounts_stay_and_are_told(
+def test_service_linked_roles_stay_and_are_reported(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stack.client("iam").create_role(RoleName="AWSServiceRoleForECS", AssumeRolePolicyDocument="{}")
@@ -345,7 +355,7 @@ def test_roles_that_are_the_whole_accounts_stay_and_are_told(
     assert "aws iam delete-service-linked-role --role-name AWSServiceRoleForECS" in said.err
 
 
-def test_names_of_servers_that_no_record_tells_of_are_told(
+def test_dns_names_of_servers_without_a_record_are_reported(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = f"{ids.server_name(ids.server_label('study', 'u1'), 1)}.servers.{DOMAIN}"
@@ -389,13 +399,13 @@ STANDS = (
 
 @pytest.mark.explores
 @pytest.mark.parametrize("status", sample(STANDS, 3))
-def test_a_stack_in_any_state_goes(stack: RealStack, monkeypatch: pytest.MonkeyPatch, status: str) -> None:
+def test_a_stack_in_any_state_is_deleted(stack: RealStack, monkeypatch: pytest.MonkeyPatch, status: str) -> None:
     assert stack.cloud.stack
     stack.in_use = 0
     stack.cloud.stack["StackStatus"] = status
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
-    assert names(stack.world) == set()
+    assert zone_records(stack.world) == set()
 
 
 GOES_ON = (
@@ -409,7 +419,7 @@ GOES_ON = (
 
 @pytest.mark.explores
 @pytest.mark.parametrize(("status", "then"), sample(GOES_ON, 3))
-def test_what_is_going_on_is_waited_for_first(
+def test_destroy_first_waits_for_an_operation_in_progress(
     stack: RealStack,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -425,7 +435,7 @@ def test_what_is_going_on_is_waited_for_first(
     assert "waiting for that first" in capsys.readouterr().err
 
 
-def test_an_update_that_begins_in_between_is_waited_for(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_destroy_waits_for_an_update_that_begins_meanwhile(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
     delete = stack.cloud.delete_stack
 
     def late(**arguments: Any) -> Any:
@@ -439,7 +449,7 @@ def test_an_update_that_begins_in_between_is_waited_for(stack: RealStack, monkey
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
 
 
-def test_another_region_is_named(
+def test_destroy_names_another_region_with_an_installation(
     world: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name = f"hippodrome-code-{ACCOUNT}-eu-west-1"
@@ -455,7 +465,7 @@ def test_another_region_is_named(
 # -- interrupted
 
 
-class Interrupting:
+class CtrlC:
     """Ctrl-C at the n-th call of AWS, before it is made or when its answer is on its way."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, cloud: FakeCloudFormation, clock: Clock) -> None:
@@ -492,9 +502,9 @@ def test_interrupted_at_any_call_the_next_run_ends_clean(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, at: int, before: bool
 ) -> None:
     stack.attach("ada", "lab")
-    stack.interface(60)
+    stack.add_interface(60)
     stack.client("s3").put_object(Bucket=DATA, Key="SSL/fullchain.pem", Body=b"x")
-    ctrl = Interrupting(monkeypatch, stack.cloud, stack.clock)
+    ctrl = CtrlC(monkeypatch, stack.cloud, stack.clock)
     ctrl.at, ctrl.before = at, before
     first = run(stack.world, "--yes", monkeypatch=monkeypatch)
     assert first == (Exit.INTERRUPTED if ctrl.calls >= at else Exit.DONE)
@@ -502,6 +512,6 @@ def test_interrupted_at_any_call_the_next_run_ends_clean(
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert stack.cloud.stack
     assert stack.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
-    assert names(stack.world) == set()
+    assert zone_records(stack.world) == set()
     assert buckets(stack.world) == {DATA}
     assert families(stack.world) == {"hippodrome-lab-study", "hippodrome-untagged"}

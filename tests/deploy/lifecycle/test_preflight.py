@@ -40,7 +40,7 @@ def game(tmp_path: Path) -> project_folder.ProjectFolder:
     return project_folder.read(write_study(tmp_path / "study"))
 
 
-def looked(
+def findings(
     world: World, settings: StackSettings = FIRST, game: project_folder.ProjectFolder | None = None
 ) -> list[Finding]:
     return preflight.look_at(preflight.InstallationCheck(prepare(world.account, "hippodrome", settings), game))
@@ -61,11 +61,11 @@ def nothing_was_made(world: World) -> bool:
 # -- the list ----------------------------------------------------------------------------------------------------------
 
 
-def test_where_all_is_well_nothing_is_said(world: World) -> None:
-    assert looked(world) == []
+def test_without_problems_there_are_no_findings(world: World) -> None:
+    assert findings(world) == []
 
 
-def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
+def test_all_problems_are_reported_at_once_with_their_remedies(
     world: World, game: project_folder.ProjectFolder, capsys: Capsys
 ) -> None:
     world.delegated = NOBODY
@@ -84,7 +84,7 @@ def test_everything_that_is_wrong_is_told_at_once_with_its_remedy(
     assert nothing_was_made(world)
 
 
-def test_mistakes_in_the_study_stand_in_the_same_list(world: World, capsys: Capsys) -> None:
+def test_mistakes_in_the_study_are_in_the_same_list(world: World, capsys: Capsys) -> None:
     world.delegated = NOBODY
     mistakes = Problem("The project cannot be registered.", "Correct it.", ["config.yml:3: no", "config.yml:4: no"])
     with pytest.raises(Problem, match="2 things are in the way"):
@@ -109,7 +109,7 @@ def test_a_domain_without_a_zone_does_not_hide_the_rest(world: World, capsys: Ca
     assert nothing_was_made(world)
 
 
-def test_a_mistake_in_the_study_stands_below_the_remarks(world: World, capsys: Capsys) -> None:
+def test_a_mistake_in_the_study_comes_after_the_remarks(world: World, capsys: Capsys) -> None:
     world.limits.executions = 10
     wrong = preflight.of_problem("study", Problem("The project cannot be registered."))
     with pytest.raises(Problem, match="1 thing is in the way"):
@@ -118,13 +118,13 @@ def test_a_mistake_in_the_study_stands_below_the_remarks(world: World, capsys: C
     assert said.index("! Lambda") < said.index("✗ study")
 
 
-def test_a_plan_shows_what_is_in_the_way_last(world: World) -> None:
+def test_a_plan_lists_remarks_before_problems(world: World) -> None:
     world.delegated = NOBODY
     world.limits.executions = 10
     assert [one.check for one in plan(world.account, "hippodrome", FIRST).findings] == ["Lambda", "domain"]
 
 
-def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
+def test_a_plan_shows_the_problems_and_does_not_stop(world: World) -> None:
     world.delegated = NOBODY
     found = plan(world.account, "hippodrome", FIRST)
     assert found.kind == "create"
@@ -133,7 +133,7 @@ def test_a_plan_shows_the_same_list_and_stops_at_nothing(world: World) -> None:
     assert nothing_was_made(world)
 
 
-def test_a_plan_of_a_change_shows_what_is_in_its_way_too(world: World) -> None:
+def test_a_plan_of_an_update_shows_its_problems(world: World) -> None:
     apply(world.account, "hippodrome", FIRST)
     world.delegated = NOBODY
     found = plan(world.account, "hippodrome", StackSettings(site="lab"))
@@ -141,7 +141,7 @@ def test_a_plan_of_a_change_shows_what_is_in_its_way_too(world: World) -> None:
     assert [one.check for one in found.findings] == ["domain"]
 
 
-def test_a_plan_says_what_address_participants_will_open(world: World) -> None:
+def test_a_plan_names_the_address_that_participants_will_open(world: World) -> None:
     """Whoever writes DOMAIN=study.example.org sees the second `study` before it is made."""
     first = [line for line, _ in plans.lines(plan(world.account, "hippodrome", FIRST))]
     assert f"Participants will open https://study.{DOMAIN}/next" in first
@@ -150,7 +150,7 @@ def test_a_plan_says_what_address_participants_will_open(world: World) -> None:
     assert f"Participants will open https://lab.{DOMAIN}/next" in moved
 
 
-def test_what_stops_can_be_overruled(world: World, capsys: Capsys) -> None:
+def test_problems_can_be_overruled(world: World, capsys: Capsys) -> None:
     world.delegated = NOBODY
     assert apply(world.account, "hippodrome", FIRST, ApplyRequest(anyway=True)).created
     assert "✗ domain" in capsys.readouterr().err
@@ -160,55 +160,53 @@ def test_what_stops_can_be_overruled(world: World, capsys: Capsys) -> None:
     ("operation", "check"),
     [("GetAccountSettings", "Lambda"), ("GetServiceQuota", "Fargate")],
 )
-def test_what_may_not_be_looked_at_is_said_and_does_not_stop(
-    world: World, capsys: Capsys, operation: str, check: str
-) -> None:
+def test_a_check_without_permission_is_a_remark(world: World, capsys: Capsys, operation: str, check: str) -> None:
     world.limits.denied.add(operation)
     assert apply(world.account, "hippodrome", FIRST).created
     said = capsys.readouterr().err
     assert f"! {check}: could not be checked: These credentials may not get " in said
 
 
-def test_a_standing_installation_is_only_looked_at_where_it_changes(world: World) -> None:
+def test_of_an_existing_installation_only_changes_are_checked(world: World) -> None:
     world.delegated = NOBODY
     world.limits.executions = 10
     world.limits.quotas.clear()
     record(world, f"study.{DOMAIN}")  # its own
     world.stand()
-    assert looked(world, StackSettings(max_runtime=30)) == []
-    assert {one.check for one in looked(world, StackSettings(site="lab"))} == {"domain"}
+    assert findings(world, StackSettings(max_runtime=30)) == []
+    assert {one.check for one in findings(world, StackSettings(site="lab"))} == {"domain"}
     assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed
 
 
 # -- the account -------------------------------------------------------------------------------------------------------
 
 
-def test_a_region_that_lacks_a_service(world: World, capsys: Capsys) -> None:
+def test_a_region_without_a_needed_service_is_a_problem(world: World, capsys: Capsys) -> None:
     world.account.region = "eu-south-2"
-    found = only([one for one in looked(world) if one.mark is Mark.BAD])
+    found = only([one for one in findings(world) if one.mark is Mark.BAD])
     assert "cannot be installed in eu-south-2" in found.text
     assert "eu-central-1" in found.advice
 
 
-def test_the_root_user_is_remarked_on(world: World) -> None:
+def test_the_root_user_is_a_remark(world: World) -> None:
     world.account.identity = {"Account": world.account.id, "Arn": f"arn:aws:iam::{world.account.id}:root"}
-    assert (only(looked(world)).mark, only(looked(world)).check) == (Mark.LOOK, "credentials")
+    assert (only(findings(world)).mark, only(findings(world)).check) == (Mark.LOOK, "credentials")
 
 
-def test_few_executions_are_a_remark_that_says_what_they_do_for(world: World) -> None:
+def test_few_executions_are_a_remark_that_says_how_they_are_divided(world: World) -> None:
     world.limits.executions = 10
-    found = only(looked(world))
+    found = only(findings(world))
     assert found.mark is Mark.LOOK
     assert "10 functions at once: 4 for participants' pages, 2 to start servers" in found.text
     assert "--service-code lambda --quota-code L-B99A9384 --desired-value 1000 --region ca-central-1" in found.advice
     world.limits.executions = 100
-    assert looked(world) == []
+    assert findings(world) == []
 
 
 @pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server"), (0, "0 servers")])
 def test_few_vcpus_are_a_remark(world: World, game: project_folder.ProjectFolder, vcpu: float, servers: str) -> None:
     world.limits.quotas |= {quotas.SPOT: vcpu, quotas.ON_DEMAND: vcpu}
-    spot, on_demand = looked(world, game=game)
+    spot, on_demand = findings(world, game=game)
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)
     assert spot.text == f"{vcpu} vCPU: {servers} of 1 vCPU may run at once."
     assert on_demand.text == f"{vcpu} vCPU: {servers} of 1 vCPU may run at once, if Spot has no room."
@@ -221,23 +219,23 @@ def test_without_docker_and_without_a_build_nobody_could_build_the_image(
 ) -> None:
     world.docker = False
     world.limits.quotas[quotas.BUILDS] = 0
-    found = only(looked(world, game=game))
+    found = only(findings(world, game=game))
     assert (found.mark, found.check) == (Mark.BAD, "CodeBuild")
     assert "the image of maze cannot be built" in found.text
     assert found.advice.startswith("Start Docker here, or ask for a build: aws service-quotas ")
     assert "--service-code codebuild --quota-code L-9D07B6EF --desired-value 1" in found.advice
-    assert only(looked(world)).mark is Mark.LOOK  # an installation alone needs no image yet
+    assert only(findings(world)).mark is Mark.LOOK  # an installation alone needs no image yet
 
 
 @pytest.mark.parametrize(("docker", "builds"), [(True, 0), (False, 1), (False, None)])
-def test_docker_or_one_build_will_do(
+def test_docker_or_one_build_is_enough(
     world: World, game: project_folder.ProjectFolder, docker: bool, builds: float | None
 ) -> None:
     world.docker = docker
     del world.limits.quotas[quotas.BUILDS]
     if builds is not None:
         world.limits.quotas[quotas.BUILDS] = builds
-    assert looked(world, game=game) == []
+    assert findings(world, game=game) == []
 
 
 def test_a_study_without_a_game_needs_neither_servers_nor_builds(world: World, tmp_path: Path) -> None:
@@ -246,16 +244,16 @@ def test_a_study_without_a_game_needs_neither_servers_nor_builds(world: World, t
     config.write_text(config.read_text().replace("2: game, 3: thanks", "2: thanks").partition("trial:")[0])
     world.docker = False
     world.limits.quotas |= {quotas.BUILDS: 0, quotas.SPOT: 0, quotas.ON_DEMAND: 0}
-    assert looked(world, game=project_folder.read(folder)) == []
+    assert findings(world, game=project_folder.read(folder)) == []
 
 
-def test_no_room_for_another_vpc(world: World) -> None:
+def test_a_used_up_quota_of_vpcs_is_a_problem(world: World) -> None:
     ec2 = world.account.client("ec2")
     there = len(ec2.describe_vpcs()["Vpcs"])
     world.limits.quotas[quotas.VPCS] = there + 1
-    assert looked(world) == []
+    assert findings(world) == []
     world.limits.quotas[quotas.VPCS] = there
-    found = only(looked(world))
+    found = only(findings(world))
     assert (found.mark, found.check) == (Mark.BAD, "VPCs")
     assert "--vpc" in found.advice
     assert f"--quota-code L-F678F1CE --desired-value {there + 1}" in found.advice
@@ -273,10 +271,10 @@ def record(world: World, name: str) -> None:
     world.account.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=batch)
 
 
-def test_a_domain_that_is_not_delegated_stops_with_the_name_servers_to_set(world: World) -> None:
+def test_a_domain_that_is_not_delegated_is_a_problem_with_the_name_servers_to_set(world: World) -> None:
     """The stack would wait for ACM for hours."""
     world.delegated = NOBODY
-    found = only(looked(world))
+    found = only(findings(world))
     assert found.mark is Mark.BAD
     servers = world.account.client("route53").get_hosted_zone(Id=world.zone)["DelegationSet"]["NameServers"]
     assert len(servers) == 4
@@ -286,7 +284,7 @@ def test_a_domain_that_is_not_delegated_stops_with_the_name_servers_to_set(world
 def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
     world.delegated = Delegation((), "Whether example.org is delegated could not be asked: LifetimeTimeout.", False)
     world.caa[DOMAIN] = caa.Caa(certain=False)
-    domain, authorities = looked(world)
+    domain, authorities = findings(world)
     assert (domain.mark, authorities.mark) == (Mark.LOOK, Mark.LOOK)
 
 
@@ -310,11 +308,11 @@ AMAZON = ("amazon.com", "amazontrust.com", "awstrust.com", "amazonaws.com")
         ("example.org", [("issue", ";"), ("issuewild", "letsencrypt.org")], ""),
     ],
 )
-def test_both_authorities_must_be_let(world: World, name: str, records: list[caa.Record], who: str) -> None:
+def test_caa_records_must_allow_both_authorities(world: World, name: str, records: list[caa.Record], who: str) -> None:
     """Amazon issues for the site, which is no wildcard; Let's Encrypt for the servers, which is one."""
     for wild in {name, *([DOMAIN, f"servers.{DOMAIN}"] if name == DOMAIN else [])}:
         world.caa[wild] = caa.Caa(name, tuple(records))
-    found = looked(world)
+    found = findings(world)
     assert [one.mark for one in found] == ([Mark.BAD] if who else [])
     for one in found:
         assert f"The CAA records of {name} (" in one.text
@@ -322,14 +320,14 @@ def test_both_authorities_must_be_let(world: World, name: str, records: list[caa
         assert one.advice == f'Add two CAA records to {name}: 0 issue "amazon.com" and 0 issuewild "letsencrypt.org".'
 
 
-def test_records_above_the_domain_are_overruled_in_it_not_changed(world: World) -> None:
+def test_the_advice_on_caa_records_above_the_domain_adds_records_to_the_domain(world: World) -> None:
     world.caa["study.lab.example.org"] = caa.Caa("example.org", (("issue", "digicert.com"),))
-    found = only(looked(world, StackSettings(domain="lab.example.org")))
+    found = only(findings(world, StackSettings(domain="lab.example.org")))
     assert "The CAA records of example.org" in found.text
     assert "Add two CAA records to lab.example.org:" in found.advice
 
 
-def test_the_nearest_caa_records_upwards_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_caa_records_of_the_nearest_parent_count(monkeypatch: pytest.MonkeyPatch) -> None:
     above = {("example.org", "CAA"): ['0 issue "digicert.com"'], ("lab.example.org", "CAA"): ['0 ISSUE "amazon.com"']}
     with answering(above) as port:
         ask_only(monkeypatch, port)
@@ -352,7 +350,7 @@ EVERY = {"study.lab.example.org", "lab.example.org", "example.org", "org"}
         (["*.example.org"], EVERY),
     ],
 )
-def test_dns_is_not_asked_for_names_that_are_still_to_be_made(
+def test_dns_is_not_asked_for_names_that_do_not_exist_yet(
     world: World, monkeypatch: pytest.MonkeyPatch, there: list[str], asked: set[str]
 ) -> None:
     """A resolver remembers for 15 minutes that a name does not exist: the site would be unknown to who deploys it."""
@@ -362,16 +360,16 @@ def test_dns_is_not_asked_for_names_that_are_still_to_be_made(
     heard: set[str] = set()
     with answering({("org", "CAA"): ['0 issue "amazon.com"', '0 issue "letsencrypt.org"']}, heard) as port:
         ask_only(monkeypatch, port)
-        assert looked(world, StackSettings(domain="lab.example.org")) == []
+        assert findings(world, StackSettings(domain="lab.example.org")) == []
     assert heard == asked
 
 
-def test_caa_records_of_a_name_that_is_there_count(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_caa_records_of_an_existing_name_count(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(caa, "find", find_caa)
     record(world, "a.study.example.org")
     with answering({("study.example.org", "CAA"): ['0 issue ";"']}) as port:
         ask_only(monkeypatch, port)
-        assert "The CAA records of study.example.org" in only(looked(world)).text
+        assert "The CAA records of study.example.org" in only(findings(world)).text
 
 
 @pytest.mark.parametrize(
@@ -384,7 +382,9 @@ def test_caa_records_of_a_name_that_is_there_count(world: World, monkeypatch: py
         ({("example.org", "NS"): SERVFAIL, ("org", "NS"): SERVFAIL}, "do not answer for it.", False),
     ],
 )
-def test_what_dns_says_of_the_zone(monkeypatch: pytest.MonkeyPatch, records: Any, problem: str, certain: bool) -> None:
+def test_delegation_is_judged_by_the_answers_of_dns(
+    monkeypatch: pytest.MonkeyPatch, records: Any, problem: str, certain: bool
+) -> None:
     """A zone that was deleted and made again has other name servers; the old ones answer no more (SERVFAIL)."""
     monkeypatch.setattr(zones, "DNS_TIMEOUT", 2.0)
     with answering(records) as port:
@@ -396,19 +396,19 @@ def test_what_dns_says_of_the_zone(monkeypatch: pytest.MonkeyPatch, records: Any
 
 def test_the_sites_address_must_be_free(world: World) -> None:
     record(world, "study.example.org")
-    found = only(looked(world))
+    found = only(findings(world))
     assert "already has a record of type A for study.example.org" in found.text
     assert "--site" in found.advice
-    assert looked(world, StackSettings(domain=DOMAIN, site="lab")) == []
+    assert findings(world, StackSettings(domain=DOMAIN, site="lab")) == []
 
 
 def test_the_sites_address_must_be_free_at_api_gateway(world: World) -> None:
     world.account.client("apigatewayv2").create_domain_name(DomainName="study.example.org")
-    found = only(looked(world))
+    found = only(findings(world))
     assert (found.mark, "already serves study.example.org" in found.text) == (Mark.BAD, True)
 
 
-def test_a_second_installation_on_one_domain_is_remarked_on(world: World) -> None:
+def test_a_second_installation_on_one_domain_is_a_remark(world: World) -> None:
     world.cloud.others = [
         {
             "StackName": "other",
@@ -417,14 +417,14 @@ def test_a_second_installation_on_one_domain_is_remarked_on(world: World) -> Non
             "Parameters": [{"ParameterKey": "RootDomain", "ParameterValue": DOMAIN}],
         }
     ]
-    found = only(looked(world))
+    found = only(findings(world))
     assert (found.mark, "The stack other has the domain" in found.text) == (Mark.LOOK, True)
 
 
 # -- the network, and what is left of an earlier installation ----------------------------------------------------------
 
 
-def test_subnets_are_looked_at(world: World) -> None:
+def test_subnets_are_checked(world: World) -> None:
     ec2 = world.account.client("ec2")
     vpcs = [ec2.create_vpc(CidrBlock=f"10.{n}.0.0/16")["Vpc"]["VpcId"] for n in (1, 2)]
     subnets = [
@@ -433,7 +433,7 @@ def test_subnets_are_looked_at(world: World) -> None:
 
     def found(subnet: str) -> list[tuple[Mark, str]]:
         settings = StackSettings(domain=DOMAIN, vpc=vpcs[0], subnets=subnet)
-        return [(one.mark, one.text) for one in looked(world, settings)]
+        return [(one.mark, one.text) for one in findings(world, settings)]
 
     in_one_zone = (Mark.LOOK, "All those subnets are in one zone: when Spot runs out of room there, servers cost more.")
     assert found(subnets[1]) == [
@@ -445,9 +445,9 @@ def test_subnets_are_looked_at(world: World) -> None:
     assert found(subnets[0]) == [in_one_zone]
 
 
-def test_what_an_unfinished_destroy_has_left_is_named(world: World) -> None:
+def test_remains_of_an_unfinished_destroy_are_a_problem(world: World) -> None:
     world.account.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/sweep")
-    found = only(looked(world))
+    found = only(findings(world))
     assert (found.mark, "An earlier installation hippodrome has left 1 log group" in found.text) == (Mark.BAD, True)
     assert "python -m deploy destroy --stack hippodrome" in found.advice
 
@@ -484,7 +484,7 @@ def waits(world: World, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return slept
 
 
-def test_ecs_has_its_role_ten_seconds_before_the_first_cluster(
+def test_the_first_apply_makes_the_role_of_ecs_and_waits_ten_seconds(
     world: World, waits: list[float], capsys: Capsys
 ) -> None:
     apply(world.account, "hippodrome", FIRST)
@@ -495,7 +495,7 @@ def test_ecs_has_its_role_ten_seconds_before_the_first_cluster(
 
 
 @pytest.mark.parametrize("code", ["InvalidInput", "AccessDenied"])
-def test_ecs_role_that_is_there_or_not_ours_to_make(
+def test_an_existing_or_forbidden_role_of_ecs_is_not_waited_for(
     world: World, waits: list[float], code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(**_: Any) -> None:
@@ -506,7 +506,9 @@ def test_ecs_role_that_is_there_or_not_ours_to_make(
     assert waits == []
 
 
-def test_a_role_that_ecs_does_not_know_yet_is_waited_for(world: World, waits: list[float]) -> None:
+def test_a_creation_that_failed_because_ecs_does_not_know_its_role_is_repeated(
+    world: World, waits: list[float]
+) -> None:
     world.cloud.operations = [list(UNKNOWN_ROLE), [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]]
     assert apply(world.account, "hippodrome", FIRST).created
     assert waits == [10, 10]
@@ -515,7 +517,7 @@ def test_a_role_that_ecs_does_not_know_yet_is_waited_for(world: World, waits: li
 
 
 @pytest.mark.parametrize(("kind", "words"), OF_NEW_ROLES)
-def test_a_policy_that_is_not_known_everywhere_is_waited_for_in_an_update_too(
+def test_an_update_that_failed_because_a_new_role_is_not_known_is_repeated(
     world: World, waits: list[float], kind: str, words: str, capsys: Capsys
 ) -> None:
     apply(world.account, "hippodrome", FIRST)
@@ -531,7 +533,7 @@ def test_a_policy_that_is_not_known_everywhere_is_waited_for_in_an_update_too(
     assert "does not know a new role everywhere yet" in capsys.readouterr().err
 
 
-def test_nobody_waits_for_a_role_for_ever(world: World, waits: list[float]) -> None:
+def test_a_creation_that_fails_for_its_role_is_tried_three_times(world: World, waits: list[float]) -> None:
     gone = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
     world.cloud.operations = [list(UNKNOWN_ROLE), list(gone), list(UNKNOWN_ROLE), list(gone), list(UNKNOWN_ROLE)]
     with pytest.raises(Problem, match="could not be made") as caught:

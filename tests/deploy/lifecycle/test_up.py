@@ -43,7 +43,7 @@ def report(directory: str, due: Verdict) -> Report:
     return Report("example.org", directory, Decision(due, "because"), stored, NOW)
 
 
-class Somebody:
+class FakeAccount:
     """An account, as far as `up` itself looks."""
 
     id, region = "123456789012", "ca-central-1"
@@ -54,7 +54,7 @@ class Somebody:
 
 
 @pytest.fixture
-def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What `up` has its parts do, in order; the parts have tests of their own."""
     done: list[str] = []
     installation = Installation("hippodrome", "ca-central-1", "CREATE_COMPLETE", {})
@@ -73,7 +73,7 @@ def doings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))
         return Exit.DONE
 
-    monkeypatch.setattr(up, "open_account", lambda profile, region: Somebody())
+    monkeypatch.setattr(up, "open_account", lambda profile, region: FakeAccount())
     monkeypatch.setattr(up, "describe_stack", lambda account, stack: {"StackStatus": "CREATE_COMPLETE"})
     monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
     monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
@@ -94,9 +94,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "project"
 
 
-def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
+def test_the_first_run_does_all_steps_in_order(calls: list[str], folder: Path) -> None:
     assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
-    assert doings == [
+    assert calls == [
         "apply example.org",
         "take over",
         "certificate staging",
@@ -105,8 +105,8 @@ def test_everything_the_first_time(doings: list[str], folder: Path) -> None:
     ]
 
 
-def test_it_says_which_certificate_it_looks_at(
-    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+def test_deploy_says_which_certificate_it_looks_at(
+    calls: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
     looking = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Looking at")]
@@ -123,63 +123,63 @@ def test_it_says_which_certificate_it_looks_at(
         ("", Verdict.FOREIGN, []),
     ],
 )
-def test_what_there_is_of_a_certificate(
-    doings: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Verdict, expected: list[str]
+def test_a_certificate_is_ordered_if_the_present_one_is_due_or_missing(
+    calls: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Verdict, expected: list[str]
 ) -> None:
     monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
     up.certify(None, "hippodrome")  # type: ignore[arg-type]
-    assert doings == ["take over", *expected]
+    assert calls == ["take over", *expected]
 
 
-def test_a_failed_rehearsal_uses_up_nothing_real(
-    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_after_a_failed_test_certificate_no_real_one_is_ordered(
+    calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def obtain(account: Any, installation: Any, choice: Choice, *, tell: Any) -> Report:
-        doings.append(choice.directory)
+        calls.append(choice.directory)
         raise Problem("The proof was not seen.", "Look at DNS.")
 
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     (folder / "config.yml").write_text(CONFIG.format(use="false"))
     assert deploy.main(["up", str(folder)]) == Exit.FAILED
-    assert doings == ["apply None", "take over", STAGING]
+    assert calls == ["apply None", "take over", STAGING]
     said = capsys.readouterr().err
     assert "The installation stands, but has no certificate. The proof was not seen." in said
     assert "Look at DNS." in said
 
 
 def test_a_study_without_a_game_needs_no_certificate(
-    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+    calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def obtain(*_: Any, **__: Any) -> Report:
         raise Problem("The proof was not seen.")
 
     monkeypatch.setattr(up.certificate, "obtain", obtain)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings == ["apply None", "take over", "register project"]
+    assert calls == ["apply None", "take over", "register project"]
 
 
-def test_no_certificate_on_request(doings: list[str], folder: Path) -> None:
+def test_no_certificate_is_ordered_on_request(calls: list[str], folder: Path) -> None:
     assert deploy.main(["up", str(folder), "--no-certificate"]) == Exit.DONE
-    assert doings == ["apply None", "register project"]
+    assert calls == ["apply None", "register project"]
 
 
-def test_a_researcher_gets_the_study_registered(
-    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_for_a_researcher_only_the_study_is_registered(
+    calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(up, "may_apply", lambda account, stack: False)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings == ["register project"]
+    assert calls == ["register project"]
     assert "researcher" in capsys.readouterr().err
 
 
-def test_mistakes_in_the_study_come_before_anything_is_made(doings: list[str], folder: Path) -> None:
+def test_mistakes_in_the_study_stop_it_before_anything_is_made(calls: list[str], folder: Path) -> None:
     (folder / "config.yml").write_text("project: {id: study, useAWS: true, steps: {x: 1}}")
     assert deploy.main(["up", str(folder)]) == Exit.FAILED
-    assert doings == []
+    assert calls == []
 
 
-def test_mistakes_and_missing_credentials_are_told_at_once(
-    doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_mistakes_and_missing_credentials_are_reported_together(
+    calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nobody(*_: Any) -> None:
         raise Problem("There are no AWS credentials on this machine.", "Log in.")
@@ -190,49 +190,51 @@ def test_mistakes_and_missing_credentials_are_told_at_once(
     said = capsys.readouterr().err
     assert "✗ study: The project cannot be registered: there are" in said
     assert "✗ There are no AWS credentials on this machine." in said
-    assert doings == []
+    assert calls == []
 
 
 @pytest.mark.parametrize(
     ("config", "said"), [(None, "has no config.yml"), (CONFIG.format(use="false"), "(useAWS: false); to put it on AWS")]
 )
-def test_a_folder_without_a_study_for_aws(
-    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str], config: str | None, said: str
+def test_a_folder_without_a_study_for_aws_gets_only_the_installation(
+    calls: list[str], folder: Path, capsys: pytest.CaptureFixture[str], config: str | None, said: str
 ) -> None:
     (folder / "config.yml").unlink()
     if config:
         (folder / "config.yml").write_text(config)
     assert deploy.main(["up", str(folder)]) == Exit.DONE
     assert said in capsys.readouterr().err
-    assert doings[0] == "apply None"
-    assert not any(line.startswith("register") for line in doings)
+    assert calls[0] == "apply None"
+    assert not any(line.startswith("register") for line in calls)
 
 
-def test_a_study_that_leaves_aws_open_is_put_there(doings: list[str], folder: Path) -> None:
+def test_a_study_without_use_aws_is_registered(calls: list[str], folder: Path) -> None:
     (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").format())
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings[-1] == "register project"
+    assert calls[-1] == "register project"
 
 
-def test_the_example_is_put_on_aws_as_it_is_shipped(doings: list[str]) -> None:
+def test_the_example_study_is_registered_unchanged(calls: list[str]) -> None:
     assert deploy.main(["up", str(ROOT), "--domain", "example.org", "--email", "me@example.org"]) == Exit.DONE
-    assert doings[0] == "apply example.org"
-    assert doings[-1] == f"register {ROOT.name}"
+    assert calls[0] == "apply example.org"
+    assert calls[-1] == f"register {ROOT.name}"
 
 
-def test_a_study_that_says_nothing_of_its_servers_is_asked_how_large_they_are(
-    doings: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
+def test_a_study_without_aws_setup_is_refused(
+    calls: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").replace("awsSetup", "#").format())
     assert deploy.main(["up", str(folder)]) == Exit.FAILED
-    assert doings == []
+    assert calls == []
     assert "project.awsSetup: gives no cpu and no memory" in capsys.readouterr().err
 
 
-def test_the_images_base_may_be_a_mirror(doings: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_base_of_the_image_may_come_from_a_mirror(
+    calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HIPPODROME_BASE_IMAGE", "mirror.example.org/python:3.13")
     assert deploy.main(["up", str(folder)]) == Exit.DONE
-    assert doings[-1] == "register project on mirror.example.org/python:3.13"
+    assert calls[-1] == "register project on mirror.example.org/python:3.13"
 
 
 class Cloud:
@@ -253,7 +255,7 @@ class Cloud:
             raise ClientError({"Error": {"Code": self.error, "Message": ""}}, "GetTemplate")
 
 
-def test_who_may_apply() -> None:
+def test_credentials_that_may_read_the_template_may_apply() -> None:
     assert up.may_apply(Cloud(False, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
     assert up.may_apply(Cloud(True), "hippodrome")  # type: ignore[arg-type]
     assert not up.may_apply(Cloud(True, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]

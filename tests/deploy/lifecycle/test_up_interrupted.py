@@ -20,7 +20,7 @@ from tests.deploy.stack_world import DOMAIN, World, world
 __all__ = ["world"]
 
 
-class Watched:
+class InterruptedClient:
     """A client whose calls are counted with those of all others; at one of them somebody presses Ctrl-C."""
 
     def __init__(self, client: Any, called: Callable[[str], Iterator[None]]) -> None:
@@ -42,7 +42,7 @@ class Watched:
         return call
 
 
-class Keyboard:
+class CtrlC:
     """Presses Ctrl-C at the n-th call: before it, or when AWS has done it and the answer is on its way."""
 
     def __init__(self) -> None:
@@ -60,12 +60,12 @@ class Keyboard:
 
 
 @pytest.fixture
-def keyboard(world: World, monkeypatch: pytest.MonkeyPatch) -> Keyboard:
-    keyboard = Keyboard()
+def ctrl_c(world: World, monkeypatch: pytest.MonkeyPatch) -> CtrlC:
+    ctrl_c = CtrlC()
     plain = world.account.client
-    monkeypatch.setattr(world.account, "client", lambda *where: Watched(plain(*where), keyboard.called))
+    monkeypatch.setattr(world.account, "client", lambda *where: InterruptedClient(plain(*where), ctrl_c.called))
     monkeypatch.setattr(up, "open_account", lambda profile, region: world.account)
-    return keyboard
+    return ctrl_c
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def deployed(world: World, keyboard: Keyboard, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+def deploy_study(world: World, ctrl_c: CtrlC, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """`make deploy` of a study. Certificate and registering, which have such tests of their own, are a call each."""
 
     def mark(what: str) -> Any:
@@ -104,27 +104,27 @@ def assert_whole(world: World) -> None:
     assert len(plain(world.account, "iam").list_roles()["Roles"]) == 1
 
 
-def interrupted_everywhere(
-    world: World, keyboard: Keyboard, deployed: Callable[[], int], afterwards: bool, before: Callable[[], None]
+def check_every_interruption(
+    world: World, ctrl_c: CtrlC, deploy_study: Callable[[], int], afterwards: bool, before: Callable[[], None]
 ) -> None:
     """Interrupt the command at its n-th call and run it again, for every n (in `make test` one of six)."""
     before()
-    assert deployed() == Exit.DONE
+    assert deploy_study() == Exit.DONE
     assert_whole(world)
-    assert len(keyboard.calls) > 30
-    for n in sample(range(len(keyboard.calls)), 6):
-        away_with_it(world)
+    assert len(ctrl_c.calls) > 30
+    for n in sample(range(len(ctrl_c.calls)), 6):
+        empty_account(world)
         before()
-        keyboard.at, keyboard.afterwards = n, afterwards
-        keyboard.calls.clear()
-        assert deployed() == Exit.INTERRUPTED, (n, keyboard.calls)
-        keyboard.at = -1
+        ctrl_c.at, ctrl_c.afterwards = n, afterwards
+        ctrl_c.calls.clear()
+        assert deploy_study() == Exit.INTERRUPTED, (n, ctrl_c.calls)
+        ctrl_c.at = -1
         world.cloud.text = world.cloud.text or world.built.text
-        assert deployed() == Exit.DONE, (n, keyboard.calls)
+        assert deploy_study() == Exit.DONE, (n, ctrl_c.calls)
         assert_whole(world)
 
 
-def away_with_it(world: World) -> None:
+def empty_account(world: World) -> None:
     """An account in which nobody has done anything."""
     plain = type(world.account).client
     s3, iam = plain(world.account, "s3"), plain(world.account, "iam")
@@ -146,22 +146,22 @@ def away_with_it(world: World) -> None:
 @pytest.mark.parametrize("afterwards", [False, True], ids=["before the call", "after it"])
 def test_ctrl_c_at_any_call_and_the_same_command_again(
     world: World,
-    keyboard: Keyboard,
-    deployed: Callable[[], int],
+    ctrl_c: CtrlC,
+    deploy_study: Callable[[], int],
     afterwards: bool,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    interrupted_everywhere(world, keyboard, deployed, afterwards, lambda: None)
+    check_every_interruption(world, ctrl_c, deploy_study, afterwards, lambda: None)
     assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.mark.explores
-def test_ctrl_c_while_a_failed_creation_is_cleared_away(
-    world: World, keyboard: Keyboard, deployed: Callable[[], int], capsys: pytest.CaptureFixture[str]
+def test_ctrl_c_while_a_failed_creation_is_removed_and_the_same_command_again(
+    world: World, ctrl_c: CtrlC, deploy_study: Callable[[], int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     def failed() -> None:
         world.stand("ROLLBACK_COMPLETE")
         world.cloud.operations = [happy("DELETE")]
 
-    interrupted_everywhere(world, keyboard, deployed, False, failed)
+    check_every_interruption(world, ctrl_c, deploy_study, False, failed)
     assert "Traceback" not in capsys.readouterr().err

@@ -133,7 +133,7 @@ def doctor(world: Installed, capsys: Any, *arguments: str) -> dict[str, tuple[st
 # The whole
 
 
-def test_a_healthy_installation(world: Installed, capsys: Any) -> None:
+def test_doctor_finds_nothing_bad_in_a_healthy_installation(world: Installed, capsys: Any) -> None:
     ran = world.run(capsys, "doctor", "--only-aws")
     assert ran.code == Exit.DONE, ran.out
     assert "✗" not in ran.out
@@ -153,7 +153,7 @@ def test_a_healthy_installation(world: Installed, capsys: Any) -> None:
         assert line in ran.out, ran.out
 
 
-def test_each_check_that_cannot_be_made_says_why_and_the_others_go_on(world: Installed, account: Account) -> None:
+def test_a_check_that_aws_refuses_says_why_and_the_others_go_on(world: Installed, account: Account) -> None:
     fresh(world)
     for action in ("s3:HeadBucket", "cloudwatch:DescribeAlarms", "service-quotas:GetServiceQuota"):
         world.fail(action, "AccessDenied", status=400)
@@ -163,7 +163,7 @@ def test_each_check_that_cannot_be_made_says_why_and_the_others_go_on(world: Ins
     assert found["project maze"].mark is Mark.GOOD
 
 
-def test_a_check_that_breaks_is_a_line_too(account: Account, world: Installed) -> None:
+def test_a_check_that_raises_has_a_line_too(account: Account, world: Installed) -> None:
     def broken(_: CheckContext) -> Iterable[Finding]:
         raise ZeroDivisionError("somebody's id")
 
@@ -180,7 +180,7 @@ def test_a_check_that_breaks_is_a_line_too(account: Account, world: Installed) -
         ("UPDATE_COMPLETE", "good"),
     ],
 )
-def test_the_stacks_state(world: Installed, capsys: Any, status: str, mark: str) -> None:
+def test_the_state_of_the_stack_is_judged(world: Installed, capsys: Any, status: str, mark: str) -> None:
     world.stack_status(status)
     found = doctor(world, capsys)
     assert found["stack"][0] == mark
@@ -188,13 +188,13 @@ def test_the_stacks_state(world: Installed, capsys: Any, status: str, mark: str)
     assert ("bucket" in found) is (mark != "bad")
 
 
-def test_a_failed_update_was_taken_back(world: Installed, capsys: Any) -> None:
+def test_a_failed_update_that_was_rolled_back_is_named(world: Installed, capsys: Any) -> None:
     world.stack_status("UPDATE_ROLLBACK_COMPLETE")
     mark, text = doctor(world, capsys)["stack"][:2]
     assert (mark, text) == ("look", "hippodrome works as before its last update, which failed.")
 
 
-def test_who_may_not_look_is_told_which_permission_is_missing(world: Installed, capsys: Any) -> None:
+def test_doctor_names_missing_permissions(world: Installed, capsys: Any) -> None:
     world.fail("cloudformation:GetTemplate", "AccessDenied", status=403)
     world.fail("sns:ListSubscriptionsByTopic", "AuthorizationError", status=403)
     found = doctor(world, capsys)
@@ -202,7 +202,7 @@ def test_who_may_not_look_is_told_which_permission_is_missing(world: Installed, 
     assert found["alarm e-mail"][1] == "could not be checked: These credentials may not list subscriptions by topic."
 
 
-def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
+def test_without_a_stack_or_credentials_doctor_says_so(world: Installed, capsys: Any) -> None:
     found = doctor(world, capsys, "--stack", "nowhere")
     assert set(found) == {"credentials", "region", "stack"}
     world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
@@ -212,7 +212,7 @@ def test_no_stack_and_no_credentials(world: Installed, capsys: Any) -> None:
 
 
 @pytest.mark.parametrize("code", ["OptInRequired", "SubscriptionRequiredException", "NotSignedUp"])
-def test_an_account_that_aws_has_not_activated_yet(world: Installed, capsys: Any, code: str) -> None:
+def test_commands_say_that_aws_has_not_activated_the_account_yet(world: Installed, capsys: Any, code: str) -> None:
     world.fail("cloudformation:DescribeStacks", code, status=403)
     ran = world.run(capsys, "status")
     assert ran.code == Exit.FAILED
@@ -220,7 +220,7 @@ def test_an_account_that_aws_has_not_activated_yet(world: Installed, capsys: Any
     assert "→ Finish the sign-up in AWS's console" in ran.err
 
 
-def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) -> None:
+def test_the_project_can_be_named_by_its_folder(world: Installed, capsys: Any, tmp_path: Path) -> None:
     for name in ("steps", "agent.py", "config.yml"):
         (shutil.copytree if name == "steps" else shutil.copy)(ROOT / name, tmp_path / name)
     config = tmp_path / "config.yml"
@@ -239,7 +239,7 @@ def test_a_project_of_a_folder(world: Installed, capsys: Any, tmp_path: Path) ->
 # Addresses
 
 
-def test_delegation(world: Installed, account: Account) -> None:
+def test_the_delegation_of_the_domain_is_checked(world: Installed, account: Account) -> None:
     elsewhere = Delegation(("ns1.elsewhere.net",), "example.org is delegated to other name servers: ns1.elsewhere.net.")
     line = only(addresses.zone(context(account, delegation=lambda _: elsewhere)))
     assert line.mark is Mark.BAD
@@ -248,12 +248,12 @@ def test_delegation(world: Installed, account: Account) -> None:
     assert only(addresses.zone(context(account, delegation=lambda _: unknown))).mark is Mark.LOOK
 
 
-def test_no_hosted_zone(world: Installed, account: Account) -> None:
+def test_a_missing_hosted_zone_is_reported(world: Installed, account: Account) -> None:
     world.client("route53").delete_hosted_zone(Id=world.env["HOSTED_ZONE_ID"])
     assert "no hosted zone" in only(addresses.zone(context(account))).text
 
 
-def test_the_site(world: Installed, account: Account) -> None:
+def test_the_site_is_asked_for_its_page(world: Installed, account: Account) -> None:
     def refused(_: str) -> int:
         raise urllib.error.URLError("Name or service not known")
 
@@ -268,7 +268,7 @@ def authorities() -> set[str]:
     return {str(one["serialNumber"]) for one in addresses.authorities().get_ca_certs()}
 
 
-def test_certificates_can_be_checked_on_a_machine_without_authorities(monkeypatch: Any, tmp_path: Path) -> None:
+def test_machines_without_certificate_authorities_use_those_of_mozilla(monkeypatch: Any, tmp_path: Path) -> None:
     """As Python from python.org is on macOS. What the machine does have counts as well."""
     (tmp_path / "none.pem").touch()
     monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "none.pem"))
@@ -281,7 +281,9 @@ def test_certificates_can_be_checked_on_a_machine_without_authorities(monkeypatc
     assert len(authorities() - mozillas) == 1
 
 
-def test_the_sites_certificate(world: Installed, account: Account, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_certificate_of_the_site_must_be_issued(
+    world: Installed, account: Account, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arn = world.client("acm").request_certificate(DomainName="study.example.org", ValidationMethod="DNS")[
         "CertificateArn"
     ]
@@ -317,13 +319,15 @@ def test_the_sites_certificate(world: Installed, account: Account, monkeypatch: 
         (chain("*.servers.example.org", days=0.5, lifetime=6.6), Mark.BAD, "0 days left"),
     ],
 )
-def test_the_servers_certificate(world: Installed, account: Account, pem: bytes, mark: Mark, says: str) -> None:
+def test_the_certificate_of_the_servers_is_checked(
+    world: Installed, account: Account, pem: bytes, mark: Mark, says: str
+) -> None:
     world.put("SSL/servers.example.org/fullchain.pem", pem)
     line = only(addresses.certificate(context(account)))
     assert (line.mark, says in line.text) == (mark, True), line
 
 
-def test_no_certificate(world: Installed, account: Account) -> None:
+def test_a_missing_certificate_is_bad(world: Installed, account: Account) -> None:
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key="SSL/servers.example.org/fullchain.pem")
     assert only(addresses.certificate(context(account))).mark is Mark.BAD
 
@@ -335,7 +339,7 @@ def fresh(installed: Installed) -> None:  # noqa: F811
     installed._answers.clear()
 
 
-def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
+def test_quotas_that_are_too_small_come_with_the_command_to_raise_them(world: Installed, account: Account) -> None:
     fresh(world)
     quotas(world, spot=6, on_demand=6, functions=10)
     one = context(account, at_once=20)
@@ -349,7 +353,7 @@ def test_quotas_that_are_too_small(world: Installed, account: Account) -> None:
 
 
 @pytest.mark.parametrize(("free", "mark"), [(6, Mark.BAD), (7, Mark.LOOK), (14, Mark.LOOK), (15, Mark.GOOD)])
-def test_pages_need_what_the_functions_behind_queues_leave(
+def test_pages_need_executions_beside_the_functions_behind_queues(
     world: Installed, account: Account, free: int, mark: Mark
 ) -> None:
     fresh(world)
@@ -357,7 +361,7 @@ def test_pages_need_what_the_functions_behind_queues_leave(
     assert only(capacity.functions(context(account, at_once=20))).mark is mark
 
 
-def test_pages_of_a_lobby_need_more_of_the_account_than_one_page_for_each_server(
+def test_sessions_need_executions_for_each_participant_and_not_for_each_server(
     world: Installed, account: Account
 ) -> None:
     fresh(world)
@@ -372,7 +376,7 @@ def test_pages_of_a_lobby_need_more_of_the_account_than_one_page_for_each_server
     assert "80 participants" in found.text
 
 
-def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
+def test_unknown_quotas_are_remarks_or_the_defaults_of_aws(world: Installed, account: Account) -> None:
     fresh(world)
     for action in ("GetServiceQuota", "GetAWSDefaultServiceQuota"):
         world.fail(f"service-quotas:{action}", "NoSuchResourceException", times=2)
@@ -382,7 +386,7 @@ def test_quotas_that_nobody_tells(world: Installed, account: Account) -> None:
     assert [line.mark for line in capacity.fargate(context(account))] == [Mark.GOOD, Mark.GOOD]
 
 
-def test_large_servers_need_more(world: Installed, account: Account) -> None:
+def test_large_servers_need_a_larger_quota(world: Installed, account: Account) -> None:
     fresh(world)
     quotas(world, spot=30, on_demand=30)
     large = project(world)
@@ -391,7 +395,7 @@ def test_large_servers_need_more(world: Installed, account: Account) -> None:
     assert (spot.mark, "7 servers of 4 vCPU" in spot.text) == (Mark.LOOK, True)
 
 
-def test_warm_servers_need_room_of_their_own(world: Installed, account: Account) -> None:
+def test_warm_servers_count_against_the_quota(world: Installed, account: Account) -> None:
     fresh(world)
     quotas(world, spot=23, on_demand=24)
     world.register(project(world, warm_servers=4))
@@ -413,7 +417,9 @@ def test_a_quota_that_warm_servers_use_up(world: Installed, account: Account) ->
 # Projects
 
 
-def test_no_live_project(world: Installed, account: Account) -> None:
+def test_without_a_live_project_capacity_is_checked_for_servers_of_the_usual_size(
+    world: Installed, account: Account
+) -> None:
     world.register(project(world, live=False))
     assert only(images.projects(context(account))).text == "None is live."
     fresh(world)
@@ -423,7 +429,7 @@ def test_no_live_project(world: Installed, account: Account) -> None:
     assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
 
-def test_an_image_that_is_gone_or_was_never_pushed(world: Installed, account: Account) -> None:
+def test_a_missing_image_is_bad(world: Installed, account: Account) -> None:
     digest = "sha256:" + "0" * 64
     world.register(project(world, task_definition=definition(world, image=f"{world.repository}@{digest}")))
     for answer in (None, {"imageDetails": []}):
@@ -433,7 +439,7 @@ def test_an_image_that_is_gone_or_was_never_pushed(world: Installed, account: Ac
         assert (line.mark, "pushed half-way, or deleted" in line.text) == (Mark.BAD, True)
 
 
-def test_task_definitions_that_cannot_run(world: Installed, account: Account) -> None:
+def test_task_definitions_that_cannot_run_are_bad(world: Installed, account: Account) -> None:
     missing = f"arn:aws:ecs:us-east-1:{world.env['SCHEDULE_ROLE_ARN'].split(':')[4]}:task-definition/gone:7"
     for task, says in ((missing, "is gone"), (definition(world, "other", "main"), "has no container named trial")):
         world.register(project(world, task_definition=task))
@@ -443,7 +449,7 @@ def test_task_definitions_that_cannot_run(world: Installed, account: Account) ->
     assert "has no task definition" in only(images.projects(context(account))).text
 
 
-def test_images_that_want_a_look(world: Installed, account: Account) -> None:
+def test_images_with_weaknesses_are_remarks(world: Installed, account: Account) -> None:
     counts = {"findingSeverityCounts": {"CRITICAL": 2, "HIGH": 7, "LOW": 90}}
     world.answer("ecr:DescribeImageScanFindings", {"imageScanFindings": counts})
     found = marks(images.projects(context(account, now=datetime.now(UTC) + timedelta(days=200))))
@@ -465,7 +471,7 @@ def test_images_that_want_a_look(world: Installed, account: Account) -> None:
     assert "runs an image of elsewhere" in only(images.projects(context(account))).text
 
 
-def test_a_study_on_another_port_than_the_installations_is_told(world: Installed, account: Account) -> None:
+def test_a_study_on_another_port_than_the_installation_is_a_remark(world: Installed, account: Account) -> None:
     world.register(project(world, server_port=5000))
     (found,) = [one for one in images.projects(context(account)) if one.mark is Mark.LOOK]
     assert found.text == "its servers listen on port 5000, and the installation's port is 443."
@@ -483,7 +489,7 @@ def test_a_study_on_another_port_than_the_installations_is_told(world: Installed
         (120, "no warm servers are kept"),
     ],
 )
-def test_warm_servers_that_have_no_time_to_wait(
+def test_warm_servers_with_little_or_no_time_to_wait_are_a_remark(
     world: Installed, account: Account, max_runtime: int, says: str
 ) -> None:
     world.register(project(world, warm_servers=2, max_runtime=max_runtime))
@@ -496,12 +502,14 @@ def test_warm_servers_that_have_no_time_to_wait(
 @pytest.mark.parametrize(
     "fits", [{"max_runtime": 60}, {"max_runtime": 110, "live": False}, {"max_runtime": 110, "warm_servers": 0}]
 )
-def test_warm_servers_that_have_time_or_are_not_kept(world: Installed, account: Account, fits: dict[str, Any]) -> None:
+def test_warm_servers_with_time_to_wait_and_studies_without_them_are_good(
+    world: Installed, account: Account, fits: dict[str, Any]
+) -> None:
     kept = project(world, **{"warm_servers": 2, **fits})
     assert only(images.projects(context(account, wanted=kept))).mark is Mark.GOOD
 
 
-def test_no_installation_runs_servers_for_longer_than_a_day(world: Installed, account: Account) -> None:
+def test_the_advice_on_warm_servers_exceeds_no_day(world: Installed, account: Account) -> None:
     world.register(project(world, warm_servers=2, max_runtime=1400))
     (advice,) = (one.advice for one in images.projects(context(account)) if "warm" in one.text)
     assert advice == "Register the project with a shorter maxRuntime or warmServers: 0."
@@ -517,7 +525,7 @@ def test_a_study_without_a_game_needs_no_image(world: Installed, account: Accoun
 # Safety
 
 
-def test_a_bucket_that_is_open(world: Installed, account: Account) -> None:
+def test_an_open_bucket_is_bad(world: Installed, account: Account) -> None:
     fresh(world)
     s3, name = world.client("s3"), world.env["BUCKET"]
     everybody = {"Effect": "Allow", "Principal": "*", "Action": "s3:GetObject"}
@@ -531,14 +539,14 @@ def test_a_bucket_that_is_open(world: Installed, account: Account) -> None:
     assert any("no older versions" in text for text in found)
 
 
-def test_a_bucket_of_somebody_elses_or_none(world: Installed, account: Account) -> None:
+def test_a_foreign_or_missing_bucket_is_reported(world: Installed, account: Account) -> None:
     world.fail("s3:HeadBucket", "403", status=403)
     assert "belongs to another account" in only(safety.bucket(context(account))).text
     world.fail("s3:HeadBucket", "404", status=404)
     assert "is gone" in only(safety.bucket(context(account))).text
 
 
-def test_dead_letters_and_alarms_that_fire(world: Installed, account: Account) -> None:
+def test_dead_letters_and_firing_alarms_are_bad(world: Installed, account: Account) -> None:
     sqs = world.client("sqs")
     dead = sqs.get_queue_url(QueueName="hippodrome-start-dead-letters")["QueueUrl"]
     sqs.send_message(QueueUrl=dead, MessageBody="{}")
@@ -548,7 +556,7 @@ def test_dead_letters_and_alarms_that_fire(world: Installed, account: Account) -
     assert only(safety.alarms(context(account))).mark is Mark.BAD
 
 
-def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
+def test_the_subscribers_of_alarms_are_checked(world: Installed, account: Account) -> None:
     topic = world.alarm_topic
     given = {"TopicArn": topic, "Protocol": "email", "Owner": "123456789012", "Endpoint": "admin@example.org"}
     for arn, mark in (("PendingConfirmation", Mark.LOOK), (f"{topic}:1", Mark.GOOD)):
@@ -564,9 +572,9 @@ def test_who_hears_the_alarms(world: Installed, account: Account) -> None:
 class Clock:
     """Time that passes only when somebody sleeps, and what AWS does meanwhile."""
 
-    def __init__(self, world: Installed, town: StudyOnMoto | None = None) -> None:
+    def __init__(self, world: Installed, study_functions: StudyOnMoto | None = None) -> None:
         self.now = 0.0
-        self.world, self.town = world, town
+        self.world, self.study_functions = world, study_functions
         self.world.in_sync = True
 
     def __call__(self) -> float:
@@ -574,12 +582,14 @@ class Clock:
 
     def sleep(self, seconds: float) -> None:
         self.now += seconds
-        if self.town:
-            self.town.deliver_some()
+        if self.study_functions:
+            self.study_functions.deliver_some()
 
 
-def rehearsal(world: Installed, town: StudyOnMoto | None, told: list[str] | None = None, **more: Any) -> Rehearsal:
-    clock = Clock(world, town)
+def rehearsal(
+    world: Installed, study_functions: StudyOnMoto | None, told: list[str] | None = None, **more: Any
+) -> Rehearsal:
+    clock = Clock(world, study_functions)
     whose = msgspec.structs.replace(study(), id="ms-pacman")
     tell = told.append if told is not None else lambda _: None
     return Rehearsal(world.platform, whose, tell, clock=clock, sleep=clock.sleep, **more)
@@ -591,25 +601,25 @@ def assert_nothing_left(world: Installed) -> None:
 
 
 def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> None:
-    town, told = StudyOnMoto(world), []
+    study_functions, told = StudyOnMoto(world), []
     SecretCache(world.platform.documents).get_or_create()
     before = world.keys()
-    found = rehearsal(world, town, told).run()
+    found = rehearsal(world, study_functions, told).run()
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert "ready after" in found[0].text
     assert any("its name is being made known" in line for line in told)
     assert_nothing_left(world)
-    town.deliver()
+    study_functions.deliver()
     assert world.keys() == before
     assert_nothing_left(world)
 
 
-def test_a_rehearsal_may_be_given_a_warm_server_and_says_so(world: Installed) -> None:
-    town = StudyOnMoto(world)
+def test_a_rehearsal_says_that_it_got_a_warm_server(world: Installed) -> None:
+    study_functions = StudyOnMoto(world)
     whose = project(world, id="ms-pacman", warm_servers=1)
     world.register(whose)
     (name,) = world.warm(whose, 1)
-    clock = Clock(world, town)
+    clock = Clock(world, study_functions)
     found = Rehearsal(world.platform, whose, clock=clock, sleep=clock.sleep).run()
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert found[0].text.startswith("A warm server of ms-pacman, on Spot: ")
@@ -618,14 +628,14 @@ def test_a_rehearsal_may_be_given_a_warm_server_and_says_so(world: Installed) ->
     assert world.keys("ms-pacman/spares/") == []
 
 
-def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_one(world: Installed) -> None:
+def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_a_session(world: Installed) -> None:
     """A start message of a participant would start none; and the sweep must not take it for one too many."""
     whose = msgspec.structs.replace(study(players=2), id="ms-pacman")
-    town = StudyOnMoto(world)
+    study_functions = StudyOnMoto(world)
     world.register(whose)
     SecretCache(world.platform.documents).get_or_create()
     before, swept = world.keys(), []
-    clock = Clock(world, town)
+    clock = Clock(world, study_functions)
 
     def sleep(seconds: float) -> None:
         clock.sleep(seconds)
@@ -635,12 +645,12 @@ def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_one(world: 
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert set(swept) == {0}
     assert_nothing_left(world)
-    town.deliver()
+    study_functions.deliver()
     after = world.keys()
     assert [key for key in after if not key.startswith("_lobb")] == before
 
 
-def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None:
+def test_a_rehearsal_connects_to_its_server_as_browsers_do(world: Installed) -> None:
     asked: list[str] = []
 
     def closed(url: str) -> None:
@@ -650,15 +660,15 @@ def test_a_rehearsals_server_is_visited_as_browsers_do(world: Installed) -> None
     def distrusted(_: str) -> None:
         raise urllib.error.URLError(ssl.SSLCertVerificationError(1, "self-signed certificate"))
 
-    town = StudyOnMoto(world)
+    study_functions = StudyOnMoto(world)
     for reach, mark in ((asked.append, Mark.GOOD), (closed, Mark.LOOK), (distrusted, Mark.BAD)):
-        found = rehearsal(world, town, reach=reach).run()
+        found = rehearsal(world, study_functions, reach=reach).run()
         assert [line.mark for line in found] == [Mark.GOOD, mark, Mark.GOOD], found
         assert_nothing_left(world)
     assert re.fullmatch(r"https://s[a-z2-7]{20}-1\.servers\.example\.org:5000/", asked[0])
 
 
-def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installed) -> None:
+def test_a_rehearsal_cleans_up_if_no_function_acts(world: Installed) -> None:
     found = rehearsal(world, None).run()
     assert "No function acted on the start message" in found[0].text
     assert found[0].mark is Mark.BAD
@@ -667,18 +677,18 @@ def test_a_rehearsal_that_nobody_answers_is_cleaned_up_from_here(world: Installe
     assert_nothing_left(world)
 
 
-def test_a_rehearsal_that_aws_refuses(world: Installed) -> None:
-    town = StudyOnMoto(world)
+def test_a_rehearsal_says_why_its_server_was_closed(world: Installed) -> None:
+    study_functions = StudyOnMoto(world)
     world.fail("ecs:RunTask", "InvalidParameterException", "No such task definition.", times=10)
-    found = rehearsal(world, town).run()
+    found = rehearsal(world, study_functions).run()
     assert found[0].text == f"The server was closed: {Reason.REFUSED}."
     assert found[0].advice == Cause.DEFINITION.sentence
     assert_nothing_left(world)
 
 
 def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
-    town = StudyOnMoto(world)
-    one = rehearsal(world, town)
+    study_functions = StudyOnMoto(world)
+    one = rehearsal(world, study_functions)
     deliver, slept = one._sleep, 0
 
     def sleep(seconds: float) -> None:
@@ -692,7 +702,7 @@ def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
     with pytest.raises(KeyboardInterrupt):
         one.run()
     assert [line.mark for line in one.left] == [Mark.GOOD]
-    town.deliver()
+    study_functions.deliver()
     assert_nothing_left(world)
 
 
@@ -712,7 +722,7 @@ def test_a_rehearsal_decides_how_the_command_ends(
     assert ran.out.splitlines()[-1].startswith(last)
 
 
-def test_nothing_to_rehearse(world: Installed, capsys: Any) -> None:
+def test_a_rehearsal_without_a_live_project_is_bad(world: Installed, capsys: Any) -> None:
     world.register(project(world, live=False))
     assert doctor(world, capsys, "--rehearse")["rehearsal"][0] == "bad"
 

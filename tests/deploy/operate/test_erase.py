@@ -33,7 +33,7 @@ from hippodrome.storage.repository import Repository
 from testing import template as cfn
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
+from tests.deploy.installation import KEYS, CommandResult, Installed, installed  # noqa: F401
 from tests.test_docs import code
 
 STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
@@ -52,7 +52,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed: 
     return installed
 
 
-def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str = "maze") -> Ran:
+def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str = "maze") -> CommandResult:
     where = () if "--everywhere" in more else ("--project", project)
     return world.run(capsys, "erase", user, *where, "--yes", *more)
 
@@ -67,7 +67,7 @@ def versions(world: Installed, prefix: str = "") -> dict[str, int]:
     return found
 
 
-def mentioned(world: Installed, user: str) -> list[str]:
+def traces(world: Installed, user: str) -> list[str]:
     """Every key, server and timer that belongs to the participant."""
     label = ids.server_label("maze", user)
     keys = [key for key in versions(world) if key.startswith(f"maze/users/{user}/") or label in key]
@@ -94,7 +94,9 @@ def bodies(world: Installed) -> list[bytes]:
     return [s3.get_object(Bucket=bucket, Key=v["Key"], VersionId=v["VersionId"])["Body"].read() for v in found]
 
 
-def test_a_person_is_erased_from_a_kept_bucket_as_documented(world: Installed, monkeypatch: Any, capsys: Any) -> None:
+def test_a_participant_is_erased_from_a_kept_bucket_as_documented(
+    world: Installed, monkeypatch: Any, capsys: Any
+) -> None:
     kept = msgspec.structs.replace(STUDY, warm_servers=1, max_participants=20)
     world.register(kept, OTHER)
     world.warm(kept, 1)
@@ -116,7 +118,7 @@ def test_a_person_is_erased_from_a_kept_bucket_as_documented(world: Installed, m
     assert versions(world, "project_master_list.json")
 
 
-def test_everything_of_one_person_goes_and_nothing_of_anybody_else(world: Installed, capsys: Any) -> None:
+def test_everything_of_one_participant_is_erased_and_nothing_of_others(world: Installed, capsys: Any) -> None:
     for user in (ANN, ANNA, "ann"):
         world.participant(user, answered=5, recordings=2, PROLIFIC_PID=f"prolific-{user}")
         start(world, user)
@@ -124,20 +126,20 @@ def test_everything_of_one_person_goes_and_nothing_of_anybody_else(world: Instal
     world.put(f"maze/users/{ANN}/participant.json", b"an older version stays in the bucket")
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/answers/1.json")
     world.client("s3").create_multipart_upload(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/trials/x/big.gz")
-    mine = {*mentioned(world, ANN)}
+    mine = {*traces(world, ANN)}
     others = {key: count for key, count in versions(world).items() if key not in mine}
 
     ran = run(world, capsys, "--receipt", "receipt.json", "--json")
 
     assert ran.code == Exit.DONE, ran.err
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
     assert versions(world) == others  # those of ANN in another project among them
     assert len([*world.platform.tasks.list()]) == len(world.timers()) == len(world.records()) == 2
     uploads = world.client("s3").list_multipart_uploads(Bucket=world.env["BUCKET"])
     assert "Uploads" not in uploads
 
 
-def test_the_receipt_says_what_and_who_and_names_nobody(world: Installed, capsys: Any) -> None:
+def test_the_receipt_says_what_was_erased_and_names_no_participant(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=3, recordings=1)
     start(world)
     ran = run(world, capsys, "--receipt", "receipt.json", "--json")
@@ -163,7 +165,7 @@ def test_the_receipt_says_what_and_who_and_names_nobody(world: Installed, capsys
     assert named.json["person"]["userId"] == ANN
 
 
-def test_a_second_time_there_is_nothing_and_that_is_said(world: Installed, capsys: Any) -> None:
+def test_a_second_run_says_that_there_is_nothing(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     assert run(world, capsys).code == Exit.DONE
     before = versions(world)
@@ -174,7 +176,7 @@ def test_a_second_time_there_is_nothing_and_that_is_said(world: Installed, capsy
     assert json.loads(Path("again.json").read_text())["projects"][0]["deleted"] == {}
 
 
-def test_nobody_is_asked_for_a_typing_mistake_and_nothing_is_made_for_it(world: Installed, capsys: Any) -> None:
+def test_a_mistyped_participant_needs_no_confirmation_and_changes_nothing(world: Installed, capsys: Any) -> None:
     before = versions(world)
     assert world.run(capsys, "erase", "no-such-person", "--project", "maze").code == Exit.DONE
     assert versions(world) == before
@@ -185,7 +187,7 @@ def test_nobody_is_asked_for_a_typing_mistake_and_nothing_is_made_for_it(world: 
     assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this participant in maze.\n")
 
 
-def test_a_project_that_nobody_knows_is_no_erasure(world: Installed, capsys: Any) -> None:
+def test_an_unknown_project_is_refused(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     ran = run(world, capsys, project="mase")
     assert ran.code == Exit.FAILED
@@ -194,7 +196,7 @@ def test_a_project_that_nobody_knows_is_no_erasure(world: Installed, capsys: Any
     assert not list(Path().glob("erased-*"))
 
 
-def test_a_dry_run_and_no_yes_change_nothing(world: Installed, capsys: Any) -> None:
+def test_a_dry_run_and_a_missing_yes_change_nothing(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     start(world)
     with world.recording() as calls:
@@ -206,7 +208,7 @@ def test_a_dry_run_and_no_yes_change_nothing(world: Installed, capsys: Any) -> N
     assert not list(Path().glob("erased-*"))
 
 
-def test_everywhere_means_every_project_also_forgotten_ones(world: Installed, capsys: Any) -> None:
+def test_everywhere_erases_in_every_project_registered_or_not(world: Installed, capsys: Any) -> None:
     forgotten = msgspec.structs.replace(STUDY, id="forgotten")
     for project in (STUDY, OTHER, forgotten):
         world.participant(ANN, answered=1, project=project)
@@ -217,16 +219,20 @@ def test_everywhere_means_every_project_also_forgotten_ones(world: Installed, ca
 
 
 @pytest.mark.explores
-def test_more_than_a_listing_or_a_deletion_takes(world: Installed, capsys: Any, pages: int, monkeypatch: Any) -> None:
+def test_more_objects_than_a_listing_or_a_deletion_takes_are_erased(
+    world: Installed, capsys: Any, pages: int, monkeypatch: Any
+) -> None:
     monkeypatch.setattr(versioned, "BATCH", pages)
     world.participant(ANN)
     for number in range(1, pages + pages // 7):
         world.put(f"maze/users/{ANN}/trials/s/3-episode-{number:04}.jsonl.gz", b"")
     assert run(world, capsys).code == Exit.DONE
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+def test_documents_that_a_trial_saves_while_it_ends_are_erased_too(
+    world: Installed, capsys: Any, monkeypatch: Any
+) -> None:
     """Documents are touched only when the task has ended."""
     world.participant(ANN, answered=3)
     start(world)
@@ -246,10 +252,10 @@ def test_what_a_trial_saves_while_it_ends_is_erased_too(world: Installed, capsys
     monkeypatch.setattr(EcsTasks, "draining", draining)
     assert run(world, capsys).code == Exit.DONE
     assert seen[:3] == [4, 5, 6]  # nothing was deleted while it was saving
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-class Thief:
+class LateStore:
     """Has a presigned request that the participant's server got at the last moment, and uses it at its last moment."""
 
     def __init__(self, world: Installed) -> None:
@@ -273,23 +279,23 @@ class Thief:
 
 
 @pytest.mark.parametrize("state", [ServerState.READY, ServerState.CLOSED])
-def test_what_was_signed_for_their_server_before_is_erased_when_it_comes_after(
+def test_a_document_stored_late_by_an_earlier_presigned_request_is_erased(
     world: Installed, capsys: Any, monkeypatch: Any, state: ServerState
 ) -> None:
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     closed = world.platform.now() - STORE_AFTER_CLOSE if state is ServerState.CLOSED else None
     world.record(ANN, state, closed=closed)
-    thief = Thief(world)
+    thief = LateStore(world)
     made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
     assert not made.run()
     assert "seconds more" in capsys.readouterr().err
     thief.sleep(VALID_SECONDS + SIGNING)
     assert thief.used
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
+def test_a_participant_without_a_recent_server_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     over = timedelta(seconds=VALID_SECONDS + SIGNING)
@@ -297,10 +303,10 @@ def test_who_had_no_server_lately_is_erased_without_waiting(world: Installed, mo
     slept: list[float] = []
     assert not eraser(world, sleep=slept.append).run()
     assert slept == []
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-def test_a_request_is_signed_within_the_time_that_erase_allows_for_it() -> None:
+def test_signing_takes_no_longer_than_erase_assumes() -> None:
     assert cfn.resources("AWS::Lambda::Function")["SignRequests"]["Timeout"] <= SIGNING
 
 
@@ -316,7 +322,7 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     assert "still runs" in ran.err
     assert len(versions(world, f"maze/users/{ANN}/")) == 4
     assert run(world, capsys).code == Exit.DONE
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
 def eraser(
@@ -326,7 +332,7 @@ def eraser(
     return Eraser(account, find_installation(account), "maze", ANN, executor=Executor(sleep, clock))
 
 
-def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, monkeypatch: Any) -> None:
+def test_a_participant_who_returns_meanwhile_is_erased_again(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=2)
     made, times = eraser(world), iter(range(2))
     delete = made._delete
@@ -342,10 +348,10 @@ def test_somebody_who_comes_back_meanwhile_is_erased_again(world: Installed, mon
     monkeypatch.setattr(made, "_delete", delete_and_return)
     assert not made.run()
     assert made.receipt.rounds == 3
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-def test_somebody_who_keeps_coming_back_is_told_of(world: Installed, capsys: Any, monkeypatch: Any) -> None:
+def test_erase_reports_a_participant_who_keeps_returning(world: Installed, capsys: Any, monkeypatch: Any) -> None:
     world.participant(ANN, answered=2)
     delete = Eraser._delete
 
@@ -361,7 +367,7 @@ def test_somebody_who_keeps_coming_back_is_told_of(world: Installed, capsys: Any
     assert json.loads(receipt.read_text())["complete"] is False
 
 
-def test_several_people_who_are_erased_in_one_second_have_a_receipt_each(
+def test_each_of_several_erasures_in_one_second_has_its_own_receipt(
     world: Installed, capsys: Any, monkeypatch: Any
 ) -> None:
     class Stopped(datetime):
@@ -378,7 +384,9 @@ def test_several_people_who_are_erased_in_one_second_have_a_receipt_each(
 
 
 @pytest.mark.parametrize("at", range(4))
-def test_cut_off_anywhere_it_goes_on_from_there(world: Installed, capsys: Any, monkeypatch: Any, at: int) -> None:
+def test_a_run_after_an_interruption_finishes_the_erasure(
+    world: Installed, capsys: Any, monkeypatch: Any, at: int
+) -> None:
     for number in range(3):
         world.participant(ANN, answered=4, recordings=number)
     start(world)
@@ -396,16 +404,16 @@ def test_cut_off_anywhere_it_goes_on_from_there(world: Installed, capsys: Any, m
 
         patch.setattr(owner, cut, cut_off)
         assert run(world, capsys).code == Exit.INTERRUPTED
-    assert mentioned(world, ANN)
+    assert traces(world, ANN)
     partial = [json.loads(path.read_text()) for path in Path().glob("erased-*.json")]
     assert all(one["complete"] is False for one in partial)
     assert bool(partial) == (cut == "_delete_batch")
     assert run(world, capsys, "--receipt", "whole.json").code == Exit.DONE
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
     assert json.loads(Path("whole.json").read_text())["complete"] is True
 
 
-def test_a_refused_deletion_is_no_success(world: Installed, capsys: Any) -> None:
+def test_a_refused_deletion_fails_the_erasure(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     errors = [{"Key": f"maze/users/{ANN}/participant.json", "Code": "AccessDenied", "Message": "object lock"}]
     for page in world.client("s3").get_paginator("list_object_versions").paginate(Bucket=world.env["BUCKET"]):
@@ -421,7 +429,7 @@ def test_a_refused_deletion_is_no_success(world: Installed, capsys: Any) -> None
     assert "participant" not in deleted  # what was refused is not on the receipt
 
 
-def test_a_server_started_a_moment_ago_that_ecs_does_not_list_yet(world: Installed, monkeypatch: Any) -> None:
+def test_erase_waits_for_a_new_task_that_ecs_does_not_list_yet(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=1)
     world.platform.timers.set(ids.server_name(ids.server_label("maze", ANN), 1), world.platform.now(), {})
     now = world.platform.now()
@@ -444,10 +452,10 @@ def test_a_server_started_a_moment_ago_that_ecs_does_not_list_yet(world: Install
     assert not made.run()
     assert world.task_arns()
     assert [*world.platform.tasks.list()] == []
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
-def test_a_receipt_that_cannot_be_written_stops_it_beforehand(world: Installed, capsys: Any) -> None:
+def test_a_receipt_that_cannot_be_written_stops_the_erasure_beforehand(world: Installed, capsys: Any) -> None:
     world.participant(ANN, answered=2)
     Path("there.json").write_text("somebody's")
     for target in ("there.json", "no/such/folder.json"):
@@ -456,28 +464,28 @@ def test_a_receipt_that_cannot_be_written_stops_it_beforehand(world: Installed, 
     assert Path("there.json").read_text() == "somebody's"
 
 
-def test_bucket_without_versions(world: Installed, capsys: Any) -> None:
+def test_a_participant_is_erased_from_a_bucket_without_versions(world: Installed, capsys: Any) -> None:
     world.client("s3").put_bucket_versioning(
         Bucket=world.env["BUCKET"], VersioningConfiguration={"Status": "Suspended"}
     )
     world.participant(ANN, answered=2)
     assert run(world, capsys).code == Exit.DONE
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
 
 
 WARM = msgspec.structs.replace(STUDY, warm_servers=2)
 
 
-def given(world: Installed, user: str) -> str:
+def take_warm_server(world: Installed, user: str) -> str:
     """Let somebody take a warm server; its name."""
     (name,) = world.warm(WARM, 1)
     Servers(world.platform).start(StartServer("maze", user))
     return name
 
 
-def test_a_warm_server_that_the_person_took_knows_nothing_of_them_any_more(world: Installed, capsys: Any) -> None:
+def test_the_warm_server_of_the_participant_is_erased_too(world: Installed, capsys: Any) -> None:
     world.register(WARM)
-    hers, others = given(world, ANN), given(world, ANNA)
+    hers, others = take_warm_server(world, ANN), take_warm_server(world, ANNA)
     (waiting,) = world.warm(WARM, 1)
     world.participant(ANN, answered=1)
     label, kept = hers.rpartition("-")[0], others.rpartition("-")[0]
@@ -488,7 +496,7 @@ def test_a_warm_server_that_the_person_took_knows_nothing_of_them_any_more(world
     assert ran.code == Exit.DONE, ran.err
     left = versions(world)
     assert not [key for key in left if key in about]
-    assert mentioned(world, ANN) == []
+    assert traces(world, ANN) == []
     assert {f"maze/spares/{others}.json", f"_servers/{kept}.json"} <= set(left)
     assert {task.name for task in world.platform.tasks.list()} == {others, waiting}
     receipt = Path("receipt.json").read_text()
@@ -496,9 +504,9 @@ def test_a_warm_server_that_the_person_took_knows_nothing_of_them_any_more(world
     assert json.loads(receipt)["projects"][0]["keys"]["maze/spares/{server}.json"] == 2  # and a delete marker
 
 
-def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys: Any) -> None:
+def test_warm_servers_of_earlier_attempts_are_erased_too(world: Installed, capsys: Any) -> None:
     world.register(WARM)
-    first = given(world, ANN)
+    first = take_warm_server(world, ANN)
     servers = Servers(world.platform)
     (task,) = world.task_arns()
     lost = parse_task_changed(world.task_event(task, "STOPPED", stop_code="SpotInterruption"))
@@ -513,11 +521,11 @@ def test_warm_servers_of_earlier_attempts_are_found_too(world: Installed, capsys
 
 
 @pytest.mark.parametrize("refused", ["maze/spares/", "_servers/"])
-def test_the_record_that_leads_to_a_warm_server_goes_last(
+def test_the_record_that_names_a_warm_server_is_erased_last(
     world: Installed, capsys: Any, monkeypatch: Any, refused: str
 ) -> None:
     world.register(WARM)
-    name = given(world, ANN)
+    name = take_warm_server(world, ANN)
     world.participant(ANN, answered=1)
     batch = VersionedBucket._delete_batch
 
@@ -534,7 +542,7 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(
     assert not [key for key in versions(world) if name.rpartition("-")[0] in key]
 
 
-def test_a_place_that_the_person_held_is_free_again(world: Installed, capsys: Any) -> None:
+def test_the_place_of_the_participant_is_free_again(world: Installed, capsys: Any) -> None:
     limited = msgspec.structs.replace(STUDY, max_participants=2)
     places = Slots(world.platform)
     for user in (ANN, ANNA):

@@ -29,7 +29,7 @@ from hippodrome.model.server import Server, ServerState
 from protocol.handover import Handover
 from protocol.keys import handover_key, session_key
 from protocol.session import parse
-from tests.deploy.installation import Ran
+from tests.deploy.installation import CommandResult
 from tests.export.data_world import crowd, into_folder
 from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study
 
@@ -43,11 +43,11 @@ class Machine:
         self.data, self.tmp, self._capsys = tmp / "data", tmp, capsys
         self.put = into_folder(self.data)
 
-    def erase(self, *more: str, user: str = ANN) -> Ran:
+    def erase(self, *more: str, user: str = ANN) -> CommandResult:
         self._capsys.readouterr()
         code = main(["erase", user, "--project", "maze", "--from", str(self.data), *more])
         printed = self._capsys.readouterr()
-        return Ran(code, printed.out, printed.err)
+        return CommandResult(code, printed.out, printed.err)
 
     def contents(self) -> dict[str, bytes]:
         """Every file; recordings unpacked."""
@@ -68,7 +68,7 @@ def machine(tmp_path: Path, capsys: Any) -> Machine:
     return Machine(tmp_path, capsys)
 
 
-def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(machine: Machine) -> None:
+def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(machine: Machine) -> None:
     study(machine.put, machine.tmp)
     machine.put(f"_servers/{LABEL}.json", b"{}")
     machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
@@ -91,7 +91,7 @@ def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(machine: Machin
     assert machine.contents() == after
 
 
-def test_when_all_members_are_erased_the_session_is_gone(machine: Machine) -> None:
+def test_after_all_members_are_erased_the_session_is_deleted(machine: Machine) -> None:
     pair(machine.put, machine.tmp)
     machine.put(".erase/.0123456789abcdef.new", b"of a run that was killed")
     machine.put(f"_servers/{ids.server_label('maze', SID)}.json", b"{}")
@@ -99,7 +99,7 @@ def test_when_all_members_are_erased_the_session_is_gone(machine: Machine) -> No
     assert machine.contents() == {}
 
 
-def test_a_study_without_sessions(machine: Machine) -> None:
+def test_a_participant_of_a_study_without_sessions_is_erased(machine: Machine) -> None:
     user, other = crowd(machine.put, machine.tmp, 2)
     kept = {key: body for key, body in machine.contents().items() if f"/{user}/" not in key}
     assert machine.erase("--yes", user=user).code == Exit.DONE
@@ -107,7 +107,7 @@ def test_a_study_without_sessions(machine: Machine) -> None:
     assert [key for key in kept if other in key]
 
 
-def test_a_study_that_is_held_is_not_touched(machine: Machine) -> None:
+def test_a_study_that_is_running_is_not_changed(machine: Machine) -> None:
     pair(machine.put, machine.tmp)
     before = machine.contents()
     lock = machine.tmp / ".hippodrome" / "data.lock"
@@ -122,7 +122,7 @@ def test_a_study_that_is_held_is_not_touched(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("left", ["a server that runs", "an unfinished recording"])
-def test_what_a_killed_run_has_left_is_finished_first(machine: Machine, left: str) -> None:
+def test_erase_first_finishes_what_a_killed_run_has_left(machine: Machine, left: str) -> None:
     pair(machine.put, machine.tmp)
     before = machine.contents()
     state = machine.tmp / ".hippodrome" / "data"
@@ -137,18 +137,18 @@ def test_what_a_killed_run_has_left_is_finished_first(machine: Machine, left: st
     assert machine.contents() == before
 
 
-def test_what_the_functions_still_know_is_told(machine: Machine) -> None:
+def test_documents_of_local_functions_that_name_the_participant_are_reported(machine: Machine) -> None:
     pair(machine.put, machine.tmp)
     into_folder(machine.tmp / ".hippodrome" / "data")("queue/1.json", json.dumps({"userId": ANN}).encode())
     assert ".hippodrome/data/queue/1.json still names them" in machine.erase("--yes").err
 
 
-class Cut(BaseException):
+class Interruption(BaseException):
     """The process ends here."""
 
 
 @contextlib.contextmanager
-def cut_off(at: int, after: bool) -> Iterator[None]:
+def interrupt_at(at: int, after: bool) -> Iterator[None]:
     """End the process before or after the n-th change."""
     count = [0]
     with pytest.MonkeyPatch.context() as patch:
@@ -158,10 +158,10 @@ def cut_off(at: int, after: bool) -> Iterator[None]:
             def change(*args: Any, whole: Any = whole, **how: Any) -> Any:
                 count[0] += 1
                 if count[0] == at and not after:
-                    raise Cut
+                    raise Interruption
                 answer = whole(*args, **how)
                 if count[0] == at:
-                    raise Cut
+                    raise Interruption
                 return answer
 
             patch.setattr(owner, name, change)
@@ -169,17 +169,17 @@ def cut_off(at: int, after: bool) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
-def test_cut_off_at_any_change_it_goes_on_from_there(tmp_path: Path, capsys: Any, after: bool) -> None:
+def test_a_run_after_an_interruption_at_any_change_finishes(tmp_path: Path, capsys: Any, after: bool) -> None:
     for at in range(1, 60):
         machine = Machine(tmp_path / str(at), capsys)
         machine.tmp.mkdir()
         study(machine.put, machine.tmp)
         machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
         try:
-            with cut_off(at, after):
+            with interrupt_at(at, after):
                 FolderEraser(machine.data, "maze", ANN).run()
             break
-        except Cut:
+        except Interruption:
             FolderEraser(machine.data, "maze", ANN).run()
         assert machine.traces() == [], at
         assert said(BOB).encode() in machine.contents()[recording_key()]
@@ -188,7 +188,7 @@ def test_cut_off_at_any_change_it_goes_on_from_there(tmp_path: Path, capsys: Any
 
 
 @pytest.mark.parametrize("owner", [ANN, SID])
-def test_the_record_that_leads_to_a_warm_server_goes_last(machine: Machine, owner: str) -> None:
+def test_the_record_that_names_a_warm_server_is_erased_last(machine: Machine, owner: str) -> None:
     machine.put(session_key("maze", SID), session(ANN, "").to_json())
     now, label = datetime.now(UTC), ids.server_label("maze", "~warm")
     name = ids.server_name(label, 1)
@@ -197,12 +197,12 @@ def test_the_record_that_leads_to_a_warm_server_goes_last(machine: Machine, owne
     machine.put(server.key(label), to_json(msgspec.structs.replace(record, user_id="~warm", assigned_to=record.label)))
     machine.put(handover_key("maze", name), Handover(owner, None, name).to_json())
     for at in range(1, 8):
-        with contextlib.suppress(Cut), cut_off(at, after=True):
+        with contextlib.suppress(Interruption), interrupt_at(at, after=True):
             FolderEraser(machine.data, "maze", ANN).run()
     assert machine.contents() == {}
 
 
-def test_a_dry_run_and_no_yes_change_nothing(machine: Machine) -> None:
+def test_a_dry_run_and_a_missing_yes_change_nothing(machine: Machine) -> None:
     pair(machine.put, machine.tmp)
     before = machine.contents()
     dry = machine.erase("--dry-run", "--json")
@@ -220,7 +220,7 @@ def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "a.json").read_bytes() == b"new"
 
 
-def test_make_run_keeps_its_lock_and_tasks_where_they_are_looked_for() -> None:
+def test_erase_and_make_run_agree_on_the_folder_of_the_lock() -> None:
     from local.__main__ import ROOT
 
     assert folder_eraser.STATE == ROOT

@@ -32,7 +32,7 @@ from protocol.keys import groups_key, session_key, sessions_folder, waiting_key
 from protocol.session import parse
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import KEYS, Installed, Ran, installed  # noqa: F401
+from tests.deploy.installation import KEYS, CommandResult, Installed, installed  # noqa: F401
 from tests.export.session_world import (
     ANN,
     BOB,
@@ -64,7 +64,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed: 
     return installed
 
 
-def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> Ran:
+def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> CommandResult:
     return world.run(capsys, "erase", user, "--project", "maze", "--yes", *more)
 
 
@@ -110,7 +110,9 @@ def eraser(world: Installed, user: str = ANN, **how: Any) -> Eraser:
     return Eraser(account, find_installation(account), "maze", user, **how)
 
 
-def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
+    world: Installed, tmp_path: Path, capsys: Any
+) -> None:
     pair(world.put, tmp_path)
     pair(world.put, tmp_path, members=("dora-0001", "emil-0001"), session_id=OTHER)
     world.put(session_key("maze", SID), session(ANN, BOB).to_json())  # an older version stays in the bucket
@@ -142,7 +144,7 @@ def test_nothing_of_one_member_stays_and_the_others_is_as_it_was(world: Installe
     assert project["deleted"]["sessions"]["versions"] == 4  # two of the recordings, two of the session's document
 
 
-def test_data_are_made_of_what_is_left(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path, capsys: Any) -> None:
     from tests.export.place import rows
 
     pair(world.put, tmp_path, observe=True)
@@ -164,7 +166,7 @@ def test_data_are_made_of_what_is_left(world: Installed, tmp_path: Path, capsys:
             assert not path.is_file() or ANN.encode() not in path.read_bytes(), path
 
 
-def test_a_second_time_there_is_nothing_and_nothing_changes(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_a_second_run_finds_nothing_and_changes_nothing(world: Installed, tmp_path: Path, capsys: Any) -> None:
     pair(world.put, tmp_path)
     assert erase(world, capsys).code == Exit.DONE
     before = contents(world)
@@ -174,11 +176,11 @@ def test_a_second_time_there_is_nothing_and_nothing_changes(world: Installed, tm
     assert contents(world) == before
 
 
-class Cut(BaseException):
+class Interruption(BaseException):
     """The process ends here."""
 
 
-def cut_off(monkeypatch: Any, at: int, after: bool) -> None:
+def interrupt_at(monkeypatch: Any, at: int, after: bool) -> None:
     """End the process before or after the n-th call that changes something."""
     count = [0]
     whole = BaseClient._make_api_call
@@ -187,10 +189,10 @@ def cut_off(monkeypatch: Any, at: int, after: bool) -> None:
         changes = operation.startswith(("Put", "Delete", "Abort", "Upload", "Complete", "Create"))
         count[0] += changes
         if changes and count[0] == at and not after:
-            raise Cut
+            raise Interruption
         answer = whole(self, operation, params)
         if changes and count[0] == at:
-            raise Cut
+            raise Interruption
         return answer
 
     monkeypatch.setattr(BaseClient, "_make_api_call", call)
@@ -198,7 +200,7 @@ def cut_off(monkeypatch: Any, at: int, after: bool) -> None:
 
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
 @pytest.mark.explores
-def test_cut_off_at_any_call_it_goes_on_from_there(world: Installed, tmp_path: Path, after: bool) -> None:
+def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_path: Path, after: bool) -> None:
     """Each call that changes something is the last one of a run; the next run finishes the work."""
     for at in range(1, 40):
         user, other = f"annabel-{at:04}", f"bobby-{at:04}"
@@ -209,11 +211,11 @@ def test_cut_off_at_any_call_it_goes_on_from_there(world: Installed, tmp_path: P
         world.put(decisions.key("maze"), to_json(Decisions(at, open=(OpenSession("s.0", datetime.now(UTC), label),))))
         theirs = of(world, other)
         with pytest.MonkeyPatch.context() as patch:
-            cut_off(patch, at, after)
+            interrupt_at(patch, at, after)
             try:
                 assert not eraser(world, user).run()
                 whole = True
-            except Cut:
+            except Interruption:
                 whole = False
         if not whole:
             assert not eraser(world, user).run()
@@ -235,7 +237,9 @@ def test_cut_off_at_any_call_it_goes_on_from_there(world: Installed, tmp_path: P
     assert at > 8
 
 
-def test_a_session_that_plays_is_stopped_first(world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
+def test_erase_first_stops_a_session_that_plays(
+    world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
     """As a server of one's own is: the trial stores what it has before anything is touched."""
     pair(world.put, tmp_path)
     start(world)
@@ -259,7 +263,7 @@ def test_a_session_that_plays_is_stopped_first(world: Installed, tmp_path: Path,
     assert not world.records()
 
 
-def test_what_the_sessions_server_may_still_store_is_waited_for(
+def test_erase_waits_until_the_sessions_server_can_store_nothing_more(
     world: Installed, tmp_path: Path, monkeypatch: Any
 ) -> None:
     """Its record stays, for the others: it may get requests for a while after its end."""
@@ -278,7 +282,9 @@ def test_what_the_sessions_server_may_still_store_is_waited_for(
     assert traces(world) == []
 
 
-def test_a_session_that_was_over_long_ago_is_not_waited_for(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
+def test_erase_does_not_wait_for_a_session_that_ended_long_ago(
+    world: Installed, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     pair(world.put, tmp_path)
     world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(minutes=10))
@@ -287,9 +293,7 @@ def test_a_session_that_was_over_long_ago_is_not_waited_for(world: Installed, tm
     assert slept == []
 
 
-def test_a_session_that_plays_again_meanwhile_is_stopped_again(
-    world: Installed, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_erase_stops_a_session_again_that_plays_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     pair(world.put, tmp_path)
     made, times = eraser(world), iter(range(1))
     take_out = made._sessions.take_out
@@ -306,7 +310,7 @@ def test_a_session_that_plays_again_meanwhile_is_stopped_again(
     assert traces(world) == []
 
 
-def test_when_all_members_are_erased_the_session_is_gone(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_after_all_members_are_erased_the_session_is_deleted(world: Installed, tmp_path: Path, capsys: Any) -> None:
     pair(world.put, tmp_path)
     world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(hours=1))
     assert erase(world, capsys, ANN).code == Exit.DONE
@@ -317,7 +321,7 @@ def test_when_all_members_are_erased_the_session_is_gone(world: Installed, tmp_p
     assert not [key for key in kept if key.startswith(sessions_folder("maze"))]
 
 
-def test_who_waits_in_the_lobby_leaves_it(world: Installed, capsys: Any) -> None:
+def test_a_participant_in_the_lobby_is_erased_from_it(world: Installed, capsys: Any) -> None:
     now = datetime.now(UTC)
     other = ids.server_label("maze", BOB)
     world.participant(ANN, answered=1)
@@ -342,7 +346,7 @@ def test_who_waits_in_the_lobby_leaves_it(world: Installed, capsys: Any) -> None
     assert world.keys("_lobby/") == [f"_lobby/maze/{other}.1790000000000.-"]
 
 
-def test_the_question_to_match_and_its_answers_forget_them(world: Installed, capsys: Any) -> None:
+def test_questions_and_answers_of_match_are_erased(world: Installed, capsys: Any) -> None:
     other = ids.server_label("maze", BOB)
     theirs, others = ({"waiting": [{"id": each}], "groups": [[each]]} for each in (LABEL, other))
     world.participant(ANN, answered=1)
@@ -363,7 +367,7 @@ def test_the_question_to_match_and_its_answers_forget_them(world: Installed, cap
 
 
 @pytest.mark.parametrize("written", [True, False], ids=["carried out", "not carried out"])
-def test_the_lobby_does_not_bring_back_who_was_erased(world: Installed, tmp_path: Path, written: bool) -> None:
+def test_the_lobby_does_not_write_an_erased_participant_again(world: Installed, tmp_path: Path, written: bool) -> None:
     """A decision may stand in its document for a while after it was carried out, or be carried out later."""
     then = datetime.now(UTC) - timedelta(minutes=1)
     other = ids.server_label("maze", BOB)
@@ -378,7 +382,7 @@ def test_the_lobby_does_not_bring_back_who_was_erased(world: Installed, tmp_path
     assert [each.user_id for each in parse(world.get(session_key("maze", SID))).members] == ["", BOB]
 
 
-def test_a_lobby_that_is_written_meanwhile_is_left_in_the_next_round(world: Installed, monkeypatch: Any) -> None:
+def test_a_lobby_that_changed_meanwhile_is_erased_from_in_the_next_round(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=1)
     world.put(decisions.key("maze"), to_json(Decisions(1, open=(OpenSession("s.1", datetime.now(UTC), LABEL),))))
     made, times = eraser(world), iter(range(1))
@@ -395,7 +399,7 @@ def test_a_lobby_that_is_written_meanwhile_is_left_in_the_next_round(world: Inst
     assert from_json(world.get(decisions.key("maze")), Decisions).version == 3
 
 
-def test_a_session_whose_document_is_lost_is_found_by_the_members_own(
+def test_a_session_without_its_document_is_found_by_the_membership(
     world: Installed, tmp_path: Path, capsys: Any
 ) -> None:
     pair(world.put, tmp_path)
@@ -407,14 +411,16 @@ def test_a_session_whose_document_is_lost_is_found_by_the_members_own(
     assert said(BOB).encode() in gzip.decompress(world.get(recording_key()))
 
 
-def test_a_document_that_names_them_and_cannot_be_read_is_told(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_an_unreadable_document_that_names_the_participant_is_reported(
+    world: Installed, tmp_path: Path, capsys: Any
+) -> None:
     pair(world.put, tmp_path)
     world.put(session_key("maze", OTHER), f'{{"members": "{ANN}"}}'.encode())
     ran = erase(world, capsys)
     assert f"maze/sessions/{OTHER}/session.json cannot be read" in ran.err
 
 
-def test_a_kept_bucket_forgets_a_member_as_documented(
+def test_a_member_is_erased_from_a_kept_bucket_as_documented(
     world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
     pair(world.put, tmp_path)

@@ -38,7 +38,7 @@ from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 from testing.simulation import conditions, tasks
 from testing.studies import study
-from tests.deploy.installation import ROOT, Ran
+from tests.deploy.installation import ROOT, CommandResult
 from tests.deploy.running_installation import RunningInstallation, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
 from tests.trial.two_players import two_players
@@ -87,7 +87,7 @@ def running_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ru
         yield world
 
 
-def play(running: RunningInstallation, capsys: Any, *arguments: str) -> Ran:
+def play(running: RunningInstallation, capsys: Any, *arguments: str) -> CommandResult:
     return running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
 
 
@@ -112,7 +112,7 @@ def assert_nothing_left(running: RunningInstallation) -> None:
 # The whole
 
 
-def test_a_rehearsal_proves_everything_and_leaves_nothing(
+def test_a_rehearsal_proves_every_line_and_leaves_nothing(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(whole, "FRESH", FRESH)
@@ -160,7 +160,7 @@ def test_a_rehearsal_of_a_study_for_two_counts_their_session_once(
     assert_nothing_left(running_pair)
 
 
-def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
+def test_a_failed_line_has_a_remedy_and_the_rest_goes_on(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running.broken["hippodrome-sweep"] = '{"errorType": "KeyError", "errorMessage": "secret"}'
@@ -180,7 +180,7 @@ def test_what_fails_is_said_with_a_remedy_and_the_rest_goes_on(
     assert_nothing_left(running)
 
 
-def test_ctrl_c_in_the_midst_removes_everything(
+def test_ctrl_c_during_the_rehearsal_removes_everything(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     watch = walk.Walk._watch
@@ -216,7 +216,7 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInst
     assert_nothing_left(running)
 
 
-def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
+def test_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
     account = open_account()
     installation = find_installation(account)
     platform = account.platform(installation)
@@ -235,7 +235,7 @@ def test_the_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningIn
 
 
 @pytest.mark.parametrize("name", ["rehearsal-20261122", "rehearsal-deadbeef", "rehearsal-1"])
-def test_a_study_that_somebody_calls_a_rehearsal_is_not_removed(name: str) -> None:
+def test_a_study_whose_id_resembles_that_of_a_copy_is_not_removed(name: str) -> None:
     theirs = msgspec.structs.replace(study(), id=name)
     with MotoWorld() as world:
         documents = world.platform.documents
@@ -243,7 +243,7 @@ def test_a_study_that_somebody_calls_a_rehearsal_is_not_removed(name: str) -> No
         assert left_behind(documents, datetime.now(UTC) + timedelta(days=1)) == []
 
 
-def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
+def test_unreadable_entries_of_the_list_of_projects_stay_unchanged() -> None:
     copy, other = (msgspec.structs.replace(study(), id=name) for name in ("rehearsal-00000000", "maze"))
     strange = UnreadableEntry(b'{"id":"old-study","steps":7,"secret":"kept"}', "old-study", "")
     with MotoWorld() as world:
@@ -263,7 +263,7 @@ def test_what_nobody_can_read_in_the_list_of_projects_stays_as_it_is() -> None:
 # Asking
 
 
-def test_nothing_is_begun_without_a_yes(running: RunningInstallation, capsys: Any) -> None:
+def test_a_rehearsal_needs_a_yes(running: RunningInstallation, capsys: Any) -> None:
     before = documents(running)
     ran = running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "3")
     assert ran.code == Exit.DECLINED
@@ -271,12 +271,12 @@ def test_nothing_is_begun_without_a_yes(running: RunningInstallation, capsys: An
     assert documents(running) == before
 
 
-def test_playing_is_a_kind_of_rehearsal(running: RunningInstallation, capsys: Any) -> None:
+def test_play_needs_rehearse(running: RunningInstallation, capsys: Any) -> None:
     ran = running.run(capsys, "doctor", "--play", "1")
     assert (ran.code, "--rehearse --play" in ran.err) == (Exit.FAILED, True)
 
 
-def test_a_transcript_that_cannot_be_written_is_told_before_anything_is_begun(
+def test_a_transcript_that_cannot_be_written_stops_the_rehearsal_beforehand(
     running: RunningInstallation, capsys: Any
 ) -> None:
     ran = play(running, capsys, "--transcript", "/nowhere/transcript.json")
@@ -287,7 +287,7 @@ def test_a_transcript_that_cannot_be_written_is_told_before_anything_is_begun(
 # The copy
 
 
-def test_the_copy_differs_only_where_it_must() -> None:
+def test_the_copy_differs_from_the_study_only_where_it_must() -> None:
     before = study(
         max_runtime=120,
         max_participants=5,
@@ -321,7 +321,7 @@ def test_the_copy_differs_only_where_it_must() -> None:
     assert after.max_runtime == 30
 
 
-def test_the_copy_has_the_pages_that_the_study_shows() -> None:
+def test_the_copy_has_the_pages_of_the_study() -> None:
     platform = FakePlatform()
     for key in (
         "one.html",
@@ -361,27 +361,27 @@ def test_the_copy_has_the_pages_that_the_study_shows() -> None:
         "ticket 00112233445566778899aabbccddeeff",
     ],
 )
-def test_a_transcript_holds_nothing_that_names_somebody_or_opens_something(text: str) -> None:
+def test_a_transcript_holds_no_names_and_no_secrets(text: str) -> None:
     cleaned = Transcript().clean(text)
     assert "…" in cleaned
     for kept in re.findall(r"[0-9a-f]{8,}|\d+\.\d+\.\d+|s[a-z2-7]{20}", text):
         assert kept not in cleaned
 
 
-def test_words_of_a_hostile_server_are_words_in_a_transcript_and_not_many() -> None:
+def test_a_transcript_cleans_and_shortens_messages_of_a_hostile_server() -> None:
     cleaned = Transcript().clean("the game says: \x1b]52;c;aGk=\x07 \x9b2J \u202e nothing\r\n✓ game: " + "x" * 100_000)
     assert cleaned.isprintable()
     assert len(cleaned) < 2_000
     assert "✓ game" in cleaned
 
 
-def test_a_transcript_hides_what_it_is_told_to_the_longest_first() -> None:
+def test_a_transcript_hides_the_longest_secret_first() -> None:
     transcript = Transcript()
     transcript.hide("token", "token-of-ada", None, "")
     assert transcript.clean("a token-of-ada, a token") == "a …, a …"
 
 
-def test_what_was_once_bad_is_not_proven() -> None:
+def test_a_line_that_was_bad_once_is_not_proven() -> None:
     transcript = Transcript()
     transcript.good("pages", "fine")
     transcript.good("data", "fine")
@@ -394,7 +394,7 @@ def test_what_was_once_bad_is_not_proven() -> None:
 # Beside the simulation
 
 
-def test_the_stages_are_those_of_the_simulation() -> None:
+def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
     """`deploy` imports nothing of `bench`: its table must follow."""
     median, sigma, longest = conditions.STARTS
     usual = tuple(float(round(median * math.exp(sign * 2 * sigma))) for sign in (-1, 1))
@@ -414,22 +414,22 @@ def arrows() -> dict[str, list[str]]:
     return {row[1].strip(): re.findall(r"`(.*?)`", row[-2].partition("→")[2]) for row in rows[2:]}
 
 
-def test_rows_of_unproven_name_only_lines_that_a_transcript_has() -> None:
+def test_rows_of_unproven_name_only_lines_of_a_transcript() -> None:
     assert {what: keys for what, keys in arrows().items() if set(keys) - set(LINES)} == {}
 
 
-def test_an_arrow_of_unproven_leads_to_keys_and_to_nothing_else() -> None:
+def test_each_arrow_of_unproven_leads_to_keys_alone() -> None:
     rows = [line for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|" and "→" in line]
     assert rows
     assert [row for row in rows if not re.search(r"→ `\w+`(, `\w+`)* \|$", row) or row.count("→") > 1] == []
 
 
 @pytest.mark.parametrize("key", LINES)
-def test_each_line_proves_something_that_nothing_else_does(key: str) -> None:
+def test_each_line_stands_in_a_row_of_unproven(key: str) -> None:
     assert key == "links" or key in {key for keys in arrows().values() for key in keys}
 
 
-def test_the_lines_are_told_as_they_are() -> None:
+def test_running_md_explains_each_line_as_the_program_does() -> None:
     section = (ROOT / "docs/running.md").read_text().partition("### The rehearsal with bots")[2].partition("\n## ")[0]
     told = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.MULTILINE)
     assert dict(told) == dict(LINES)

@@ -57,7 +57,7 @@ def test_participants_stand_at_the_first_step_without_an_answer(world: Installed
     assert "person-" not in text + world.run(capsys, "status", "--json").out
 
 
-def test_strange_things_in_the_bucket_are_nobody(world: Installed, capsys: Any) -> None:
+def test_unknown_objects_in_the_bucket_count_as_no_participants(world: Installed, capsys: Any) -> None:
     world.participant("alice", answered=1)
     for key in (
         "maze/users/.DS_Store",
@@ -78,7 +78,7 @@ def test_strange_things_in_the_bucket_are_nobody(world: Installed, capsys: Any) 
 
 
 @pytest.mark.explores
-def test_beyond_a_page_of_keys_no_participant_is_missing_and_none_is_read(
+def test_status_counts_participants_beyond_a_page_of_keys_without_reading_them(
     world: Installed, capsys: Any, pages: int
 ) -> None:
     s3, bucket = world.client("s3"), world.env["BUCKET"]
@@ -93,7 +93,7 @@ def test_beyond_a_page_of_keys_no_participant_is_missing_and_none_is_read(
     assert not [key for key in read if "/users/" in key]
 
 
-def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> None:
+def test_status_shows_the_age_and_the_minutes_left_of_servers(world: Installed, capsys: Any) -> None:
     ready = world.record("alice")
     world.record("bob", ServerState.STARTING)
     world.record("carol", ServerState.CLOSED, reason=Reason.LOST, closed=datetime.now(UTC))
@@ -112,7 +112,7 @@ def test_servers_with_age_and_minutes_left(world: Installed, capsys: Any) -> Non
     assert any(f" {left} min" in shown for left in minutes)
 
 
-def test_why_servers_failed_is_told_with_what_to_do(world: Installed, capsys: Any) -> None:
+def test_status_says_why_servers_failed_and_what_to_do(world: Installed, capsys: Any) -> None:
     now = datetime.now(UTC)
 
     def lost(user: str, ago: timedelta, cause: str, **more: Any) -> server.Server:
@@ -135,7 +135,7 @@ def test_why_servers_failed_is_told_with_what_to_do(world: Installed, capsys: An
     assert not any(user in text for user in ("carol", "dave"))
 
 
-def test_where_nothing_failed_nothing_is_told_of_it(world: Installed, capsys: Any) -> None:
+def test_without_failures_status_says_nothing_of_them(world: Installed, capsys: Any) -> None:
     world.record("alice")
     assert look(world, capsys)["servers"]["failed"] == []
     assert "fault" not in world.run(capsys, "status").out
@@ -144,7 +144,7 @@ def test_where_nothing_failed_nothing_is_told_of_it(world: Installed, capsys: An
 WARM_SERVERS = [f"~{number:020x}" for number in range(5)]
 
 
-def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: Installed, capsys: Any) -> None:
+def test_warm_servers_are_counted_separately_and_not_as_participants(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4), CLOSED)
     for warm_server in WARM_SERVERS[:3]:
         world.record(warm_server)
@@ -166,7 +166,7 @@ def test_warm_servers_are_counted_by_themselves_and_are_no_participants(world: I
     assert "~" not in text
 
 
-def test_servers_of_sessions_are_told_with_the_number_of_their_members(world: Installed, capsys: Any) -> None:
+def test_servers_of_sessions_are_shown_with_the_number_of_their_members(world: Installed, capsys: Any) -> None:
     formed, ahead = ("s." + "0" * 19 + digit for digit in "12")
     pairs = study(players=2)
     world.register(pairs)
@@ -183,20 +183,20 @@ def test_servers_of_sessions_are_told_with_the_number_of_their_members(world: In
     assert not any(part in text for part in ("person-", formed, ahead))
 
 
-def test_servers_of_single_participants_are_told_as_ever(world: Installed, capsys: Any) -> None:
+def test_servers_of_single_participants_are_shown_without_members(world: Installed, capsys: Any) -> None:
     world.record("alice")
     (one,) = look(world, capsys)["servers"]["open"]
     assert one.keys().isdisjoint({"session", "members"})
 
 
-def test_warm_servers_of_a_study_that_was_closed(world: Installed, capsys: Any) -> None:
+def test_warm_servers_of_a_closed_study_are_shown(world: Installed, capsys: Any) -> None:
     world.register(study(warm_servers=4, live=False))
     world.record(WARM_SERVERS[0], ServerState.DRAINING)
     assert look(world, capsys)["projects"][0]["warmServers"]["wanted"] == 0
     assert "maze: 1 warm server on the way out." in world.run(capsys, "status").out
 
 
-def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
+def test_todays_spending_counts_the_time_of_servers_today(world: Installed, capsys: Any) -> None:
     assert look(world, capsys)["spentToday"]["likely"] == 0
     world.record("alice", ServerState.CLOSED, reason=Reason.ENDED, closed=datetime.now(UTC), spot=False)
     before = datetime.now(UTC)
@@ -209,7 +209,7 @@ def test_todays_spend_is_what_ran_today(world: Installed, capsys: Any) -> None:
     assert 0.95 * least - rounded <= spent <= 1.05 * most + rounded
 
 
-def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
+def test_status_shows_queues_alarms_and_the_certificate(world: Installed, capsys: Any) -> None:
     found = look(world, capsys)
     assert [(q["name"], q["waiting"], q["deadLetters"]) for q in found["queues"]] == [
         ("hippodrome-start-dead-letters", 0, True),
@@ -241,12 +241,14 @@ def test_queues_alarms_and_certificate(world: Installed, capsys: Any) -> None:
     ("days", "issuer", "says"),
     [(-3, "R12", "-3 days left"), (50, "(STAGING) Riddling Rhubarb R12", "STAGING: browsers refuse it")],
 )
-def test_certificates_that_do_not_help(world: Installed, capsys: Any, days: int, issuer: str, says: str) -> None:
+def test_status_names_expired_and_staging_certificates(
+    world: Installed, capsys: Any, days: int, issuer: str, says: str
+) -> None:
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=days, issuer=issuer))
     assert says in world.run(capsys, "status").out
 
 
-def test_what_may_not_be_seen_leaves_the_rest(world: Installed, capsys: Any) -> None:
+def test_status_shows_the_rest_if_a_part_is_refused(world: Installed, capsys: Any) -> None:
     world.participant("alice")
     world.record("alice")
     world.fail("cloudformation:ListStackResources", "AccessDenied", status=403)
@@ -259,7 +261,7 @@ def test_what_may_not_be_seen_leaves_the_rest(world: Installed, capsys: Any) -> 
     assert "These credentials may not list stack resources" in found["problems"]["queues"]
 
 
-def test_without_cost_explorer_there_is_everything_but_the_bill(world: Installed, capsys: Any) -> None:
+def test_without_cost_explorer_only_the_bill_is_missing(world: Installed, capsys: Any) -> None:
     world.participant("alice")
     for _ in range(2):
         world.fail("ce:GetCostAndUsage", "AccessDeniedException", status=403)
@@ -271,17 +273,17 @@ def test_without_cost_explorer_there_is_everything_but_the_bill(world: Installed
     assert "Alarms: none fires." in text
 
 
-def test_a_broken_list_of_projects_is_a_sentence(world: Installed, capsys: Any) -> None:
+def test_a_broken_list_of_projects_is_reported_in_a_sentence(world: Installed, capsys: Any) -> None:
     world.put("project_master_list.json", b'{"projects": {"id": 7}}')
     assert "The list of projects cannot be read" in look(world, capsys)["problems"]["projects"]
 
 
-def test_an_installation_without_projects(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_status_of_an_installation_without_projects_says_so(installed: Installed, capsys: Any) -> None:  # noqa: F811
     assert look(installed, capsys)["projects"] == []
     assert "No project is registered yet" in installed.run(capsys, "status").out
 
 
-def test_a_second_look_reads_only_what_has_changed(world: Installed, monkeypatch: Any) -> None:
+def test_a_second_look_reads_only_changed_records(world: Installed, monkeypatch: Any) -> None:
     monkeypatch.setattr(server_records, "SETTLED", timedelta(0))  # else what was written a moment ago is read again
     for user in ("alice", "bob", "carol"):
         world.record(user)
@@ -308,14 +310,14 @@ def test_watching_ends_at_ctrl_c(world: Installed, capsys: Any, monkeypatch: Any
     assert "Interrupted" not in ran.err
 
 
-def test_misuse_is_a_sentence(world: Installed, capsys: Any) -> None:
+def test_wrong_options_of_status_are_reported_in_a_sentence(world: Installed, capsys: Any) -> None:
     assert world.run(capsys, "status", "--watch", "--json").code == Exit.FAILED
     ran = world.run(capsys, "status", "--json", "--project", "labyrinth")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "No project named labyrinth" in ran.err
 
 
-def test_in_another_region_it_says_where_the_installation_is(world: Installed, capsys: Any) -> None:
+def test_status_in_another_region_says_where_the_installation_is(world: Installed, capsys: Any) -> None:
     name = "hippodrome-code-123456789012-ca-central-1"
     world.client("s3").create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": "ca-central-1"})
     ran = world.run(capsys, "status", "--region", "eu-west-1")
@@ -324,7 +326,7 @@ def test_in_another_region_it_says_where_the_installation_is(world: Installed, c
     assert "→ Something of that name is in another region: say AWS_REGION=ca-central-1." in ran.err
 
 
-def test_whoever_may_not_list_buckets_is_told_how_to_name_another_region(
+def test_without_permission_to_list_buckets_status_says_how_to_name_another_region(
     world: Installed, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     denied = ClientError({"Error": {"Code": "AccessDenied", "Message": "no"}}, "ListBuckets")

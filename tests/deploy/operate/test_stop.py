@@ -56,7 +56,7 @@ def reasons(world: Installed, project: str, *users: str) -> set[Any]:
     return {record.reason for user in users if (record := repository.server_of(project, user))}
 
 
-def test_every_server_is_stopped_and_its_page_will_say_who_did_it(world: Installed, capsys: Any) -> None:
+def test_every_server_is_stopped_with_the_reason_stopped(world: Installed, capsys: Any) -> None:
     people = [f"p{n}" for n in range(30)]
     start(world, "maze", *people)
     start(world, "other", "x")
@@ -68,7 +68,7 @@ def test_every_server_is_stopped_and_its_page_will_say_who_did_it(world: Install
     assert not any(person in ran.out + ran.err for person in people)
 
 
-def test_a_second_time_there_is_nothing_to_do(world: Installed, capsys: Any) -> None:
+def test_a_second_run_has_nothing_to_do(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice")
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
     with world.recording() as calls:
@@ -78,7 +78,7 @@ def test_a_second_time_there_is_nothing_to_do(world: Installed, capsys: Any) -> 
     assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
 
 
-def test_only_one_project(world: Installed, capsys: Any) -> None:
+def test_stop_can_stop_the_servers_of_one_project(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice")
     start(world, "other", "alice")
     assert world.run(capsys, "stop", "--yes", "--project", "maze").code == Exit.DONE
@@ -86,7 +86,7 @@ def test_only_one_project(world: Installed, capsys: Any) -> None:
     assert len(world.records()) == len(world.timers()) == 1
 
 
-def test_a_dry_run_and_no_answer_change_nothing(world: Installed, capsys: Any) -> None:
+def test_a_dry_run_and_a_missing_answer_change_nothing(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice")
     with world.recording() as calls:
         dry = world.run(capsys, "stop", "--dry-run", "--json")
@@ -97,7 +97,7 @@ def test_a_dry_run_and_no_answer_change_nothing(world: Installed, capsys: Any) -
     assert running_servers(world)
 
 
-def test_what_no_open_server_owns_goes_too_but_not_what_may_be_anothers(world: Installed, capsys: Any) -> None:
+def test_leftovers_are_removed_but_not_what_may_belong_to_another_installation(world: Installed, capsys: Any) -> None:
     closed = ids.server_name(ids.server_label("maze", "alice"), 1)
     world.record("alice", ServerState.CLOSED, reason=Reason.ENDED)
     nobody = ids.server_name(ids.server_label("maze", "nobody"), 1)
@@ -122,7 +122,7 @@ def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(worl
     assert [*tasks.clusters()] == [theirs]
 
 
-def test_a_start_that_is_on_its_way_finds_the_server_closed(world: Installed, capsys: Any) -> None:
+def test_a_start_message_after_stop_starts_no_server(world: Installed, capsys: Any) -> None:
     world.record("alice", ServerState.STARTING)  # claimed; neither timer nor task yet
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
     Servers(world.platform).start(StartServer("maze", "alice"))
@@ -136,7 +136,9 @@ def pool(world: Installed) -> Pool:
     return from_json(world.get(warm_pool.pool_key("maze")), Pool)
 
 
-def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(world: Installed, capsys: Any) -> None:
+def test_warm_servers_are_stopped_too_and_stop_says_that_a_live_study_gets_new_ones(
+    world: Installed, capsys: Any
+) -> None:
     world.register(WARM)
     world.warm(WARM, 3)
     Servers(world.platform).start(StartServer("maze", "alice"))  # takes one of them
@@ -153,7 +155,7 @@ def test_warm_servers_go_too_and_it_is_said_that_a_live_study_gets_new_ones(worl
     assert reasons(world, "maze", "alice") == {Reason.STOPPED}
 
 
-def test_what_somebody_plays_on_who_took_a_warm_server_is_of_their_project(world: Installed, capsys: Any) -> None:
+def test_a_taken_warm_server_belongs_to_the_project_of_its_participant(world: Installed, capsys: Any) -> None:
     world.register(WARM, msgspec.structs.replace(OTHER, task_definition="hippodrome"))
     (name,) = world.warm(WARM, 1)
     Servers(world.platform).start(StartServer("maze", "alice"))
@@ -172,7 +174,7 @@ def test_a_closed_study_gets_no_warm_servers_again(world: Installed, capsys: Any
     assert (running_servers(world), dict(pool(world).warm_servers)) == ([], {})
 
 
-def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:
+def test_servers_that_cannot_be_stopped_are_reported_and_the_others_are_stopped(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice", "bob")
     world.fail("ecs:StopTask", "AccessDeniedException", times=2)
     with_trouble = world.run(capsys, "stop", "--yes", "--wait", "0")
@@ -182,7 +184,7 @@ def test_what_cannot_be_stopped_is_said_and_the_others_are_stopped(world: Instal
     assert (running_servers(world), world.timers()) == ([], {})
 
 
-def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed, monkeypatch: Any) -> None:
+def test_stop_waits_until_tasks_have_ended(world: Installed, monkeypatch: Any) -> None:
     start(world, "maze", "alice")
     name = ids.server_name(ids.server_label("maze", "alice"), 1)
     saving = RunningTask("arn", "hippodrome", name)
@@ -194,7 +196,7 @@ def test_it_waits_until_tasks_have_saved_what_they_have(world: Installed, monkey
     assert len(slept) == 2
 
 
-def test_foreign_and_broken_records_are_left_alone(world: Installed, capsys: Any) -> None:
+def test_foreign_and_broken_records_are_not_changed(world: Installed, capsys: Any) -> None:
     world.put("_servers/readme.txt", b"hello")
     world.put(server.key(ids.server_label("maze", "broken")), b"{")
     stolen = world.record("alice")
@@ -204,7 +206,7 @@ def test_foreign_and_broken_records_are_left_alone(world: Installed, capsys: Any
     assert world.get("_servers/readme.txt") == b"hello"
 
 
-def test_an_unknown_project_and_no_stack_are_sentences(world: Installed, capsys: Any) -> None:
+def test_an_unknown_project_and_a_missing_stack_are_reported_in_a_sentence(world: Installed, capsys: Any) -> None:
     ran = world.run(capsys, "stop", "--project", "labyrinth")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "No project named labyrinth" in ran.err

@@ -91,7 +91,9 @@ def stored_serial(world: World, number: int) -> str:
     return stored.serial
 
 
-def test_five_installations_order_once(world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_five_installations_in_succession_order_one_certificate(
+    world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for number in range(5):
         installation(world, number, monkeypatch)
         report = up.certify(world.account, "hippodrome")
@@ -102,7 +104,7 @@ def test_five_installations_order_once(world: World, authority: Authority, monke
     assert authority.orders == [STAGING, PRODUCTION]
 
 
-def test_the_one_that_took_it_over_renews_it_with_the_same_account(
+def test_the_installation_that_took_it_over_renews_it_with_the_same_account(
     world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installation(world, 0, monkeypatch)
@@ -118,7 +120,7 @@ def test_the_one_that_took_it_over_renews_it_with_the_same_account(
 
 
 @pytest.mark.parametrize("why", ["due", "another domain", "another installation", "untagged", "by hand"])
-def test_what_is_not_fresh_or_not_ours_is_not_taken_over(
+def test_certificates_that_are_not_fresh_or_not_ours_are_not_taken_over(
     world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch, why: str
 ) -> None:
     authority.days = 20 if why == "due" else 80
@@ -139,7 +141,7 @@ def test_what_is_not_fresh_or_not_ours_is_not_taken_over(
         document(world, 1, PRIVKEY)
 
 
-def test_a_real_certificate_before_one_for_tests(
+def test_a_real_certificate_is_preferred_to_a_test_certificate(
     world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = installation(world, 0, monkeypatch)
@@ -151,7 +153,7 @@ def test_a_real_certificate_before_one_for_tests(
     assert taken.directory == PRODUCTION
 
 
-def test_a_certificate_that_is_there_stays(world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_existing_certificate_stays(world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     first = installation(world, 0, monkeypatch)
     certificate.obtain(world.account, first, certificate.Choice(PRODUCTION))
     second = installation(world, 1, monkeypatch)
@@ -161,7 +163,7 @@ def test_a_certificate_that_is_there_stays(world: World, authority: Authority, m
     assert document(world, 1, PRIVKEY) == before
 
 
-def test_the_command_takes_over_as_well_and_a_dry_run_does_not(
+def test_the_command_certificate_takes_it_over_and_a_dry_run_does_not(
     world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     certificate.obtain(world.account, installation(world, 0, monkeypatch), certificate.Choice(PRODUCTION))

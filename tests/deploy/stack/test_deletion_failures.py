@@ -81,23 +81,23 @@ def failure(kind: str, reason: str) -> FailedResource:
 
 
 @pytest.mark.parametrize(("kind", "reason", "helps"), REPORTED)
-def test_what_people_have_reported(kind: str, reason: str, helps: Recovery) -> None:
+def test_reported_failures_get_the_right_remedy(kind: str, reason: str, helps: Recovery) -> None:
     assert recovery_from(failure(kind, reason)) is helps
 
 
 @pytest.mark.parametrize(("kind", "reason"), FOR_PEOPLE)
-def test_what_somebody_has_to_put_right_is_not_waited_for(kind: str, reason: str) -> None:
+def test_failures_that_need_a_person_are_not_waited_for(kind: str, reason: str) -> None:
     assert recovery_from(failure(kind, reason)) is None
 
 
-def test_each_wait_once_and_none_if_one_thing_does_not_pass() -> None:
+def test_each_wait_is_listed_once_and_none_if_a_failure_needs_a_person() -> None:
     passing = [failure(kind, reason) for kind, reason, _ in REPORTED]
     assert recoveries(passing) == list(dict.fromkeys(helps for *_, helps in REPORTED))
     assert recoveries([*passing, failure(*FOR_PEOPLE[0])]) == []
     assert recoveries([]) == []
 
 
-def test_every_line_of_the_table_is_about_something_in_the_template_and_says_where_it_is_from() -> None:
+def test_every_line_of_the_table_is_about_a_type_of_the_template_and_has_a_source() -> None:
     types = {one["Type"] for one in template()["Resources"].values()}
     for known in TABLE:
         assert not known.types or any(re.fullmatch(known.types, type_) for type_ in types), known

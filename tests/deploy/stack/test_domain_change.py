@@ -45,13 +45,13 @@ def prepared(world: Installed, account: Account | None = None, **changed: str) -
     return Prepared(account, Stack(account, "hippodrome"), found, nothing, (), wanted, nothing)
 
 
-def test_servers_with_hashed_names_go_on_below_the_domain_while_new_ones_get_their_level(world: Installed) -> None:
+def test_running_servers_with_hashed_names_do_not_stop_the_change(world: Installed) -> None:
     label = world.record("alice").label
     world.record("alice", dns=f"{label}-1.example.org")
     domain_change.check(prepared(world))
 
 
-def test_servers_named_after_people_must_have_ended_before(world: Installed) -> None:
+def test_running_servers_named_after_participants_stop_the_change(world: Installed) -> None:
     world.record("alice", dns="alice.example.org")
     with pytest.raises(Problem, match="whose names the installation could not remove any more") as caught:
         domain_change.check(prepared(world))
@@ -60,7 +60,7 @@ def test_servers_named_after_people_must_have_ended_before(world: Installed) -> 
     domain_change.check(prepared(world))
 
 
-def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> None:
+def test_running_servers_stop_a_change_of_the_domain(world: Installed) -> None:
     label = world.record("alice").label
     world.record("alice", dns=f"{label}-1.example.org")
     with pytest.raises(Problem, match="could not remove"):
@@ -68,7 +68,7 @@ def test_no_server_may_run_while_the_domain_itself_changes(world: Installed) -> 
 
 
 @pytest.mark.parametrize("state", [ServerState.STARTING, ServerState.READY, ServerState.DRAINING])
-def test_no_server_may_run_while_the_site_that_it_stores_through_changes(world: Installed, state: ServerState) -> None:
+def test_running_servers_stop_a_change_of_the_site(world: Installed, state: ServerState) -> None:
     world.record("alice", state)
     for moved in (prepared(world, SiteHost="lab"), prepared(world, RootDomain="pilot.example.org")):
         with pytest.raises(Problem, match=r"by way of study\.example\.org, which would be gone") as caught:
@@ -82,7 +82,7 @@ def test_no_server_may_run_while_the_site_that_it_stores_through_changes(world: 
     domain_change.check_site(prepared(world, SiteHost="lab"))
 
 
-def test_no_server_may_run_while_its_network_is_given_up(world: Installed) -> None:
+def test_running_servers_stop_a_change_of_the_network(world: Installed) -> None:
     world.record("alice")
     own = prepared(world, VpcId="")
     with world.recording() as calls:
@@ -96,16 +96,14 @@ def test_no_server_may_run_while_its_network_is_given_up(world: Installed) -> No
 
 
 @pytest.mark.parametrize(("site", "vpc"), [("lab", ""), ("study", "vpc-1")])
-def test_an_apply_that_moves_the_site_or_the_network_looks_for_such_servers(
-    world: Installed, site: str, vpc: str
-) -> None:
+def test_preflight_finds_servers_that_stop_a_change_of_site_or_network(world: Installed, site: str, vpc: str) -> None:
     world.record("alice")
     moved = prepared(world, ServersHost="", SiteHost=site, VpcId=vpc, SubnetIds="subnet-1")
     found = preflight.look_at(preflight.InstallationCheck(moved))
     assert [one.mark for one in found if one.check == "servers"] == [Mark.BAD]
 
 
-def test_nothing_is_looked_at_where_names_stay(world: Installed) -> None:
+def test_without_new_names_nothing_is_checked(world: Installed) -> None:
     world.record("alice", dns="alice.example.org")
     with world.recording() as calls:
         domain_change.check(prepared(world, ServersHost=""))
@@ -113,7 +111,7 @@ def test_nothing_is_looked_at_where_names_stay(world: Installed) -> None:
     assert calls == []
 
 
-def test_a_level_that_the_zone_delegates_is_no_level_for_servers(world: Installed) -> None:
+def test_servers_cannot_have_names_below_a_delegated_level(world: Installed) -> None:
     record = {"Name": "servers.example.org", "Type": "NS", "TTL": 60, "ResourceRecords": [{"Value": "ns.example.net."}]}
     world.client("route53").change_resource_record_sets(
         HostedZoneId=world.env["HOSTED_ZONE_ID"],
@@ -129,7 +127,7 @@ def test_a_level_that_the_zone_delegates_is_no_level_for_servers(world: Installe
     [("servers.example.org", "servers"), ("org", "example")],
     ids=["its site below our servers", "our site below its servers"],
 )
-def test_no_site_gets_a_name_that_the_servers_of_another_installation_have_the_key_for(
+def test_a_site_cannot_have_a_name_that_the_certificate_of_other_servers_covers(
     world: Installed, domain: str, level: str
 ) -> None:
     text = {"RootDomain": {"Type": "String", "Default": domain}, "ServersHost": {"Type": "String", "Default": level}}
@@ -139,7 +137,7 @@ def test_no_site_gets_a_name_that_the_servers_of_another_installation_have_the_k
         domain_change.check(prepared(world))
 
 
-def test_a_certificate_put_there_by_hand_needs_one_for_the_new_names_beside_it(world: Installed) -> None:
+def test_a_manual_certificate_needs_another_for_the_new_names(world: Installed) -> None:
     domain_change.certify(prepared(world))  # none at all: nobody can play, and nothing is to be kept going
     world.put("SSL/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
     with pytest.raises(Problem, match=r"there is none for \*\.servers\.example\.org") as caught:

@@ -43,7 +43,7 @@ def made(world: World) -> Stack:
 # -- following ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_first_cause_is_told_and_not_its_consequences(world: World) -> None:
+def test_only_the_first_cause_of_a_failure_is_reported(world: World) -> None:
     world.stand("CREATE_COMPLETE")
     stack = made(world)
     stack_id = world.cloud.stack["StackId"]
@@ -59,7 +59,7 @@ def test_the_first_cause_is_told_and_not_its_consequences(world: World) -> None:
     assert "--vpc" in problem.advice
 
 
-def test_earlier_operations_are_not_mixed_in(world: World) -> None:
+def test_failures_of_earlier_operations_are_not_reported(world: World) -> None:
     world.stand("CREATE_COMPLETE")
     world.cloud.script = list(FAILED_CREATION)
     stack, stack_id = made(world), world.cloud.stack["StackId"]
@@ -76,7 +76,7 @@ def test_earlier_operations_are_not_mixed_in(world: World) -> None:
     assert operation.states == {"Bucket": "UPDATE_COMPLETE"}
 
 
-def test_a_status_from_before_is_not_taken_for_the_end(world: World) -> None:
+def test_the_status_before_an_operation_is_not_taken_for_its_end(world: World) -> None:
     """ExecuteChangeSet returns before the stack says IN_PROGRESS: UPDATE_COMPLETE is still that of the last time."""
     world.stand("UPDATE_COMPLETE")
     stack, stack_id = made(world), world.cloud.stack["StackId"]
@@ -99,7 +99,7 @@ def test_ctrl_c_says_that_cloudformation_goes_on(world: World) -> None:
     assert caught.value.exit_code == Exit.INTERRUPTED
 
 
-def test_attaching_waits_for_what_is_going_on(world: World) -> None:
+def test_attach_waits_for_the_operation_in_progress(world: World) -> None:
     world.stand("UPDATE_IN_PROGRESS")
     world.cloud.script = [
         ("UPDATE_IN_PROGRESS", []),
@@ -110,7 +110,7 @@ def test_attaching_waits_for_what_is_going_on(world: World) -> None:
     assert world.cloud.stack["StackStatus"] == "UPDATE_COMPLETE"
 
 
-def test_a_deletion_that_fails_says_what_is_in_the_way(world: World) -> None:
+def test_a_failed_deletion_reports_its_reason(world: World) -> None:
     world.stand()
     reason = "The VPC 'vpc-1' has dependencies and cannot be deleted."
     world.cloud.operations = [
@@ -121,12 +121,12 @@ def test_a_deletion_that_fails_says_what_is_in_the_way(world: World) -> None:
     assert any(reason in line for line in caught.value.details)
 
 
-def test_deleting_what_is_not_there_is_nothing(world: World) -> None:
+def test_deleting_a_missing_stack_does_nothing(world: World) -> None:
     made(world).delete()
     assert not world.cloud.called("delete_stack")
 
 
-def test_a_refusal_that_is_not_absence_is_raised(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_is_not_taken_for_a_missing_stack(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     def denied(**_: Any) -> None:
         raise ClientError({"Error": {"Code": "AccessDenied", "Message": "no"}}, "DescribeStacks")
 
@@ -169,7 +169,7 @@ def test_known_causes_have_their_advice(reason: str, word: str) -> None:
 # -- the template ------------------------------------------------------------------------------------------------------
 
 
-def test_zips_are_tied_to_the_template() -> None:
+def test_the_template_gets_the_keys_of_the_zips() -> None:
     functions = [function("sweep"), function("next_step", b"other\n")]
     text = Template(TEMPLATE).with_code(functions).text
     for one in functions:
@@ -178,12 +178,12 @@ def test_zips_are_tied_to_the_template() -> None:
     assert text.replace(functions[0].key, "sweep.zip").replace(functions[1].key, "next_step.zip") == TEMPLATE
 
 
-def test_a_function_without_a_file_is_a_sentence() -> None:
+def test_a_function_without_a_file_is_reported_in_a_sentence() -> None:
     with pytest.raises(Problem, match="next_step"):
         Template(TEMPLATE).with_code([function("sweep")])
 
 
-def test_resources_by_conditions(world: World) -> None:
+def test_conditions_decide_which_resources_there_are(world: World) -> None:
     template = Template(TEMPLATE)
     assert {"Vpc", "EitherThing"} <= set(template.resources(world.parameters()))
     assert not {"Mail", "BothThings"} & set(template.resources(world.parameters()))
@@ -206,7 +206,7 @@ def test_our_template_can_be_read() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "a: [", "Resources", "just: this"])
-def test_what_is_no_template_is_a_sentence(text: str) -> None:
+def test_an_invalid_template_is_reported_in_a_sentence(text: str) -> None:
     with pytest.raises(Problem):
         assert Template(text).body
 
@@ -214,14 +214,14 @@ def test_what_is_no_template_is_a_sentence(text: str) -> None:
 # -- the zone ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_zone_is_found_by_the_domain_or_one_above(world: World) -> None:
+def test_the_zone_is_that_of_the_domain_or_of_a_parent(world: World) -> None:
     assert zones.find_zone(world.account, "example.org").id == world.zone
     assert zones.find_zone(world.account, "lab.dept.example.org").id == world.zone
     nearer = world.make_zone("dept.example.org")
     assert zones.find_zone(world.account, "lab.dept.example.org").id == nearer
 
 
-def test_no_zone_two_zones_a_private_zone(world: World) -> None:
+def test_a_domain_needs_exactly_one_public_zone(world: World) -> None:
     with pytest.raises(Problem, match=r"no public hosted zone for nowhere\.org") as caught:
         zones.find_zone(world.account, "nowhere.org")
     assert "example.org" in caught.value.advice
@@ -237,22 +237,22 @@ def test_no_zone_two_zones_a_private_zone(world: World) -> None:
 @pytest.mark.parametrize(
     "domain", ["", "localhost", "a..b", "-a.org", "https://example.org", "exa mple.org", "x" * 250]
 )
-def test_what_is_no_domain(domain: str) -> None:
+def test_invalid_domains_are_refused(domain: str) -> None:
     with pytest.raises(Problem, match="is not a domain"):
         zones.clean_domain(domain)
 
 
-def test_domains_are_put_in_order() -> None:
+def test_domains_are_normalized() -> None:
     assert zones.clean_domain(" Example.ORG. ") == "example.org"
 
 
 @pytest.mark.parametrize("zone", ["", "/hostedzone/Z123", "z123456", "Z0000000000000"])
-def test_what_is_no_zone(world: World, zone: str) -> None:
+def test_invalid_zone_ids_are_refused(world: World, zone: str) -> None:
     with pytest.raises(Problem):
         zones.read_zone(world.account, zone)
 
 
-def test_records_at_an_address(world: World) -> None:
+def test_the_record_of_a_name_is_found(world: World) -> None:
     zone = zones.read_zone(world.account, world.zone)
     assert zones.record_in(world.account, zone, "study.example.org") is None
     change = {
@@ -270,7 +270,7 @@ def test_records_at_an_address(world: World) -> None:
     assert zones.record_in(world.account, zone, "stud.example.org") is None
 
 
-def test_delegation_by_a_name_server_of_our_own(dns: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delegation_is_read_from_a_name_server(dns: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     right = zones.Zone("Z1", "example.org", ("ns-1.awsdns-1.com", "ns-2.awsdns-2.net"))
     dns({"example.org.": ["NS-1.awsdns-1.com.", "ns-2.awsdns-2.net."]})
     assert zones.delegation(right) == zones.Delegation(("ns-1.awsdns-1.com", "ns-2.awsdns-2.net"))
@@ -348,11 +348,11 @@ def decide(world: World, settings: StackSettings, previous: dict[str, str] | Non
     return settings.parameters(world.account, Template(TEMPLATE).defaults, previous or {}, world.code_bucket)
 
 
-def test_the_first_time(world: World) -> None:
+def test_the_first_settings_have_the_defaults(world: World) -> None:
     assert decide(world, StackSettings(domain="Example.org.", max_runtime=60)) == world.parameters(MaxRuntime="60")
 
 
-def test_the_sites_name_is_one_that_a_certificate_can_have(world: World) -> None:
+def test_the_name_of_the_site_must_fit_a_certificate(world: World) -> None:
     """ACM: the first name has 64 characters at most."""
     domain = f"{'x' * 50}.example"
     world.make_zone(domain)
@@ -371,7 +371,7 @@ def chosen(world: World, previous: dict[str, str] | None = None, **asked: Any) -
     return {name: found[name] for name in ("ZoneA", "ZoneB")}
 
 
-def test_zones_are_two_that_run_fargate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_zones_with_fargate_are_chosen(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert chosen(world) == {"ZoneA": "ca-central-1a", "ZoneB": "ca-central-1b"}
     offered = [
         {"ZoneName": f"ca-central-1{letter}", "ZoneId": f"cac1-az{number}", "State": "available"} | more
@@ -397,7 +397,7 @@ def test_zones_stay_as_they_are(world: World) -> None:
     assert chosen(world, stood) == stood
 
 
-def test_an_installation_from_before_keeps_the_zones_of_its_subnets(world: World) -> None:
+def test_an_earlier_installation_keeps_the_zones_of_its_subnets(world: World) -> None:
     ec2 = world.account.client("ec2")
     vpc = ec2.create_vpc(CidrBlock="10.0.0.0/16")["Vpc"]["VpcId"]
     made = [
@@ -410,21 +410,21 @@ def test_an_installation_from_before_keeps_the_zones_of_its_subnets(world: World
     assert chosen(world, world.parameters(), standing=gone) == {"ZoneA": "ca-central-1a", "ZoneB": "ca-central-1b"}
 
 
-def test_a_network_of_yours_needs_no_chosen(world: World) -> None:
+def test_an_own_network_needs_no_zones(world: World) -> None:
     theirs = {"vpc": "vpc-1", "subnets": "subnet-1,subnet-2"}
     assert chosen(world, **theirs) == {"ZoneA": "", "ZoneB": ""}
     stood = {"ZoneA": "ca-central-1d", "ZoneB": "ca-central-1a"}
     assert chosen(world, stood, **theirs) == stood
 
 
-def test_what_is_left_out_stays(world: World) -> None:
+def test_settings_that_are_left_out_stay(world: World) -> None:
     before = world.parameters(SiteHost="lab", MaxRuntime="30", AlarmEmail="a@b.c")
     assert decide(world, StackSettings(), before) == before
     assert decide(world, StackSettings(email=""), before)["AlarmEmail"] == ""
     assert decide(world, StackSettings(max_runtime=45), before)["MaxRuntime"] == "45"
 
 
-def test_servers_listen_on_443_unless_another_port_was_asked_for_once() -> None:
+def test_servers_listen_on_443_by_default_and_may_listen_on_5000() -> None:
     assert Template.read().defaults["ServerPort"] == "443"
     given = {"RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
     taken = {name: value or "" for name, value in Template.read().defaults.items()} | given
@@ -432,11 +432,11 @@ def test_servers_listen_on_443_unless_another_port_was_asked_for_once() -> None:
     assert option("ServerPort") == "--port"
 
 
-def test_front_ends_without_tokens_are_refused_unless_that_was_asked_for() -> None:
+def test_front_ends_without_tokens_are_refused_by_default() -> None:
     assert Template.read().defaults["PlainClients"] == "refused"
 
 
-def test_values_that_the_template_does_not_take_are_told_by_their_options() -> None:
+def test_values_that_the_template_refuses_are_reported_with_their_options() -> None:
     given = {"RootDomain": "example.org", "HostedZoneId": "Z1", "CodeBucket": "code"}
     taken = {name: value or "" for name, value in Template.read().defaults.items()} | given
     values = {name: value or "" for name, value in taken.items()}
@@ -460,17 +460,17 @@ def test_parameters_that_the_template_no_longer_has_are_dropped(world: World) ->
     assert "Old" not in decide(world, StackSettings(), world.parameters(Old="1"))
 
 
-def test_the_first_time_needs_a_domain(world: World) -> None:
+def test_a_first_installation_needs_a_domain(world: World) -> None:
     with pytest.raises(Problem, match="Which domain"):
         decide(world, StackSettings())
 
 
-def test_the_same_domain_keeps_its_zone_without_looking(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_domain_keeps_its_zone_without_a_request(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("deploy.stack.settings.find_zone", lambda *_: pytest.fail("looked"))
     assert decide(world, StackSettings(domain="example.org"), world.parameters())["HostedZoneId"] == world.zone
 
 
-def test_a_zone_by_its_id(world: World) -> None:
+def test_the_zone_can_be_named_by_its_id(world: World) -> None:
     second = world.make_zone("example.org")
     assert decide(world, StackSettings(domain="example.org", zone=second))["HostedZoneId"] == second
     other = world.make_zone("elsewhere.org")
@@ -486,7 +486,7 @@ def test_vpc_and_subnets_go_together(world: World, settings: StackSettings) -> N
         decide(world, settings, world.parameters())
 
 
-def test_subnets_are_put_in_order(world: World) -> None:
+def test_subnets_are_normalized(world: World) -> None:
     found = decide(world, StackSettings(vpc="vpc-1", subnets=" subnet-1 , subnet-2,"), world.parameters())
     assert found["SubnetIds"] == "subnet-1,subnet-2"
 
@@ -511,7 +511,7 @@ def test_the_bucket_is_made_private_and_encrypted(world: World) -> None:
     assert s3.get_bucket_location(Bucket=bucket.name)["LocationConstraint"] == REGION
 
 
-def test_a_half_made_bucket_is_finished(world: World) -> None:
+def test_an_unfinished_bucket_is_finished(world: World) -> None:
     s3 = world.account.client("s3")
     s3.create_bucket(Bucket=world.code_bucket, CreateBucketConfiguration={"LocationConstraint": REGION})
     assert CodeBucket(world.account, "hippodrome").make()
@@ -530,7 +530,7 @@ def listening(world: World, event: str, handler: Any) -> Iterator[None]:
         events.unregister(event, handler)
 
 
-def test_somebody_elses_bucket(world: World) -> None:
+def test_a_bucket_of_another_account_is_refused(world: World) -> None:
     """Gap: moto does not compare ExpectedBucketOwner. S3 answers 403 to HeadBucket then."""
     bucket = CodeBucket(world.account, "hippodrome")
 
@@ -545,7 +545,7 @@ def test_somebody_elses_bucket(world: World) -> None:
             bucket.make()
 
 
-def test_a_name_taken_in_the_same_moment(world: World) -> None:
+def test_a_bucket_name_that_was_just_taken_is_refused(world: World) -> None:
     bucket = CodeBucket(world.account, "hippodrome")
 
     def taken(params: Any, **_: Any) -> None:
@@ -569,7 +569,7 @@ def test_every_request_names_the_owner(world: World) -> None:
     assert all(one["ExpectedBucketOwner"] == ACCOUNT for one in seen)
 
 
-def test_only_what_is_missing_is_uploaded(world: World) -> None:
+def test_only_missing_zips_are_uploaded(world: World) -> None:
     bucket = CodeBucket(world.account, "hippodrome")
     bucket.make()
     assert bucket.upload([function("sweep"), function("next_step")]) == 2
@@ -587,7 +587,7 @@ def test_an_empty_object_is_uploaded_again(world: World) -> None:
     assert bucket.upload([function("sweep")]) == 1
 
 
-def test_templates_have_an_address_that_cloudformation_takes(world: World) -> None:
+def test_templates_are_stored_at_an_address_for_cloudformation(world: World) -> None:
     bucket = CodeBucket(world.account, "hippodrome")
     bucket.make()
     url = bucket.put_template(TEMPLATE)

@@ -54,7 +54,7 @@ def what_follows(status: str) -> list[list[Step]]:
     }.get(states.action_for(status), [])
 
 
-def test_no_state_is_forgotten() -> None:
+def test_every_state_of_a_stack_has_an_action() -> None:
     assert set(states.ACTIONS) == set(STATES)
     assert set(ENDS) == {status for status in STATES if states.action_for(status) is StackAction.WAIT}
 
@@ -63,7 +63,7 @@ def test_no_state_is_forgotten() -> None:
 @pytest.mark.parametrize(
     ("status", "end"), sample([(status, end) for status in STATES for end in ENDS.get(status, [None])], 3)
 )
-def test_whatever_state_it_is_in_one_run_or_a_remedy_and_another_run_makes_it_whole(
+def test_from_any_state_a_run_or_the_advised_remedy_and_a_run_succeed(
     world: World, status: str, end: str | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     world.stand(status)
@@ -93,7 +93,7 @@ def apply_again(world: World) -> Any:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("status", sample(STATES, 3))
-def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy(world: World, status: str) -> None:
+def test_from_any_state_plan_gives_a_plan_or_a_problem_with_advice(world: World, status: str) -> None:
     world.stand(status)
     try:
         found = plans.plan(world.account, "hippodrome", FIRST)
@@ -111,14 +111,14 @@ def test_a_plan_of_whatever_state_it_is_in_is_a_plan_or_a_sentence_with_a_remedy
     assert not world.cloud.calls or {name for name, _ in world.cloud.calls} == {"get_template"}
 
 
-def test_a_state_of_tomorrow_is_left_alone(world: World) -> None:
+def test_a_stack_in_an_unknown_state_is_left_alone(world: World) -> None:
     world.stand("PAUSED_COMPLETE")
     with pytest.raises(Problem, match="does not know"):
         apply(world.account, "hippodrome", FIRST)
     assert world.cloud.calls == []
 
 
-def test_a_failed_update_that_was_left_as_it_is_is_taken_back_before_the_next(world: World) -> None:
+def test_a_failed_update_is_rolled_back_before_the_next(world: World) -> None:
     """CloudFormation takes no change set with rollback in UPDATE_FAILED, which is left by updates without rollback."""
     world.stand("UPDATE_FAILED")
     world.cloud.operations = [list(TAKEN_BACK)]
@@ -129,7 +129,7 @@ def test_a_failed_update_that_was_left_as_it_is_is_taken_back_before_the_next(wo
     ]
 
 
-def test_an_update_that_cannot_be_taken_back_says_why(world: World) -> None:
+def test_an_update_that_cannot_be_rolled_back_says_why(world: World) -> None:
     reason = "Resource handler returned message: Access denied"
     world.stand("UPDATE_FAILED")
     failed: list[Step] = [

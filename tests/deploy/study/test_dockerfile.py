@@ -16,10 +16,10 @@ import yaml
 from deploy.study.image.bundle import make_bundle
 from hippodrome.ports import PORTS
 from tests.deploy.recipe import Container, Recipe, recipe, stages
-from tests.deploy.registering import folder, machine, town, write_study
+from tests.deploy.registering import folder, machine, register_world, write_study
 from tests.trial.conftest import client_of, grid_agent
 
-__all__ = ["folder", "machine", "recipe", "town"]
+__all__ = ["folder", "machine", "recipe", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -57,7 +57,7 @@ def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:
     assert recipe.all("WORKDIR") == [recipe.env["AGENT_DIR"]]
 
 
-def test_the_agent_is_tried_in_a_stage_that_the_image_waits_for_and_takes_nothing_of(recipe: Recipe) -> None:
+def test_a_stage_tries_the_agent_and_adds_nothing_to_the_image(recipe: Recipe) -> None:
     """BuildKit skips a stage of which nothing is used: https://docs.docker.com/build/building/multi-stage/"""
     _, tried, last = stages()
     assert recipe.all("FROM") == ["${BASE} AS image"]
@@ -71,7 +71,7 @@ def test_the_agent_is_tried_in_a_stage_that_the_image_waits_for_and_takes_nothin
     assert ("requirements/trial.txt", same) in recipe.copies, "the file is that of the image"
 
 
-def test_what_changes_least_comes_first(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+def test_the_dockerfile_copies_first_what_changes_least(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     sources = [source for source, _ in recipe.copies]
     assert sources == ["requirements/trial.txt", "requirements/project.txt", "protocol/", "trial/", "project/"]
     runs = [index for index, (word, _) in enumerate(recipe.steps) if word == "RUN"]
@@ -96,7 +96,7 @@ def test_the_versions_of_the_trial_are_pinned() -> None:
         assert line.startswith("#") or re.fullmatch(r"[A-Za-z0-9-]+==[0-9.]+", line)
 
 
-def test_the_buildspec_is_one() -> None:
+def test_the_commands_of_the_buildspec_are_valid() -> None:
     spec = yaml.safe_load((ROOT / "infra/buildspec.yml").read_text())
     assert spec["version"] == 0.2
     commands = [command for phase in spec["phases"].values() for command in phase["commands"]]
@@ -130,7 +130,7 @@ ENV = {
 }
 
 
-def test_what_the_image_holds_plays_a_game(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+def test_the_files_of_the_image_can_play_a_game(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     write_study(
         folder,
         agent_DOT_py="import helper\n" + grid_agent(20).replace("self.env = Grid()", "self.env = helper.ready(Grid())"),
@@ -160,7 +160,7 @@ def test_what_the_image_holds_plays_a_game(recipe: Recipe, folder: Path, tmp_pat
     assert container.files() == container.before  # nothing is written but below /scratch
 
 
-def test_sigterm_ends_what_the_image_runs(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+def test_sigterm_ends_the_server_of_the_image(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     write_study(folder, agent_DOT_py=grid_agent(None))
     make_bundle(folder).write_folder(tmp_path / "context")
     container = Container(recipe, tmp_path / "context", tmp_path / "root", {**ENV, "STORE": str(tmp_path / "store")})

@@ -11,10 +11,10 @@ import pytest
 from deploy.study.image.bundle import make_bundle
 from testing.waiting import until
 from tests.deploy.recipe import Container, Recipe, recipe, stages
-from tests.deploy.registering import folder, machine, town, write_study
+from tests.deploy.registering import folder, machine, register_world, write_study
 from tests.trial.conftest import grid_agent
 
-__all__ = ["folder", "machine", "recipe", "town"]
+__all__ = ["folder", "machine", "recipe", "register_world"]
 
 
 def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "150", **trial: Any) -> tuple[int, str]:
@@ -119,7 +119,7 @@ LATE = """try:
         ("import gymnasium; gymnasium.make('NoSuch-v0')", "", "agent.py:1: NameNotFound", "write the package with this game"),
     ],
 )  # fmt: skip
-def test_what_the_image_lacks_ends_its_build(
+def test_an_agent_that_cannot_run_in_the_image_ends_the_build(
     recipe: Recipe, folder: Path, tmp_path: Path, first: str, drawing: str, what: str, remedy: str
 ) -> None:
     agent = grid_agent(20)
@@ -202,7 +202,7 @@ def test_policies_are_tried_too(
         ("def f(:", "150", "SyntaxError"),
     ],
 )
-def test_what_a_server_may_have_and_a_build_has_not_is_a_warning(
+def test_a_failure_that_only_a_build_may_have_is_a_warning(
     recipe: Recipe, folder: Path, tmp_path: Path, first: str, seconds: str, words: str
 ) -> None:
     write_study(folder, agent_DOT_py=f"{first}\n" + grid_agent(20))
@@ -212,7 +212,7 @@ def test_what_a_server_may_have_and_a_build_has_not_is_a_warning(
     assert words in said
 
 
-def test_what_the_agent_has_started_ends_with_the_step(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+def test_processes_of_the_agent_end_with_the_step(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     started = "import subprocess, pathlib\nchild = subprocess.Popen(['/bin/sleep', '600'])\n"
     started += f"pathlib.Path({str(tmp_path / 'child')!r}).write_text(str(child.pid))\n"
     write_study(folder, agent_DOT_py=started + grid_agent(20))
@@ -221,7 +221,7 @@ def test_what_the_agent_has_started_ends_with_the_step(recipe: Recipe, folder: P
     until(lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z", 10)
 
 
-def test_what_the_agent_is_tried_with_names_the_image_and_the_rest_of_the_section_does_not(folder: Path) -> None:
+def test_only_settings_of_the_agents_trial_change_the_image(folder: Path) -> None:
     names = [
         make_bundle(folder, trial=trial).hash
         for trial in (

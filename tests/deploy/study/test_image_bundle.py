@@ -13,13 +13,13 @@ import pytest
 
 from deploy.study.image import bundle
 from deploy.study.image.bundle import make_bundle
-from tests.deploy.registering import folder, machine, town, write_study
+from tests.deploy.registering import folder, machine, register_world, write_study
 
-__all__ = ["folder", "machine", "town"]
+__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_the_same_files_are_the_same_bundle_wherever_they_lie(folder: Path, tmp_path: Path) -> None:
+def test_the_same_files_in_another_folder_give_the_same_bundle(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "elsewhere"
     shutil.copytree(folder, other)
     os.utime(other / "agent.py", (1, 1))
@@ -31,7 +31,9 @@ def test_the_same_files_are_the_same_bundle_wherever_they_lie(folder: Path, tmp_
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
 
 
-def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_every_part_of_the_image_changes_the_bundle(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     here = tmp_path / "hippodrome"
     for part in ("infra/Dockerfile", "requirements/trial.txt", "protocol/trial.py", "trial/server/server.py"):
         (here / part).parent.mkdir(parents=True, exist_ok=True)
@@ -56,14 +58,14 @@ def test_every_part_of_the_image_counts(folder: Path, monkeypatch: pytest.Monkey
     assert len(seen) == 9
 
 
-def test_what_is_not_in_the_image_does_not_count(folder: Path) -> None:
+def test_other_files_do_not_change_the_bundle(folder: Path) -> None:
     before = make_bundle(folder).hash
     write_study(folder, config="project: {}", steps__consent_DOT_html="other", data__x="1", _DOT_git__HEAD="x")
     (folder / "agent.py").write_text("class Agent:\n    pass\n")
     assert make_bundle(folder).hash == before
 
 
-def test_zip_and_folder_hold_the_same_and_everybody_may_read_it(folder: Path, tmp_path: Path) -> None:
+def test_the_zip_and_the_folder_hold_the_same_readable_files(folder: Path, tmp_path: Path) -> None:
     write_study(folder, tool="#!/bin/sh\n", private_DOT_txt="x")
     (folder / "tool").chmod(0o700)
     (folder / "private.txt").chmod(0o600)

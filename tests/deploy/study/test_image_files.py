@@ -12,14 +12,14 @@ from console.problem import Problem
 from deploy.study.image import files
 from deploy.study.image.bundle import make_bundle
 from deploy.study.image.files import Ignore, project_files
-from tests.deploy.registering import folder, machine, town, write_study
+from tests.deploy.registering import folder, machine, register_world, write_study
 
-__all__ = ["folder", "machine", "town"]
+__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize("app", ["App", "src/hippogym_app"])
-def test_of_a_clone_of_hippo_gym_what_lies_beside_the_agent_goes_in(folder: Path, app: str) -> None:
+def test_of_a_clone_of_hippo_gym_the_files_beside_the_agent_are_in_the_image(folder: Path, app: str) -> None:
     (folder / "agent.py").unlink()
     for name in ("agent.py", "coachAgent.py", "images/a.png", "maps/steps/b.txt", "README.md"):
         (folder / app / name).parent.mkdir(parents=True, exist_ok=True)
@@ -38,7 +38,7 @@ def test_of_a_clone_of_hippo_gym_what_lies_beside_the_agent_goes_in(folder: Path
 
 
 @pytest.mark.parametrize("app", ["App", "src/hippogym_app"])
-def test_recordings_and_keys_of_a_clone_stay_out_though_its_agent_has_moved_up(folder: Path, app: str) -> None:
+def test_recordings_and_keys_of_a_clone_stay_out_even_if_its_agent_is_elsewhere(folder: Path, app: str) -> None:
     for name in ("Trials/episode_1_user_P1", "privkey.pem", "fullchain.pem", ".env", "data/map.txt"):
         (folder / app / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / app / name).write_text(name)
@@ -46,7 +46,7 @@ def test_recordings_and_keys_of_a_clone_stay_out_though_its_agent_has_moved_up(f
 
 
 @pytest.mark.parametrize("link", ["App", "src"])
-def test_a_folder_elsewhere_does_not_go_in_by_a_link(folder: Path, tmp_path: Path, link: str) -> None:
+def test_a_link_to_a_folder_elsewhere_is_refused(folder: Path, tmp_path: Path, link: str) -> None:
     (folder / "agent.py").unlink()
     elsewhere = tmp_path / "elsewhere"
     place = elsewhere if link == "App" else elsewhere / "hippogym_app"
@@ -58,7 +58,7 @@ def test_a_folder_elsewhere_does_not_go_in_by_a_link(folder: Path, tmp_path: Pat
         project_files(folder)
 
 
-def test_what_is_elsewhere_hidden_or_made_by_machines_stays_out(folder: Path) -> None:
+def test_hidden_generated_and_unrelated_files_stay_out(folder: Path) -> None:
     write_study(
         folder,
         maps__one_DOT_txt="1",
@@ -90,12 +90,12 @@ def test_a_dockerignore_leaves_out_more(folder: Path) -> None:
     assert list(project_files(folder)) == ["agent.py", "deep/c.txt", "deep/er/keep.mp4"]
 
 
-def test_what_is_hidden_cannot_be_taken_back(folder: Path) -> None:
+def test_a_dockerignore_cannot_add_hidden_files(folder: Path) -> None:
     write_study(folder, _DOT_env="secret", _DOT_dockerignore="!.env\n!config.yml\n")
     assert list(project_files(folder)) == ["agent.py"]
 
 
-def test_patterns_mean_what_they_mean_to_docker() -> None:
+def test_patterns_have_the_meaning_that_docker_gives_them() -> None:
     oracle = pytest.importorskip("docker.utils.build").PatternMatcher
     chance = random.Random(7)
     names = ["a", "ab", "b.py", "c", "d.txt"]
@@ -126,13 +126,13 @@ def test_patterns_mean_what_they_mean_to_docker() -> None:
         ("a[", ["a["], ["a"]),
     ],
 )
-def test_patterns(pattern: str, yes: list[str], no: list[str]) -> None:
+def test_each_pattern_matches_the_right_files(pattern: str, yes: list[str], no: list[str]) -> None:
     ignored = Ignore([pattern])
     assert [name for name in yes if not ignored(name)] == []
     assert [name for name in no if ignored(name)] == []
 
 
-def test_links_within_the_folder_are_the_files_they_lead_to(folder: Path) -> None:
+def test_links_within_the_folder_become_files(folder: Path) -> None:
     write_study(folder, maps__one_DOT_txt="1")
     (folder / "two.txt").symlink_to(folder / "maps/one.txt")
     assert project_files(folder)["two.txt"].read_text() == "1"
@@ -166,13 +166,15 @@ def test_a_link_out_of_the_folder_may_be_ignored(folder: Path) -> None:
     assert list(project_files(folder)) == ["agent.py"]
 
 
-def test_what_is_no_file_is_refused(folder: Path) -> None:
+def test_special_files_are_refused(folder: Path) -> None:
     os.mkfifo(folder / "pipe")
     with pytest.raises(Problem, match=r"pipe is not a file"):
         project_files(folder)
 
 
-def test_too_much_names_the_biggest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_or_too_large_files_are_refused_naming_the_largest(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(files, "LIMIT_BYTES", 5000)
     write_study(folder, a__model_DOT_bin="x" * 4000, notes_DOT_txt="y" * 3000)
     with pytest.raises(Problem, match="more than") as caught:
@@ -184,7 +186,7 @@ def test_too_much_names_the_biggest(folder: Path, monkeypatch: pytest.MonkeyPatc
         project_files(folder)
 
 
-def test_the_example_brings_only_its_agent() -> None:
+def test_the_image_of_the_example_holds_only_its_agent() -> None:
     """The example project lies in the folder of Hippodrome itself."""
     assert list(project_files(ROOT)) == ["agent.py"]
 
@@ -204,7 +206,7 @@ def test_the_example_brings_only_its_agent() -> None:
         ("--find-links https://me:secret@example.org/wheels", "password"),
     ],
 )
-def test_requirements_that_cannot_be_met(folder: Path, line: str, said: str) -> None:
+def test_requirements_that_an_image_cannot_install_are_refused(folder: Path, line: str, said: str) -> None:
     write_study(folder, requirements_DOT_txt=f"numpy  # fine\n\n# ./comment\n{line}\n")
     with pytest.raises(Problem, match=rf"requirements\.txt:4: .*({said})"):
         make_bundle(folder)
@@ -213,6 +215,6 @@ def test_requirements_that_cannot_be_met(folder: Path, line: str, said: str) -> 
 @pytest.mark.parametrize(
     "line", ["numpy==2.4.6", "torch>=2,<3 ; python_version > '3'", "a @ https://example.org/a.zip", "a.b[c]"]
 )
-def test_requirements_that_can(folder: Path, line: str) -> None:
+def test_other_requirements_go_into_the_bundle(folder: Path, line: str) -> None:
     write_study(folder, requirements_DOT_txt=line)
     assert make_bundle(folder).entries["requirements/project.txt"] == line.encode()

@@ -18,25 +18,25 @@ from hippodrome.storage.secret import SecretCache
 from lambdas import update_project_master_list
 from testing.studies import PAGES, study
 from testing.visitors import Browser
-from tests.deploy.installation import Ran
-from tests.deploy.registering import Town, machine, town  # noqa: F401
+from tests.deploy.installation import CommandResult
+from tests.deploy.registering import RegisterWorld, machine, register_world  # noqa: F401
 
 SIGNED = msgspec.structs.replace(study(), signed_links=True)
 
 
 @pytest.fixture
-def world(town: Town) -> Town:  # noqa: F811
-    town.register(SIGNED, msgspec.structs.replace(study(), id="open"))
+def world(register_world: RegisterWorld) -> RegisterWorld:  # noqa: F811
+    register_world.register(SIGNED, msgspec.structs.replace(study(), id="open"))
     for file, source in PAGES.items():
-        town.put(f"maze/steps/{file}.html", source.encode())
-    return town
+        register_world.put(f"maze/steps/{file}.html", source.encode())
+    return register_world
 
 
-def run(world: Town, capsys: Any, *more: str, project: str = "maze") -> Ran:
+def run(world: RegisterWorld, capsys: Any, *more: str, project: str = "maze") -> CommandResult:
     return world.run(capsys, "links", "--project", project, *more)
 
 
-def test_every_line_is_somebodys_link(world: Town, capsys: Any, tmp_path: Path) -> None:
+def test_each_line_is_the_link_of_one_participant(world: RegisterWorld, capsys: Any, tmp_path: Path) -> None:
     file = tmp_path / "ids.txt"
     file.write_text("\ufeffann\n\n  bob \nann\n", encoding="utf-8")
     ran = run(world, capsys, str(file))
@@ -52,14 +52,14 @@ def test_every_line_is_somebodys_link(world: Town, capsys: Any, tmp_path: Path) 
         assert browser.send()["statusCode"] == 403
 
 
-def test_new_ids_are_all_different(world: Town, capsys: Any) -> None:
+def test_new_ids_are_all_different(world: RegisterWorld, capsys: Any) -> None:
     found = run(world, capsys, "--new", "20", "--json").json
     assert len({one["userId"] for one in found}) == 20
     assert all(one["userId"] in one["link"] for one in found)
 
 
 @pytest.mark.parametrize("text", ["ann@example.org\n", "userId,link\n", "a b\n", "x" * 65])
-def test_what_is_no_id_is_told_with_its_line(world: Town, capsys: Any, tmp_path: Path, text: str) -> None:
+def test_an_invalid_id_is_reported_with_its_line(world: RegisterWorld, capsys: Any, tmp_path: Path, text: str) -> None:
     (tmp_path / "ids.txt").write_text(f"ann\n{text}")
     ran = run(world, capsys, str(tmp_path / "ids.txt"))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
@@ -67,7 +67,9 @@ def test_what_is_no_id_is_told_with_its_line(world: Town, capsys: Any, tmp_path:
     assert text.strip() not in ran.err
 
 
-def test_nobody_an_unknown_project_and_one_that_is_open(world: Town, capsys: Any, tmp_path: Path) -> None:
+def test_links_needs_participants_and_a_known_project_and_says_if_links_are_not_signed(
+    world: RegisterWorld, capsys: Any, tmp_path: Path
+) -> None:
     assert run(world, capsys).code == Exit.FAILED
     assert run(world, capsys, str(tmp_path / "none.txt")).code == Exit.FAILED
     assert "No project named" in run(world, capsys, "--new", "1", project="other").err
@@ -75,7 +77,7 @@ def test_nobody_an_unknown_project_and_one_that_is_open(world: Town, capsys: Any
     assert (ran.code, "signedLinks" in ran.err) == (Exit.DONE, True)
 
 
-def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
+def test_links_are_made_without_reading_the_secret(world: RegisterWorld, capsys: Any) -> None:
     SecretCache(world.platform.documents).get_or_create()
     world.register(msgspec.structs.replace(SIGNED, secret="", salt="s"))
     world.asked.clear()
@@ -85,8 +87,8 @@ def test_whoever_makes_links_reads_no_secret(world: Town, capsys: Any) -> None:
     assert browser.send()["statusCode"] == 200
 
 
-def test_more_than_one_message_holds_are_asked_for_in_several(
-    world: Town, capsys: Any, monkeypatch: pytest.MonkeyPatch
+def test_many_links_are_requested_in_several_messages(
+    world: RegisterWorld, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(links, "MAX_SIGNED", 3)
     found = run(world, capsys, "--new", "7", "--json").json
@@ -96,7 +98,7 @@ def test_more_than_one_message_holds_are_asked_for_in_several(
 
 
 def test_an_installation_that_signs_no_links_yet_says_so(
-    world: Town, capsys: Any, monkeypatch: pytest.MonkeyPatch
+    world: RegisterWorld, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(update_project_master_list, "handler", lambda *_: {"problems": ["project: missing"]})
     ran = run(world, capsys, "--new", "1")

@@ -15,9 +15,18 @@ import pytest
 from console.problem import Exit
 from hippodrome.model import ids
 from lambdas import next_step, start_server
-from tests.deploy.registering import CONFIG, Town, bodies, configure, folder, machine, town, write_study
+from tests.deploy.registering import (
+    CONFIG,
+    RegisterWorld,
+    bodies,
+    configure,
+    folder,
+    machine,
+    register_world,
+    write_study,
+)
 
-__all__ = ["folder", "machine", "town"]
+__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]
@@ -26,42 +35,44 @@ Capsys = pytest.CaptureFixture[str]
 # --- the whole way ------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_becomes_a_link(town: Town, folder: Path, capsys: Capsys) -> None:
-    ran = town.run(capsys, "register", str(folder))
+def test_a_folder_becomes_a_link(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
     assert LINK in ran.out.split()
-    project = town.project()
+    project = register_world.project()
     assert project is not None
     assert project.live
-    assert (project.aws_setup.bucket, project.aws_setup.region) == (town.env["BUCKET"], "us-east-1")
+    assert (project.aws_setup.bucket, project.aws_setup.region) == (register_world.env["BUCKET"], "us-east-1")
     assert project.aws_setup.root_domain == "example.org"
-    assert town.keys("maze/") == [f"maze/steps/{name}" for name in ("consent.html", "maze.png", "thanks.html")]
-    assert [project.task_definition] == town.revisions()
-    (tag,) = town.image_tags()
+    assert register_world.keys("maze/") == [
+        f"maze/steps/{name}" for name in ("consent.html", "maze.png", "thanks.html")
+    ]
+    assert [project.task_definition] == register_world.revisions()
+    (tag,) = register_world.image_tags()
     assert re.fullmatch("maze-[0-9a-f]{12}", tag)
-    assert town.builds[0].env["IMAGE"] == f"{town.repository}:{tag}"
+    assert register_world.builds[0].env["IMAGE"] == f"{register_world.repository}:{tag}"
 
 
-def test_the_answer_for_scripts(town: Town, folder: Path, capsys: Capsys) -> None:
-    answer = town.run(capsys, "register", str(folder), "--json").json
+def test_register_answers_in_json(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    answer = register_world.run(capsys, "register", str(folder), "--json").json
     assert answer["link"] == LINK
     assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 0}
     assert answer["imageBuilt"] is True
-    assert re.fullmatch(re.escape(town.repository) + "@sha256:[0-9a-f]{64}", answer["image"])
-    assert answer["taskDefinition"] == town.revisions()[0]
+    assert re.fullmatch(re.escape(register_world.repository) + "@sha256:[0-9a-f]{64}", answer["image"])
+    assert answer["taskDefinition"] == register_world.revisions()[0]
     assert answer["live"] is True
 
 
-def test_the_task_definition(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_register_makes_the_task_definition(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     configure(folder, ("cpu: 1, memory: 2", "cpu: 0.5, memory: 3"))
-    answer = town.run(capsys, "register", str(folder), "--json").json
-    ecs = town.client("ecs")
+    answer = register_world.run(capsys, "register", str(folder), "--json").json
+    ecs = register_world.client("ecs")
     found = ecs.describe_task_definition(taskDefinition="hippodrome-maze", include=["TAGS"])
     task, tags = found["taskDefinition"], {tag["key"]: tag["value"] for tag in found["tags"]}
     assert (task["cpu"], task["memory"], task["networkMode"]) == ("512", "3072", "awsvpc")
     assert task["requiresCompatibilities"] == ["FARGATE"]
     assert task["runtimePlatform"]["cpuArchitecture"] == "X86_64"
-    assert task["executionRoleArn"] == town.outputs["TaskExecutionRole"]
+    assert task["executionRoleArn"] == register_world.outputs["TaskExecutionRole"]
     assert "taskRoleArn" not in task, "what runs in the container has no rights"
     assert tags["hippodrome:stack"] == "hippodrome"
     (container,) = task["containerDefinitions"]
@@ -74,40 +85,40 @@ def test_the_task_definition(town: Town, folder: Path, capsys: Capsys) -> None:
     assert container["systemControls"] == [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": "443"}]
     assert container["user"] == "10001:10001"
     assert container["linuxParameters"]["capabilities"]["drop"] == ["ALL"]
-    assert town.project().server_port == 443
-    assert container["logConfiguration"]["options"]["awslogs-group"] == town.outputs["TrialLogGroup"]
+    assert register_world.project().server_port == 443
+    assert container["logConfiguration"]["options"]["awslogs-group"] == register_world.outputs["TrialLogGroup"]
     assert container["logConfiguration"]["options"]["awslogs-stream-prefix"] == "maze"
     assert container["environment"] == [{"name": "STOP_SECONDS", "value": "120"}], "nothing secret"
     assert "secrets" not in container
 
 
 def test_a_study_takes_the_installations_port_when_it_is_registered_again(
-    town: Town, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
 ) -> None:
-    town.change(ServerPort="5000")
-    town.run(capsys, "register", str(folder))
-    first = town.project()
-    (container,) = town.client("ecs").describe_task_definition(taskDefinition=first.task_definition)["taskDefinition"][
-        "containerDefinitions"
-    ]
+    register_world.change(ServerPort="5000")
+    register_world.run(capsys, "register", str(folder))
+    first = register_world.project()
+    (container,) = register_world.client("ecs").describe_task_definition(taskDefinition=first.task_definition)[
+        "taskDefinition"
+    ]["containerDefinitions"]
     assert (first.server_port, container["portMappings"][0]["containerPort"]) == (5000, 5000)
     assert not container.get("systemControls")
-    assert "Nothing to do" in town.run(capsys, "register", str(folder), "--dry-run").out
-    town.change(ServerPort="443")
-    town.run(capsys, "register", str(folder))
-    again = town.project()
+    assert "Nothing to do" in register_world.run(capsys, "register", str(folder), "--dry-run").out
+    register_world.change(ServerPort="443")
+    register_world.run(capsys, "register", str(folder))
+    again = register_world.project()
     assert again.server_port == 443
     assert again.task_definition != first.task_definition
 
 
-def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_participant_comes_and_a_server_starts(register_world: RegisterWorld, tmp_path: Path, capsys: Capsys) -> None:
     """The example study as it is shipped: its page is shown, and its server is told where the certificate is."""
     study = tmp_path / "example"
     (study / "steps").mkdir(parents=True)
     (study / "config.yml").write_text((ROOT / "config.yml").read_text())
     for page in (ROOT / "steps").iterdir():
         (study / "steps" / page.name).write_bytes(page.read_bytes())
-    ran = town.run(capsys, "register", str(study))
+    ran = register_world.run(capsys, "register", str(study))
     assert ran.code == Exit.DONE, ran.err
 
     def get(query: str) -> dict[str, Any]:
@@ -120,12 +131,12 @@ def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, cap
     assert b"Learning to play Ms. Pac-Man" in gzip.decompress(base64.b64decode(reply["body"]))
 
     task = "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/0123456789abcdef0123456789abcdef"
-    town.answer("ecs:RunTask", {"tasks": [{"taskArn": task}], "failures": []})
+    register_world.answer("ecs:RunTask", {"tasks": [{"taskArn": task}], "failures": []})
     start = {"projectId": "ms-pacman", "userId": "ada", "attempt": 1}
-    assert start_server.handler(town.sqs_event("start", [start]), None) == {"batchItemFailures": []}
-    (call,) = [call for call in town.calls if call.action == "ecs:RunTask"]
+    assert start_server.handler(register_world.sqs_event("start", [start]), None) == {"batchItemFailures": []}
+    (call,) = [call for call in register_world.calls if call.action == "ecs:RunTask"]
     told = {one["name"]: one["value"] for one in call.params["overrides"]["containerOverrides"][0]["environment"]}
-    assert call.params["taskDefinition"] == town.project("ms-pacman").task_definition
+    assert call.params["taskDefinition"] == register_world.project("ms-pacman").task_definition
     assert (told["SSL_FULLCHAIN"], told["SSL_PRIVKEY"]) == (
         "SSL/servers.example.org/fullchain.pem",
         "SSL/servers.example.org/privkey.pem",
@@ -133,161 +144,171 @@ def test_a_participant_comes_and_a_server_starts(town: Town, tmp_path: Path, cap
     assert call.params["startedBy"] == ids.server_name(ids.server_label("ms-pacman", "ada"), 1)
 
 
-def test_a_study_without_a_game_needs_no_image(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_a_study_without_a_game_needs_no_image(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     configure(
         folder,
         ("{1: consent, 2: game, 3: thanks}", "{1: consent, 2: thanks}"),
         ("trial:\n  game: ALE/MsPacman-v5\n", ""),
     )
-    answer = town.run(capsys, "register", str(folder), "--json").json
+    answer = register_world.run(capsys, "register", str(folder), "--json").json
     assert (answer["image"], answer["taskDefinition"]) == (None, None)
-    assert town.project().task_definition is None
-    assert (town.builds, town.image_tags(), town.revisions()) == ([], [], [])
+    assert register_world.project().task_definition is None
+    assert (register_world.builds, register_world.image_tags(), register_world.revisions()) == ([], [], [])
 
 
 # --- again --------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_changed_is_nothing_done(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
-    before = bodies(town)
-    salt = town.project().salt
-    with town.recording() as calls:
-        answer = town.run(capsys, "register", str(folder), "--json").json
+def test_register_without_changes_does_nothing(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.run(capsys, "register", str(folder))
+    before = bodies(register_world)
+    salt = register_world.project().salt
+    with register_world.recording() as calls:
+        answer = register_world.run(capsys, "register", str(folder), "--json").json
     writes = {"s3:DeleteObject", "ecs:RegisterTaskDefinition", "codebuild:StartBuild"}
     assert not writes & {call.action for call in calls}
     assert not [call for call in calls if call.action == "s3:PutObject" and "/steps/" in call.params["Key"]]
     assert answer["pages"] == {"uploaded": 0, "same": 3, "removed": 0}
     assert answer["imageBuilt"] is False
-    assert len(town.revisions()) == 1
-    assert bodies(town) == before
-    assert town.project().salt == salt != ""
+    assert len(register_world.revisions()) == 1
+    assert bodies(register_world) == before
+    assert register_world.project().salt == salt != ""
 
 
-def test_only_the_changed_page_is_uploaded(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
+def test_only_the_changed_page_is_uploaded(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.run(capsys, "register", str(folder))
     (folder / "steps/consent.html").write_text("<p>May we?</p>")
-    with town.recording() as calls:
-        town.run(capsys, "register", str(folder))
+    with register_world.recording() as calls:
+        register_world.run(capsys, "register", str(folder))
     put = [call.params["Key"] for call in calls if call.action == "s3:PutObject"]
     assert [key for key in put if key.startswith("maze/")] == ["maze/steps/consent.html"]
-    assert town.get("maze/steps/consent.html") == b"<p>May we?</p>"
-    assert len(town.builds) == 1
+    assert register_world.get("maze/steps/consent.html") == b"<p>May we?</p>"
+    assert len(register_world.builds) == 1
 
 
-def test_an_open_study_keeps_its_pages_until_its_image_is_there(town: Town, folder: Path, capsys: Capsys) -> None:
-    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
-    before = bodies(town)
+def test_a_live_study_keeps_its_pages_until_its_new_image_exists(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    before = bodies(register_world)
     (folder / "steps/consent.html").write_text("<p>Another consent</p>")
     (folder / "agent.py").write_text("# another agent\n")
-    town.outcome = "FAILED"
-    assert town.run(capsys, "register", str(folder)).code == Exit.FAILED
-    assert bodies(town) == before
+    register_world.outcome = "FAILED"
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.FAILED
+    assert bodies(register_world) == before
 
 
-def test_a_page_whose_etag_is_no_md5_is_read(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_a_page_whose_etag_is_no_md5_is_read(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     """As with a KMS key: the ETag says nothing, the content does."""
-    town.run(capsys, "register", str(folder))
-    s3 = town.client("s3")
-    listed = s3.list_objects_v2(Bucket=town.env["BUCKET"], Prefix="maze/steps/")["Contents"]
+    register_world.run(capsys, "register", str(folder))
+    s3 = register_world.client("s3")
+    listed = s3.list_objects_v2(Bucket=register_world.env["BUCKET"], Prefix="maze/steps/")["Contents"]
     lines = [{**line, "ETag": f'"{hashlib.md5(line["Key"].encode()).hexdigest()}"'} for line in listed]
-    town.answer("s3:ListObjectsV2", {"Contents": lines, "IsTruncated": False})
-    with town.recording() as calls:
-        answer = town.run(capsys, "register", str(folder), "--json").json
+    register_world.answer("s3:ListObjectsV2", {"Contents": lines, "IsTruncated": False})
+    with register_world.recording() as calls:
+        answer = register_world.run(capsys, "register", str(folder), "--json").json
     assert answer["pages"]["same"] == 3
     assert [call.params["Key"] for call in calls if call.action == "s3:GetObject" and "/steps/" in call.params["Key"]]
 
 
-def test_pages_that_are_gone_go_last(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
+def test_deleted_pages_are_removed_last(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.run(capsys, "register", str(folder))
     (folder / "steps/consent.html").unlink()
     for group in range(2):
         (folder / f"steps/consent-{group}.html").write_text(f"<p>{group}</p>")
-    town.put("maze/users/ada/answers/1.json", b"{}")
-    town.put("maze-two/steps/consent.html", b"another project's")
-    ran = town.run(capsys, "register", str(folder), "--yes")
+    register_world.put("maze/users/ada/answers/1.json", b"{}")
+    register_world.put("maze-two/steps/consent.html", b"another project's")
+    ran = register_world.run(capsys, "register", str(folder), "--yes")
     assert ran.code == Exit.DONE, ran.err
-    assert town.keys("maze/steps/") == [
+    assert register_world.keys("maze/steps/") == [
         f"maze/steps/{name}" for name in ("consent-0.html", "consent-1.html", "maze.png", "thanks.html")
     ]
-    calls = [call for call in town.made if call in ("lambda:Invoke", "s3:DeleteObject")]
+    calls = [call for call in register_world.made if call in ("lambda:Invoke", "s3:DeleteObject")]
     assert calls == ["lambda:Invoke", "lambda:Invoke", "s3:DeleteObject"]
-    assert town.get("maze-two/steps/consent.html") == b"another project's"
-    assert town.get("maze/users/ada/answers/1.json") == b"{}"
+    assert register_world.get("maze-two/steps/consent.html") == b"another project's"
+    assert register_world.get("maze/users/ada/answers/1.json") == b"{}"
 
 
-def test_another_size_is_another_revision_of_the_same_image(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
+def test_another_size_is_another_revision_of_the_same_image(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    register_world.run(capsys, "register", str(folder))
     configure(folder, ("memory: 2", "memory: 4"))
-    town.run(capsys, "register", str(folder))
-    assert len(town.builds) == 1
-    assert [arn.rpartition(":")[2] for arn in town.revisions()] == ["1", "2"]
-    assert town.project().task_definition == town.revisions()[1]
+    register_world.run(capsys, "register", str(folder))
+    assert len(register_world.builds) == 1
+    assert [arn.rpartition(":")[2] for arn in register_world.revisions()] == ["1", "2"]
+    assert register_world.project().task_definition == register_world.revisions()[1]
 
 
-def test_more_pages_than_a_listing_holds(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_pages_of_more_than_a_listing_are_registered(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
     """S3 lists 1,000 keys at a time; here one, which is as good."""
     for name in ("a.txt", "b.txt", "c.txt"):
-        town.put(f"maze/steps/{name}", b"x")
-    s3 = town.client("s3")
-    first = s3.list_objects_v2(Bucket=town.env["BUCKET"], Prefix="maze/steps/", MaxKeys=1)
+        register_world.put(f"maze/steps/{name}", b"x")
+    s3 = register_world.client("s3")
+    first = s3.list_objects_v2(Bucket=register_world.env["BUCKET"], Prefix="maze/steps/", MaxKeys=1)
     assert first["IsTruncated"]
     first.pop("ResponseMetadata")
-    town.answer("s3:ListObjectsV2", first)
-    answer = town.run(capsys, "register", str(folder), "--json").json
+    register_world.answer("s3:ListObjectsV2", first)
+    answer = register_world.run(capsys, "register", str(folder), "--json").json
     assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 3}
-    assert len(town.keys("maze/steps/")) == 3
+    assert len(register_world.keys("maze/steps/")) == 3
 
 
 # --- open and closed ----------------------------------------------------------------------------------------------
 
 
-def test_closed_and_open_again(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
-    known = town.project()
-    ran = town.run(capsys, "register", str(folder), "--no-live")
+def test_a_study_can_be_closed_and_opened_again(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.run(capsys, "register", str(folder))
+    known = register_world.project()
+    ran = register_world.run(capsys, "register", str(folder), "--no-live")
     assert ran.code == Exit.DONE, ran.err
-    assert not town.project().live
-    assert town.project().task_definition == known.task_definition
+    assert not register_world.project().live
+    assert register_world.project().task_definition == known.task_definition
     assert "closed" in ran.out
-    assert town.run(capsys, "register", str(folder), "--live", "--json").json["live"] is True
-    assert town.project().live
-    assert town.project().salt == known.salt != ""
-    assert len(town.builds) == 1
+    assert register_world.run(capsys, "register", str(folder), "--live", "--json").json["live"] is True
+    assert register_world.project().live
+    assert register_world.project().salt == known.salt != ""
+    assert len(register_world.builds) == 1
 
 
-def test_an_open_study_with_warm_servers_says_what_they_cost_a_day(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_register_says_what_warm_servers_of_a_live_study_cost_a_day(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
     configure(folder, ("maxRuntime: 30", "maxRuntime: 30\n  warmServers: 4"))
     said = "4 servers will be kept warm while the study is open: about $2.14 a day on Spot, $5.22 on demand"
-    assert said in town.run(capsys, "register", str(folder)).err.replace("\n", " ")
-    assert "kept warm while" not in town.run(capsys, "register", str(folder), "--no-live").err
-    project = town.project()
+    assert said in register_world.run(capsys, "register", str(folder)).err.replace("\n", " ")
+    assert "kept warm while" not in register_world.run(capsys, "register", str(folder), "--no-live").err
+    project = register_world.project()
     assert project is not None
     assert (project.live, project.warm_servers) == (False, 4)
 
 
-def test_closing_comes_before_everything(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
+def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.run(capsys, "register", str(folder))
     (folder / "agent.py").write_text("class Agent:\n    new = True\n")
-    town.outcome, town.made = "FAILED", []
-    ran = town.run(capsys, "register", str(folder), "--no-live")
+    register_world.outcome, register_world.made = "FAILED", []
+    ran = register_world.run(capsys, "register", str(folder), "--no-live")
     assert ran.code == Exit.FAILED  # the new image could not be built
-    assert not town.project().live  # but nobody gets in
-    assert town.made.index("lambda:Invoke") == 2
+    assert not register_world.project().live  # but nobody gets in
+    assert register_world.made.index("lambda:Invoke") == 2
 
 
 @pytest.mark.parametrize("broken", ["steps: {1: consent", "maxRuntime: never"])
-def test_a_study_is_closed_although_its_config_is_broken(town: Town, folder: Path, capsys: Capsys, broken: str) -> None:
-    town.run(capsys, "register", str(folder))
+def test_a_study_is_closed_although_its_config_is_broken(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, broken: str
+) -> None:
+    register_world.run(capsys, "register", str(folder))
     where = "steps: {1: consent" if broken.startswith("steps") else "maxRuntime: 30"
     (folder / "config.yml").write_text(CONFIG.replace(where, broken.replace("consent", "nosuchpage")))
-    ran = town.run(capsys, "register", str(folder), "--no-live")
+    ran = register_world.run(capsys, "register", str(folder), "--no-live")
     assert ran.code == Exit.FAILED
     assert "config.yml:" in ran.err
-    assert not town.project().live
+    assert not register_world.project().live
 
 
-def test_what_is_closed_keeps_everything_else(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     """Also what records leave out because it is the default, such as 1 vCPU and 2 GB."""
     write_study(folder, steps__consent_DOT_html="x")
     configure(
@@ -298,133 +319,141 @@ def test_what_is_closed_keeps_everything_else(town: Town, folder: Path, capsys: 
         ),
         ("trial:\n", "trial:\n  options: {a: [1, {b: null}]}\n  ui: {good: true}\n"),
     )
-    town.run(capsys, "register", str(folder))
-    before = town.project()
+    register_world.run(capsys, "register", str(folder))
+    before = register_world.project()
     (folder / "config.yml").write_text("project:\n  id: maze\n")
-    town.run(capsys, "register", str(folder), "--no-live")
-    after = town.project()
+    register_world.run(capsys, "register", str(folder), "--no-live")
+    after = register_world.project()
     assert not after.live
     import msgspec
 
     assert msgspec.structs.replace(after, live=True, version=before.version) == before
 
 
-def test_a_new_study_can_begin_closed(town: Town, folder: Path, capsys: Capsys) -> None:
-    assert town.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
-    assert town.project().live is False
+def test_a_new_study_can_be_registered_as_closed(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    assert register_world.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
+    assert register_world.project().live is False
 
 
-def test_steps_of_a_study_under_way_change_only_after_a_yes(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.run(capsys, "register", str(folder))
-    town.put("maze/users/ada/participant.json", b"{}")
+def test_steps_of_a_study_with_participants_change_only_after_a_yes(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    register_world.run(capsys, "register", str(folder))
+    register_world.put("maze/users/ada/participant.json", b"{}")
     (folder / "steps/survey.html").write_text("<p>?</p>")
     configure(folder, ("3: thanks", "3: survey, 4: thanks"))
-    before = town.project()
-    ran = town.run(capsys, "register", str(folder))
+    before = register_world.project()
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DECLINED
     assert "step 3 is survey (was thanks), step 4 is thanks (new)" in " ".join((ran.out + ran.err).split())
-    assert town.project() == before
-    assert "maze/steps/survey.html" not in town.keys("maze/steps/")
-    assert town.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
-    assert [step.page for step in town.project().steps] == ["consent", "game", "survey", "thanks"]
+    assert register_world.project() == before
+    assert "maze/steps/survey.html" not in register_world.keys("maze/steps/")
+    assert register_world.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
+    assert [step.page for step in register_world.project().steps] == ["consent", "game", "survey", "thanks"]
 
 
-def test_a_copied_folder_with_the_same_id_takes_no_study_over_that_is_under_way_without_a_yes(
-    town: Town, folder: Path, capsys: Capsys
+def test_a_copied_folder_replaces_a_study_with_participants_only_after_a_yes(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
 ) -> None:
     """Its pages and its agent would be those of the other study's participants."""
-    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
     configure(folder, ("A maze", "A second study"))
-    assert town.run(capsys, "register", str(folder)).code == Exit.DONE, "nobody has taken part yet"
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE, "nobody has taken part yet"
     configure(folder, ("A maze", "A third study"))
-    town.put("maze/users/ada/participant.json", b"{}")
-    before = town.project()
-    ran = town.run(capsys, "register", str(folder))
+    register_world.put("maze/users/ada/participant.json", b"{}")
+    before = register_world.project()
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DECLINED
     assert "is called A second study, and this one A third study" in ran.err
-    assert town.project() == before
-    assert town.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
-    assert town.project().name == "A third study"
+    assert register_world.project() == before
+    assert register_world.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
+    assert register_world.project().name == "A third study"
 
 
 # --- only looking -------------------------------------------------------------------------------------------------
 
 
-def test_a_dry_run_says_everything_and_does_nothing(town: Town, folder: Path, capsys: Capsys) -> None:
-    steps = town.run(capsys, "register", str(folder), "--dry-run", "--json").json["steps"]
+def test_a_dry_run_shows_every_change_and_makes_none(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    steps = register_world.run(capsys, "register", str(folder), "--dry-run", "--json").json["steps"]
     assert [step.split()[0] for step in steps] == ["upload", "upload", "upload", "build", "make", "register"]
-    assert town.keys() == []
-    assert (town.builds, town.revisions()) == ([], [])
-    town.run(capsys, "register", str(folder))
-    ran = town.run(capsys, "register", str(folder), "--dry-run")
+    assert register_world.keys() == []
+    assert (register_world.builds, register_world.revisions()) == ([], [])
+    register_world.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder), "--dry-run")
     assert (ran.code, "Nothing to do" in ran.out) == (Exit.DONE, True)
     (folder / "steps/maze.png").unlink()
-    before = (town.keys(), town.project())
-    ran = town.run(capsys, "register", str(folder), "--dry-run", "--no-live")
+    before = (register_world.keys(), register_world.project())
+    ran = register_world.run(capsys, "register", str(folder), "--dry-run", "--no-live")
     assert ran.code == Exit.CHANGES
     assert "remove maze/steps/maze.png" in ran.out
     assert "new version" in ran.out
-    assert (town.keys(), town.project()) == before
+    assert (register_world.keys(), register_world.project()) == before
 
 
 # --- the link -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "magic"), [("a.svg", b"<?xml"), ("a.PNG", b"\x89PNG"), ("a.pdf", b"%PDF")])
-def test_a_qr_code_in_a_file(town: Town, folder: Path, tmp_path: Path, capsys: Capsys, name: str, magic: bytes) -> None:
-    ran = town.run(capsys, "register", str(folder), "--qr", str(tmp_path / name))
+def test_the_qr_code_can_be_written_to_a_file(
+    register_world: RegisterWorld, folder: Path, tmp_path: Path, capsys: Capsys, name: str, magic: bytes
+) -> None:
+    ran = register_world.run(capsys, "register", str(folder), "--qr", str(tmp_path / name))
     assert ran.code == Exit.DONE, ran.err
     assert (tmp_path / name).read_bytes().startswith(magic)
 
 
 @pytest.mark.parametrize("name", ["poster.docx", "nowhere/poster.svg"])
-def test_a_qr_code_that_cannot_be_written_is_told_first(town: Town, folder: Path, capsys: Capsys, name: str) -> None:
-    ran = town.run(capsys, "register", str(folder), "--qr", str(folder / name))
+def test_a_qr_code_that_cannot_be_written_stops_register_beforehand(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, name: str
+) -> None:
+    ran = register_world.run(capsys, "register", str(folder), "--qr", str(folder / name))
     assert ran.code == Exit.FAILED
-    assert town.made == []
+    assert register_world.made == []
 
 
 def test_on_a_terminal_the_qr_code_is_shown(
-    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert re.search("[▀▄█]{4}", ran.out)
 
 
-def test_no_link_is_shown_that_would_let_nobody_in(
-    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+def test_for_signed_links_register_shows_no_link_without_a_signature(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
     configure(folder, ("maxRuntime: 30", "signedLinks: true"))
-    answer = town.run(capsys, "register", str(folder), "--json").json
+    answer = register_world.run(capsys, "register", str(folder), "--json").json
     assert (answer["signedLinks"], answer["link"]) == (True, None)
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert "/next?" not in ran.out
     assert not re.search("[▀▄█]", ran.out)
     assert "python -m deploy links --project maze --new 50" in ran.out
-    made = town.run(capsys, "links", "--project", "maze", "--new", "50")
+    made = register_world.run(capsys, "links", "--project", "maze", "--new", "50")
     assert made.out.count("&signature=") == 50
 
 
-def test_a_study_with_signed_links_has_no_qr_code(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_a_study_with_signed_links_has_no_qr_code(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     configure(folder, ("maxRuntime: 30", "signedLinks: true"))
-    ran = town.run(capsys, "register", str(folder), "--qr", str(folder.parent / "a.svg"))
+    ran = register_world.run(capsys, "register", str(folder), "--qr", str(folder.parent / "a.svg"))
     assert ran.code == Exit.FAILED
     assert "each participant has a link of their own" in ran.err
-    assert town.made == []
-    closed = town.run(capsys, "register", str(folder), "--no-live", "--qr", str(folder.parent / "a.svg"))
+    assert register_world.made == []
+    closed = register_world.run(capsys, "register", str(folder), "--no-live", "--qr", str(folder.parent / "a.svg"))
     assert closed.code == Exit.DONE
     assert "each participant has a link of their own" in closed.err
     assert not (folder.parent / "a.svg").exists()
 
 
-def test_the_link_is_the_one_in_the_documents() -> None:
+def test_recruiting_md_shows_the_form_of_the_link() -> None:
     text = (ROOT / "docs/recruiting.md").read_text()
     assert "https://…/next?projectId=your-project" in text
 
 
-def test_the_documented_options_exist(town: Town, capsys: Capsys) -> None:
-    shown = town.run(capsys, "register", "--help").out
+def test_the_documented_options_exist(register_world: RegisterWorld, capsys: Capsys) -> None:
+    shown = register_world.run(capsys, "register", "--help").out
     for option in re.findall(r"`(--[a-z-]+)", (ROOT / "docs/aws-project.md").read_text()):
         assert option in shown

@@ -14,9 +14,9 @@ from deploy.study import pages
 from hippodrome import registry
 from hippodrome.registry import NotRegistered
 from testing.files import write_files
-from tests.deploy.registering import CONFIG, Town, configure, folder, machine, town, write_study
+from tests.deploy.registering import CONFIG, RegisterWorld, configure, folder, machine, register_world, write_study
 
-__all__ = ["folder", "machine", "town"]
+__all__ = ["folder", "machine", "register_world"]
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]
 
@@ -44,47 +44,57 @@ Capsys = pytest.CaptureFixture[str]
         ([("trial:", "trail:")], "config.yml:8:"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_told_before_anything_is_sent(
-    town: Town, folder: Path, capsys: Capsys, changes: list[tuple[str, str]], said: str
+def test_mistakes_are_reported_before_anything_is_sent(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, changes: list[tuple[str, str]], said: str
 ) -> None:
     configure(folder, *changes)
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert said in ran.err
     assert "→" in ran.err
-    assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(town.made)
+    assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(
+        register_world.made
+    )
 
 
-def test_all_mistakes_come_at_once(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_all_mistakes_are_reported_at_once(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     configure(
         folder,
         ("maxRuntime: 30", "subdomain: userId"),
         ("memory: 2", "memory: 2, rootDomain: other.org, region: eu-west-1"),
     )
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert "3 mistakes" in ran.err
     assert len(re.findall(r"config\.yml:\d", ran.err)) == 3
 
 
-def test_what_the_installation_has_may_be_said_too(town: Town, folder: Path, capsys: Capsys) -> None:
-    same = f"memory: 2, bucket: {town.env['BUCKET']}, region: us-east-1, rootDomain: Example.org"
-    ssl = f"ssl: {{sslBucket: {town.env['BUCKET']}, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}}"
+def test_keys_that_repeat_the_installation_are_accepted(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    same = f"memory: 2, bucket: {register_world.env['BUCKET']}, region: us-east-1, rootDomain: Example.org"
+    ssl = f"ssl: {{sslBucket: {register_world.env['BUCKET']}, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}}"
     configure(folder, ("memory: 2", same), ("maxRuntime: 30", ssl))
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
 
 
-def test_with_strict_a_remark_is_told_before_anything_is_done(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_with_strict_a_remark_stops_register_beforehand(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
     configure(folder, ("trial:", "trial:\n  rows: 6"))
-    ran = town.run(capsys, "register", str(folder), "--strict")
+    ran = register_world.run(capsys, "register", str(folder), "--strict")
     assert ran.code == Exit.FAILED
     assert "config.yml:9: remark: trial.rows: no key of Hippodrome's" in " ".join(ran.err.split())
-    assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(town.made)
-    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
-    assert town.project().trial["options"] == {"rows": 6}
+    assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(
+        register_world.made
+    )
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    assert register_world.project().trial["options"] == {"rows": 6}
 
 
-def test_a_clone_of_hippo_gym_is_registered_as_it_is(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_clone_of_hippo_gym_is_registered_as_it_is(
+    register_world: RegisterWorld, tmp_path: Path, capsys: Capsys
+) -> None:
     """Its pages, its agent in App/, its id with an underscore, and nothing of HIPPO's own programs on the way."""
     files = {
         "config.yml": """\
@@ -109,18 +119,20 @@ trial:
         "Dockerfile": "FROM python:3.7\n",
     }
     clone = write_files(tmp_path / "clone", files)
-    ran = town.run(capsys, "register", str(clone))
+    ran = register_world.run(capsys, "register", str(clone))
     assert ran.code == Exit.DONE, ran.err
     assert "projectId=old_study_2" in ran.out
-    assert town.keys("old_study_2/steps/") == ["old_study_2/steps/bye.html", "old_study_2/steps/hello.html"]
-    project = town.project("old_study_2")
+    assert register_world.keys("old_study_2/steps/") == ["old_study_2/steps/bye.html", "old_study_2/steps/hello.html"]
+    project = register_world.project("old_study_2")
     assert [step.page for step in project.steps] == ["hello", "game", "bye"]
     assert project.trial["options"] == {"modality": "demo"}
     assert project.task_definition.split("/")[-1] == "hippodrome-old_study_2:1"
-    assert town.run(capsys, "register", str(clone), "--dry-run").code == Exit.DONE, "nothing is left to do"
+    assert register_world.run(capsys, "register", str(clone), "--dry-run").code == Exit.DONE, "nothing is left to do"
 
 
-def test_a_template_of_hippo_gym_is_registered_with_its_last_page(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_template_of_hippo_gym_is_registered_with_its_last_page(
+    register_world: RegisterWorld, tmp_path: Path, capsys: Capsys
+) -> None:
     clone = tmp_path / "blank"
     (clone / "App").mkdir(parents=True)
     (clone / "App/agent.py").write_text("class Agent:\n    pass\n")
@@ -128,92 +140,98 @@ def test_a_template_of_hippo_gym_is_registered_with_its_last_page(town: Town, tm
         "project: {useAWS: true, awsSetup: {cpu: , memory: }, id: blank, steps: {1: , finalStep: }}\n"
         "trial: {game: CartPole-v1}\n"
     )
-    ran = town.run(capsys, "register", str(clone))
+    ran = register_world.run(capsys, "register", str(clone))
     assert ran.code == Exit.DONE, ran.err
-    assert town.keys("blank/steps/") == ["blank/steps/hippodrome-the-end.html"]
-    assert b"Thank you" in town.get("blank/steps/hippodrome-the-end.html")
+    assert register_world.keys("blank/steps/") == ["blank/steps/hippodrome-the-end.html"]
+    assert b"Thank you" in register_world.get("blank/steps/hippodrome-the-end.html")
 
 
 @pytest.mark.parametrize(
     ("use", "said"), [("useAWS: true, ", "missing; give the project an id"), ("", "is empty; on AWS")]
 )
 def test_a_study_without_an_id_is_not_registered_by_the_name_of_its_folder(
-    town: Town, tmp_path: Path, capsys: Capsys, use: str, said: str
+    register_world: RegisterWorld, tmp_path: Path, capsys: Capsys, use: str, said: str
 ) -> None:
     """Two clones of the same template would otherwise be one study."""
     clone = write_study(tmp_path / "HIPPO_Gym")
     configure(clone, ("id: maze", "id:"), ("  useAWS: true\n", f"  {use.rstrip(', ')}\n" if use else ""))
-    ran = town.run(capsys, "register", str(clone))
+    ran = register_world.run(capsys, "register", str(clone))
     assert ran.code == Exit.FAILED
     assert f"project.id: {said}" in " ".join(ran.err.split())
-    assert "lambda:Invoke" not in town.made
+    assert "lambda:Invoke" not in register_world.made
 
 
-def test_another_bucket_and_another_certificate_are_said_to_have_no_effect(
-    town: Town, folder: Path, capsys: Capsys
+def test_register_says_that_another_bucket_and_certificate_have_no_effect(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
 ) -> None:
     ssl = "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}"
     configure(folder, ("memory: 2", "memory: 2, bucket: lab.projects"), ("maxRuntime: 30", ssl))
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
     said = " ".join((ran.out + ran.err).split())
     assert "config.yml:4: remark: project.ssl: no effect: servers get the certificate of the installation" in said
-    here = town.env["BUCKET"]
+    here = register_world.env["BUCKET"]
     assert (
         f"config.yml:7: remark: project.awsSetup.bucket: no effect: it is lab.projects, and the study's pages and data are in {here}"
         in said
     )
-    assert town.project().aws_setup.bucket == here
+    assert register_world.project().aws_setup.bucket == here
 
 
-def test_a_runtime_beyond_the_installations_is_the_installations(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_a_longer_runtime_than_the_installations_is_reduced_to_it(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
     configure(folder, ("maxRuntime: 30", "maxRuntime: 600"))
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
     said = " ".join((ran.out + ran.err).split())
     assert (
         "config.yml:4: remark: project.maxRuntime: is 600 minutes; the installation hippodrome stops servers at 120"
         in said
     )
-    assert town.project().max_runtime == 120
+    assert register_world.project().max_runtime == 120
 
 
-def test_an_agent_that_python_cannot_read(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_an_agent_with_a_syntax_error_is_refused(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     (folder / "agent.py").write_text("class Agent:\n    def step(self\n        pass\n")
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert re.search(r"agent\.py:\d: Python cannot read this", ran.err)
-    assert town.made == []
+    assert register_world.made == []
 
 
-def test_no_folder(town: Town, tmp_path: Path, capsys: Capsys) -> None:
-    ran = town.run(capsys, "register", str(tmp_path / "nowhere"))
+def test_a_missing_folder_is_reported(register_world: RegisterWorld, tmp_path: Path, capsys: Capsys) -> None:
+    ran = register_world.run(capsys, "register", str(tmp_path / "nowhere"))
     assert (ran.code, "there is no such folder" in ran.err) == (Exit.FAILED, True)
-    ran = town.run(capsys, "register", str(tmp_path / "nowhere"), "--no-live")
+    ran = register_world.run(capsys, "register", str(tmp_path / "nowhere"), "--no-live")
     assert (ran.code, "there is no such folder" in ran.err) == (Exit.FAILED, True)
 
 
-def test_another_region_has_no_stack(town: Town, folder: Path, capsys: Capsys) -> None:
-    ran = town.run(capsys, "register", str(folder), "--region", "eu-west-1")
+def test_register_in_another_region_says_that_there_is_no_stack(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
+    ran = register_world.run(capsys, "register", str(folder), "--region", "eu-west-1")
     assert ran.code == Exit.FAILED
     assert "no stack named hippodrome in eu-west-1" in ran.err
 
 
 @pytest.mark.parametrize("name", ["link", "picture"])
-def test_pages_that_must_not_be_uploaded(town: Town, folder: Path, capsys: Capsys, name: str) -> None:
+def test_links_out_of_the_folder_and_large_pages_are_refused(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, name: str
+) -> None:
     if name == "link":
         (folder / "steps/keys.txt").symlink_to("/etc/passwd")
     else:
         (folder / "steps/film.mp4").write_bytes(b"x" * (pages.LIMIT_BYTES + 1))
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert ("link out of the project folder" if name == "link" else "larger than 4 MB") in ran.err
-    assert town.keys() == []
+    assert register_world.keys() == []
 
 
-def test_hidden_files_and_folders_are_no_pages(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_hidden_files_and_folders_are_not_uploaded(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
     write_study(folder, steps___DOT_DS_Store="x", steps__drafts__a_DOT_html="x")
-    assert town.run(capsys, "register", str(folder), "--json").json["pages"]["uploaded"] == 3
+    assert register_world.run(capsys, "register", str(folder), "--json").json["pages"]["uploaded"] == 3
 
 
 # --- failures on the way ------------------------------------------------------------------------------------------
@@ -231,37 +249,37 @@ def test_hidden_files_and_folders_are_no_pages(town: Town, folder: Path, capsys:
         ("lambda:Invoke", "ResourceNotFoundException", "would not invoke"),
     ],
 )
-def test_what_aws_refuses_is_a_sentence_and_the_next_run_goes_on(
-    town: Town, folder: Path, capsys: Capsys, action: str, code: str, said: str
+def test_a_refusal_of_aws_is_reported_in_a_sentence_and_the_next_run_finishes(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, action: str, code: str, said: str
 ) -> None:
-    town.fail(action, code)
-    ran = town.run(capsys, "register", str(folder))
+    register_world.fail(action, code)
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert said in ran.err
-    assert town.project() is None
-    ran = town.run(capsys, "register", str(folder))
+    assert register_world.project() is None
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
-    assert len(town.builds) <= 1
-    assert len(town.revisions()) == 1
+    assert len(register_world.builds) <= 1
+    assert len(register_world.revisions()) == 1
 
 
-def test_the_functions_objections_are_told(
-    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+def test_mistakes_that_the_function_finds_are_reported(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def objects(*_: object) -> None:
         raise NotRegistered(["project.maxRuntime is too long", "project.steps.1: consent.html has not been uploaded"])
 
     with monkeypatch.context() as patch:
         patch.setattr("hippodrome.registry.register", objects)
-        ran = town.run(capsys, "register", str(folder))
+        ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert "project.maxRuntime is too long" in ran.err
     assert "consent.html has not been uploaded" in ran.err
     assert LINK not in ran.out
 
 
-def test_a_function_that_is_older_than_a_key_of_the_study_is_to_be_brought_up_to_date(
-    town: Town, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+def test_register_advises_an_update_if_the_function_does_not_know_a_key(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Here the study has a key more; what the function says of it is the same."""
     known = registry.register
@@ -271,26 +289,28 @@ def test_a_function_that_is_older_than_a_key_of_the_study_is_to_be_brought_up_to
 
     with monkeypatch.context() as patch:
         patch.setattr("hippodrome.registry.register", older)
-        ran = town.run(capsys, "register", str(folder))
+        ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert "keyOfTomorrow: unknown key" in ran.err
     assert "The installation is older than this study: bring it up to date with `make deploy`" in ran.err
     assert LINK not in ran.out
 
 
-def test_a_function_that_fails_is_told(town: Town, folder: Path, capsys: Capsys) -> None:
-    town.function_error = True
-    ran = town.run(capsys, "register", str(folder))
+def test_a_failure_of_the_function_is_reported(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+    register_world.function_error = True
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
     assert "function that registers projects failed" in ran.err
 
 
-def test_ctrl_c_anywhere_leaves_nothing_half_seen(town: Town, tmp_path: Path, capsys: Capsys) -> None:
+def test_ctrl_c_at_any_change_leaves_no_half_registered_project(
+    register_world: RegisterWorld, tmp_path: Path, capsys: Capsys
+) -> None:
     """Interrupted after each change of a run in turn: the project is registered in full or not at all, and the next run
     completes it without uploading, building or making a revision twice."""
     whole = write_study(tmp_path / "whole", CONFIG.replace("id: maze", "id: whole"))
-    assert town.run(capsys, "register", str(whole)).code == Exit.DONE
-    calls = town.made
+    assert register_world.run(capsys, "register", str(whole)).code == Exit.DONE
+    calls = register_world.made
     assert calls[-1] == "lambda:Invoke"
     changes = {"s3:PutObject", "codebuild:StartBuild", "codebuild:BatchGetBuilds", "ecs:RegisterTaskDefinition"}
     places = [n for n, action in enumerate(calls) if not n or calls[n - 1] in changes or action == "lambda:Invoke"]
@@ -298,18 +318,18 @@ def test_ctrl_c_anywhere_leaves_nothing_half_seen(town: Town, tmp_path: Path, ca
     for place in places:
         what, name = (place, calls[place]), f"maze-{place}"
         folder = write_study(tmp_path / name, CONFIG.replace("id: maze", f"id: {name}"))
-        town.made, town.builds, town.calls, town.interrupt = [], [], [], place
-        ran = town.run(capsys, "register", str(folder))
+        register_world.made, register_world.builds, register_world.calls, register_world.interrupt = [], [], [], place
+        ran = register_world.run(capsys, "register", str(folder))
         assert ran.code == Exit.INTERRUPTED, what
         assert "goes on from here" in ran.err
-        assert town.project(name) is None, what
-        town.interrupt = None
-        ran = town.run(capsys, "register", str(folder))
+        assert register_world.project(name) is None, what
+        register_world.interrupt = None
+        ran = register_world.run(capsys, "register", str(folder))
         assert ran.code == Exit.DONE, (what, ran.err)
-        assert [town.project(name).task_definition] == town.revisions(f"hippodrome-{name}"), what
-        assert len(town.keys(f"{name}/steps/")) == 3
-        assert len(town.builds) == 1, what
-        written = [call.params["Key"] for call in town.calls if call.action == "s3:PutObject"]
+        assert [register_world.project(name).task_definition] == register_world.revisions(f"hippodrome-{name}"), what
+        assert len(register_world.keys(f"{name}/steps/")) == 3
+        assert len(register_world.builds) == 1, what
+        written = [call.params["Key"] for call in register_world.calls if call.action == "s3:PutObject"]
         cut_off = calls[place] == "s3:PutObject"  # it is counted, but never arrived
         assert len(set(written)) == len(written) - cut_off, what
 
@@ -317,11 +337,11 @@ def test_ctrl_c_anywhere_leaves_nothing_half_seen(town: Town, tmp_path: Path, ca
 # --- what the image lacks -----------------------------------------------------------------------------------------
 
 
-def test_a_package_that_the_image_lacks_is_named_before_the_image_is_built(
-    town: Town, folder: Path, capsys: pytest.CaptureFixture[str]
+def test_a_missing_package_is_reported_before_the_build(
+    register_world: RegisterWorld, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_study(folder, agent_DOT_py="import numpy\nimport psutil\n\n\nclass Agent:\n    pass\n")
-    ran = town.run(capsys, "register", str(folder))
+    ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.DONE, ran.err
     line = f"write psutil=={version('psutil')} into requirements.txt"
     told = " ".join(ran.err.split())
@@ -330,4 +350,4 @@ def test_a_package_that_the_image_lacks_is_named_before_the_image_is_built(
     write_study(
         folder, agent_DOT_py="import psutil\n\n\nclass Agent:\n    pass\n", requirements_DOT_txt="psutil\nnumpy\n"
     )
-    assert "psutil==" not in town.run(capsys, "register", str(folder)).err
+    assert "psutil==" not in register_world.run(capsys, "register", str(folder)).err

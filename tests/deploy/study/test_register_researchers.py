@@ -17,16 +17,16 @@ from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import Judge, evaluator
 from tests.deploy.installation import KEYS
-from tests.deploy.registering import CONFIG, Town, folder, machine, town, write_study
+from tests.deploy.registering import CONFIG, RegisterWorld, folder, machine, register_world, write_study
 
-__all__ = ["folder", "machine", "town"]
+__all__ = ["folder", "machine", "register_world"]
 Capsys = pytest.CaptureFixture[str]
 
 
 # --- several people -----------------------------------------------------------------------------------------------
 
 
-def _together(town: Town, *folders: Path) -> list[dict[str, Any] | BaseException]:
+def _together(register_world: RegisterWorld, *folders: Path) -> list[dict[str, Any] | BaseException]:
     """Register these folders at the same moment."""
     account = open_account(region="us-east-1")
     installation = find_installation(account)
@@ -49,41 +49,43 @@ def _together(town: Town, *folders: Path) -> list[dict[str, Any] | BaseException
     return results
 
 
-def test_two_researchers_at_once_lose_nothing(town: Town, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_projects_registered_at_once_are_both_registered(
+    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     names = [f"study-{number}" for number in range(4)]
     folders = [write_study(tmp_path / name, CONFIG.replace("id: maze", f"id: {name}")) for name in names]
-    results = _together(town, *folders)
+    results = _together(register_world, *folders)
     assert [result["project"] for result in results] == names, results
     for name in names:
-        project = town.project(name)
+        project = register_world.project(name)
         assert project is not None
-        assert [project.task_definition] == town.revisions(f"hippodrome-{name}")
-        assert len(town.keys(f"{name}/steps/")) == 3
+        assert [project.task_definition] == register_world.revisions(f"hippodrome-{name}")
+        assert len(register_world.keys(f"{name}/steps/")) == 3
 
 
-def test_of_two_who_register_the_same_study_one_wins_whole(
-    town: Town, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_two_versions_registered_at_once_both_succeed_and_share_one_image(
+    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     folders = [
         write_study(tmp_path / who, CONFIG.replace("A maze", who), steps__thanks_DOT_html=who) for who in ("Ada", "Bob")
     ]
-    results = _together(town, *folders)
+    results = _together(register_world, *folders)
     assert all(isinstance(result, dict) for result in results), results
-    assert town.project().name in ("Ada", "Bob")
-    assert town.get("maze/steps/thanks.html") in (b"Ada", b"Bob")
-    assert len(town.image_tags()) == 1
+    assert register_world.project().name in ("Ada", "Bob")
+    assert register_world.get("maze/steps/thanks.html") in (b"Ada", b"Bob")
+    assert len(register_world.image_tags()) == 1
 
 
 # --- what a researcher must be allowed ----------------------------------------------------------------------------
 
 
-def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
+def _asks(register_world: RegisterWorld, action: str, params: dict[str, Any]) -> list[Ask]:
     """What a call of `register` needs, by AWS's Service Authorization Reference."""
-    here, bucket = f"us-east-1:{ACCOUNT}", f"arn:aws:s3:::{town.env['BUCKET']}"
+    here, bucket = f"us-east-1:{ACCOUNT}", f"arn:aws:s3:::{register_world.env['BUCKET']}"
     stack, families = f"arn:aws:cloudformation:{here}:stack/hippodrome/1", f"arn:aws:ecs:{here}:task-definition"
     service, operation = action.split(":")
     if service == "s3":
@@ -103,7 +105,7 @@ def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
             "ecr:DescribeImages": Ask(action, f"arn:aws:ecr:{here}:repository/hippodrome"),
             "ecs:DescribeTaskDefinition": Ask(action, "*"),
             "lambda:Invoke": Ask(
-                "lambda:InvokeFunction", f"arn:aws:lambda:{here}:function:{town.outputs['RegisterFunction']}"
+                "lambda:InvokeFunction", f"arn:aws:lambda:{here}:function:{register_world.outputs['RegisterFunction']}"
             ),
             "logs:GetLogEvents": Ask(
                 action, f"arn:aws:logs:{here}:log-group:/hippodrome/hippodrome/image:log-stream:1"
@@ -113,22 +115,24 @@ def _asks(town: Town, action: str, params: dict[str, Any]) -> list[Ask]:
 
 
 @pytest.mark.skipif(evaluator() is None, reason="no evaluator of policies is installed; tests/infra says so aloud")
-def test_researchers_may_do_all_of_it_and_not_more(town: Town, folder: Path, capsys: Capsys) -> None:
+def test_the_researchers_policy_allows_register_and_refuses_more(
+    register_world: RegisterWorld, folder: Path, capsys: Capsys
+) -> None:
     repository, builder = f"arn:aws:ecr:us-east-1:{ACCOUNT}:repository/hippodrome", "hippodrome-image"
-    account = account_of(town)
-    function = f"arn:aws:lambda:us-east-1:{ACCOUNT}:function:{town.outputs['RegisterFunction']}"
+    account = account_of(register_world)
+    function = f"arn:aws:lambda:us-east-1:{ACCOUNT}:function:{register_world.outputs['RegisterFunction']}"
     project = f"arn:aws:codebuild:us-east-1:{ACCOUNT}:project/{builder}"
     known = {"Repository.Arn": repository, "ImageBuilder.Arn": project, "UpdateProjectMasterList.Arn": function}
     judge = Judge(dataclasses.replace(account, known={**account.known, **known}))
-    assert town.run(capsys, "register", str(folder)).code == Exit.DONE
+    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
     (folder / "steps/maze.png").unlink()
     (folder / "agent.py").write_text("class Agent:\n    x = 1\n")
-    assert town.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
-    assert "s3:DeleteObject" in town.made
-    for action, params in town.asked:
-        for ask in _asks(town, action, params):
+    assert register_world.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
+    assert "s3:DeleteObject" in register_world.made
+    for action, params in register_world.asked:
+        for ask in _asks(register_world, action, params):
             assert judge.may("ResearcherPolicy", ask), ask
-    bucket = f"arn:aws:s3:::{town.env['BUCKET']}"
+    bucket = f"arn:aws:s3:::{register_world.env['BUCKET']}"
     for ask in (
         Ask("s3:PutObject", f"{bucket}/project_master_list.json"),
         Ask("s3:PutObject", f"{bucket}/maze/users/ada/answers/1.json"),

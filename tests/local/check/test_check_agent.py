@@ -439,7 +439,7 @@ def test_without_a_game_the_agent_does_not_matter(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("source", [b"x = '\xff'", b"\0", b"(", b"  x", b"return"])
-def test_an_agent_that_python_cannot_read(folder: Path, source: bytes) -> None:
+def test_an_agent_with_a_syntax_error_is_refused(folder: Path, source: bytes) -> None:
     (folder / "agent.py").write_bytes(source)
     (line,) = looked(folder)
     assert line.startswith("agent.py")
