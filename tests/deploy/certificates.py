@@ -11,7 +11,7 @@ from cryptography.x509.oid import NameOID
 
 
 def chain(*names: str, days: float = 60, issuer: str = "R12", lifetime: float = 90) -> bytes:
-    """A certificate (PEM) for these names that is valid for so many days from now, less than none for an expired one.
+    """A certificate (PEM) for these names that is valid for `days` days from now; a negative number makes an expired one.
 
     `lifetime` is how many days it was valid for when it was made.
     """

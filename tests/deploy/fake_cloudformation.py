@@ -1,4 +1,4 @@
-"""CloudFormation with a script: stacks, change sets and events in the shapes of the real answers.
+"""A fake CloudFormation that follows a script: stacks, change sets and events in the shapes of the real answers.
 
 moto's CloudFormation says CREATE_COMPLETE of whatever it skips and never fails by itself. This one does what it is told:
 `operations` is what comes of the next execute, delete or continue, a list of steps; each look at the stack takes one.
@@ -20,8 +20,8 @@ from typing import Any
 from botocore.exceptions import ClientError
 
 Event = tuple[str, str, str, str]  # logical id, type, status, reason
-Step = tuple[str, list[Event]]  # the stack's status, and what happens then
-DELETABLE = {"CREATE_IN_PROGRESS", "DELETE_IN_PROGRESS", "REVIEW_IN_PROGRESS"}  # of those in which something goes on
+Step = tuple[str, list[Event]]  # the stack's status, and the events of this step
+DELETABLE = {"CREATE_IN_PROGRESS", "DELETE_IN_PROGRESS", "REVIEW_IN_PROGRESS"}  # statuses of an operation in progress
 
 UPDATABLE = {  # by a change set
     "CREATE_COMPLETE",
@@ -51,25 +51,29 @@ class FakeCloudFormation:
         self.resources: list[dict[str, Any]] = []
         self.changes: list[dict[str, Any]] | None = None  # of the next change set; None: what the template adds
         self.change_set: dict[str, Any] | None = None
-        self.change_sets: dict[str, str] = {}  # ours that were neither executed nor deleted: names by ids
-        self.failing = ""  # why the next change set fails
-        self.validation: Callable[[], list[dict[str, str]]] = list  # what is found wrong when a change set is made
-        self.found: list[dict[str, str]] = []  # what was found wrong with the last one
+        self.change_sets: dict[
+            str, str
+        ] = {}  # change sets of ours that were neither executed nor deleted: names by ids
+        self.failing = ""  # the reason for which the next change set fails
+        self.validation: Callable[[], list[dict[str, str]]] = (
+            list  # the findings of validation when a change set is made
+        )
+        self.found: list[dict[str, str]] = []  # the findings on the last change set
         self.operations: list[list[Step]] = []
         self.making: Callable[[dict[str, Any]], str] | None = None
         self.deleting: Callable[[dict[str, Any]], str] | None = None
-        self.clock: Callable[[], datetime] | None = None  # else a second passes with each event
+        self.clock: Callable[[], datetime] | None = None  # without it, a second passes with each event
         self.past: list[tuple[dict[str, Any], list[dict[str, Any]], list[dict[str, Any]]]] = []
         self.script: list[Step | Callable[[], Step]] = []
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.outputs: dict[str, str] = {}
-        self.interrupt_after = 10**9  # looks at the stack until somebody presses Ctrl-C
+        self.interrupt_after = 10**9  # the number of looks at the stack before Ctrl-C
         self.others: list[dict[str, Any]] = []
         self._ids = itertools.count(1)
         self._now = datetime(2026, 11, 1, tzinfo=UTC)
         self.templates: dict[str, str] = {}
 
-    # -- telling it what there is
+    # -- setting its state
 
     def stand(self, status: str, parameters: dict[str, str], text: str = "", name: str = "hippodrome") -> None:
         self.stack = {
@@ -262,7 +266,7 @@ class FakeCloudFormation:
             self._event(logical, kind, state, reason)
 
     def _making(self) -> Step:
-        """Everything is made or, as soon as something is refused, taken back."""
+        """The steps of a creation: everything is made or, once something is refused, rolled back."""
         assert self.making
         events: list[Event] = []
         for one in self.resources:
@@ -275,7 +279,7 @@ class FakeCloudFormation:
         return "CREATE_COMPLETE", events
 
     def _deleting(self) -> Step:
-        """Everything that can be is deleted, the last that was made first."""
+        """The steps of a deletion: everything that can be deleted is deleted, in the reverse order of its creation."""
         assert self.deleting
         events: list[Event] = []
         for one in reversed(self.resources):
@@ -318,7 +322,7 @@ def happy(kind: str) -> list[Step]:
 
 
 def invalid(name: str, reason: str, mode: str = "FAIL", status: str = "FAILED") -> dict[str, str]:
-    """What validation before deployment says of a resource (API Reference, OperationEvent)."""
+    """A finding of validation before deployment on a resource (API Reference, OperationEvent)."""
     return {
         "EventType": "VALIDATION_ERROR",
         "LogicalResourceId": name,

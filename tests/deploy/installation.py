@@ -57,7 +57,7 @@ class CommandResult:
 
     @property
     def json(self) -> Any:
-        """The answer; nothing but JSON may be on stdout."""
+        """The JSON on stdout; anything else there is an error."""
         return json.loads(self.out)
 
 
@@ -88,9 +88,10 @@ class Installed(MotoWorld):
         self.stack(self.template())
 
     def _secure_bucket(self) -> None:
-        """As the template makes it, but for the policy.
+        """Give the bucket the settings of the template, without the policy.
 
-        Gap: moto judges a bucket policy without its conditions, so that one that only asks for TLS locks everybody out.
+
+        Gap: moto ignores the conditions of a bucket policy, so the policy that requires TLS would refuse every request.
         """
         s3, bucket = self.client("s3"), self.env["BUCKET"]
         names = ["BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets"]
@@ -159,19 +160,19 @@ class Installed(MotoWorld):
         )
 
     def change(self, **outputs: str) -> None:
-        """Let the stack have these outputs from now on."""
+        """Change outputs of the stack."""
         self._changes |= outputs
         self.client("cloudformation").update_stack(StackName=STACK, TemplateBody=json.dumps(self.template()))
 
     def stack_status(self, status: str, name: str = STACK) -> None:
-        """Let the stack be in some state."""
+        """Set the status of the stack."""
         from moto.cloudformation.models import cloudformation_backends
 
         for stack in cloudformation_backends[ACCOUNT][self.region].stacks.values():
             if stack.name == name:
                 stack.status = status
 
-    # -- what people did ------------------------------------------------------------------------------------------
+    # -- participants and servers ------------------------------------------------------------------------------------------
 
     def put(self, key: str, body: bytes) -> None:
         self.client("s3").put_object(Bucket=self.env["BUCKET"], Key=key, Body=body)
@@ -184,13 +185,13 @@ class Installed(MotoWorld):
         return [line["Key"] for page in pages for line in page.get("Contents", ())]
 
     def register(self, *projects: Project) -> None:
-        """Put projects into the master list, as they are."""
+        """Write these projects into the master list, without any check."""
         self.put(MASTER_LIST, to_json(MasterList(sorted(projects or [study()], key=lambda p: p.id))))
 
     def participant(
         self, user: str, *, answered: int = 0, project: Project | None = None, recordings: int = 0, **link: str
     ) -> None:
-        """Somebody who has come and has answered that many steps."""
+        """Store a participant who has answered the first `answered` steps."""
         project = project or study()
         now = datetime.now(UTC)
         arrival = Participant(project.id, user, now, project.group(user), "CODE", link)
@@ -209,7 +210,7 @@ class Installed(MotoWorld):
     def record(
         self, user: str, state: ServerState = ServerState.READY, project: Project | None = None, **changes: Any
     ) -> Server:
-        """A server's record in the bucket, requested ten minutes ago."""
+        """Store the record of a server that was requested ten minutes ago."""
         project = project or study()
         then = datetime.now(UTC) - timedelta(minutes=10)
         attempt = changes.pop("attempt", 1)
@@ -224,7 +225,7 @@ class Installed(MotoWorld):
         return made
 
     def warm(self, project: Project, number: int) -> list[str]:
-        """Start warm servers for participants of a registered project, and make them ready; their names."""
+        """Start warm servers of a registered project, and make them ready. Returns their names."""
         servers, repository, before = Servers(self.platform), Repository(self.platform.documents), set(self.task_arns())
         now = datetime.now(UTC)
         new = Pool().with_new(project, number, now)
@@ -244,7 +245,7 @@ class Installed(MotoWorld):
     # -- commands -------------------------------------------------------------------------------------------------
 
     def run(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> CommandResult:
-        """Run a command in this process, as its users do."""
+        """Run a command in this process with the arguments of its command line."""
         capsys.readouterr()
         with pytest.MonkeyPatch.context() as patch:
             for name, value in KEYS.items():
@@ -256,7 +257,7 @@ class Installed(MotoWorld):
 
     @contextlib.contextmanager
     def served(self) -> Iterator[dict[str, str]]:
-        """The same account behind a real HTTP server on loopback: the environment for processes that should use it."""
+        """Put a real HTTP server on loopback before this account. Yields the environment for processes that use it."""
         from moto.server import ThreadedMotoServer
 
         server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
@@ -271,7 +272,7 @@ class Installed(MotoWorld):
 
 
 def environment(endpoint: str = "") -> dict[str, str]:
-    """What a command's process gets to see: no settings of whoever runs the tests."""
+    """The environment of a command's process, without settings of the person who runs the tests."""
     kept = {name: os.environ[name] for name in ("PATH", "LANG", "LC_ALL", "TMPDIR") if name in os.environ}
     more = {"AWS_ENDPOINT_URL": endpoint} if endpoint else {}
     quiet = {

@@ -21,7 +21,7 @@ BALANCER = "arn:aws:elasticloadbalancing:ca-central-1:987654321098:loadbalancer/
 
 
 class Clock:
-    """Time that passes when somebody sleeps."""
+    """A clock whose time passes only in `sleep`."""
 
     def __init__(self) -> None:
         self.time = datetime.now(UTC)
@@ -40,7 +40,7 @@ class Clock:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """While AWS itself does something, which nobody's Ctrl-C interrupts."""
+        """Mark that AWS itself acts, which Ctrl-C does not interrupt."""
         before, self.aws = self.aws, True
         try:
             yield
@@ -52,7 +52,7 @@ class Clock:
 
 
 class RealStack:
-    """Makes the things, and is what CloudFormation asks of each when it deletes or makes it."""
+    """Makes the stack's resources in moto, and decides which of their creations and deletions AWS refuses."""
 
     in_use = (
         4 * 60
@@ -61,7 +61,9 @@ class RealStack:
     def __init__(self, world: World, clock: Clock) -> None:
         self.world, self.clock = world, clock
         self.deleted: dict[str, datetime] = {}  # queues
-        self.refused_until = clock.time  # of the certificate, whatever ACM says uses it
+        self.refused_until = (
+            clock.time
+        )  # until then the certificate's deletion is refused, whatever ACM lists as its users
         self.client = world.account.client
         self.cloud = world.cloud
         self.cloud.clock = lambda: clock.time
@@ -69,7 +71,7 @@ class RealStack:
         self.make_all()
 
     def make_all(self) -> None:
-        """What an installation is made of, as far as its deletion may be refused."""
+        """Make the resources of an installation whose deletion AWS may refuse."""
         ec2 = self.client("ec2")
         self.vpc = ec2.create_vpc(CidrBlock="10.86.0.0/16")["Vpc"]["VpcId"]
         self.subnet = ec2.create_subnet(VpcId=self.vpc, CidrBlock="10.86.64.0/18")["Subnet"]["SubnetId"]
@@ -111,7 +113,7 @@ class RealStack:
         return ""
 
     def certificate_users(self) -> list[str]:
-        """What ACM says uses the certificate: moto's own list."""
+        """The users of the certificate that ACM lists: moto's own list."""
         return acm_backends[ACCOUNT][REGION]._certificates[self.certificate].in_use_by
 
     def _delete_SiteDomain(self) -> str:
@@ -172,7 +174,7 @@ class RealStack:
     # -- what people and AWS do
 
     def attach(self, user: str = "", group: str = "", role: str = "") -> None:
-        """Give the researchers' policy to somebody."""
+        """Attach the researchers' policy to a user, a group or a role."""
         iam = self.client("iam")
         if user:
             iam.create_user(UserName=user)
@@ -185,7 +187,7 @@ class RealStack:
             iam.attach_role_policy(RoleName=role, PolicyArn=self.policy)
 
     def delete_zone(self) -> None:
-        """The hosted zone, by hand: Route 53 deletes an empty one only."""
+        """Delete the hosted zone and its records, as a person would (Route 53 deletes only an empty zone)."""
         client = self.client("route53")
         for one in client.list_resource_record_sets(HostedZoneId=self.world.zone)["ResourceRecordSets"]:
             if one["Type"] not in {"NS", "SOA"}:
@@ -194,7 +196,7 @@ class RealStack:
         client.delete_hosted_zone(Id=self.world.zone)
 
     def add_interface(self, seconds: float) -> None:
-        """An interface of a task that has ended, which AWS takes away after so long."""
+        """Add the network interface of a task that has ended, which AWS removes after so many seconds."""
         ec2 = self.client("ec2")
         made = ec2.create_network_interface(SubnetId=self.subnet)["NetworkInterface"]["NetworkInterfaceId"]
         self.clock.after(seconds, lambda: ec2.delete_network_interface(NetworkInterfaceId=made))
@@ -204,7 +206,7 @@ POLICY = '{"Version":"2012-10-17","Statement":[{"Effect":"Allow","Action":"s3:Li
 
 
 def passed_on(sentence: str, service: str) -> str:
-    """As CloudFormation passes on what a service says."""
+    """The message of a service in the form in which CloudFormation passes it on."""
     return (
         f'Resource handler returned message: "{sentence} (Service: {service}, Status Code: 400, Request ID: 0a1b)" '
         "(RequestToken: 9fd5, HandlerErrorCode: GeneralServiceException)"
@@ -216,13 +218,13 @@ def resource(logical: str, kind: str, physical: str) -> dict[str, Any]:
 
 
 def request_certificate(world: World, domain: str, region: str = REGION) -> str:
-    """A certificate that is validated by DNS."""
+    """Request a certificate that is validated by DNS. Returns its ARN."""
     acm = world.account.client("acm", region)
     return str(acm.request_certificate(DomainName=domain, ValidationMethod="DNS")["CertificateArn"])
 
 
 def validation_record(world: World, arn: str) -> str:
-    """The name of the certificate's record, put into the zone as CloudFormation does."""
+    """Put the certificate's validation record into the zone, as CloudFormation does. Returns its name."""
     described = world.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
     record = described["DomainValidationOptions"][0]["ResourceRecord"]
     put_cname(world, record["Name"], record["Value"])
@@ -230,7 +232,7 @@ def validation_record(world: World, arn: str) -> str:
 
 
 def put_cname(world: World, name: str, value: str) -> None:
-    """A CNAME in the zone."""
+    """Put a CNAME into the zone."""
     change = {
         "Action": "UPSERT",
         "ResourceRecordSet": {"Name": name, "Type": "CNAME", "TTL": 300, "ResourceRecords": [{"Value": value}]},
@@ -241,7 +243,7 @@ def put_cname(world: World, name: str, value: str) -> None:
 
 
 def same_record(world: World, arn: str, like: str, region: str) -> None:
-    """Give a certificate the validation record of another: ACM's is the same for a name in all of an account."""
+    """Give a certificate the validation record of another: within an account, ACM's is the same for the same name."""
     told = acm_backends[ACCOUNT][REGION]._certificates[like]
     other = acm_backends[ACCOUNT][region]._certificates[arn]
     record = told.describe()["Certificate"]["DomainValidationOptions"][0]["ResourceRecord"]
@@ -257,7 +259,7 @@ def same_record(world: World, arn: str, like: str, region: str) -> None:
 
 
 def zone_records(world: World) -> set[tuple[str, str]]:
-    """The records of the zone, but for its own."""
+    """The zone's records without NS and SOA: names and types."""
     found = world.account.client("route53").list_resource_record_sets(HostedZoneId=world.zone)["ResourceRecordSets"]
     return {(one["Name"], one["Type"]) for one in found if one["Type"] not in {"NS", "SOA"}}
 

@@ -1,4 +1,4 @@
-"""The image without Docker, for tests: the Dockerfile's instructions, and what they come to in a folder."""
+"""The image without Docker, for tests: the Dockerfile's instructions are read, and carried out in a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass
 class Recipe:
-    """A Dockerfile as far as ours goes: its instructions, and what they come to."""
+    """A Dockerfile with the instructions that ours uses."""
 
     steps: list[tuple[str, str]] = field(default_factory=list)
 
@@ -43,7 +43,7 @@ class Recipe:
 
 
 def stages() -> list[Recipe]:
-    """The parts of the Dockerfile, each from its FROM; what stands before the first belongs to that."""
+    """The stages of the Dockerfile, each from its FROM; lines before the first FROM belong to the first stage."""
     first, *others = re.split(r"(?m)^(?=FROM )", (ROOT / "infra/Dockerfile").read_text())
     return [Recipe.of(first + others[0]), *map(Recipe.of, others[1:])]
 
@@ -55,7 +55,7 @@ def recipe() -> Recipe:
 
 
 class Container:
-    """The image without Docker: what COPY copies, ENV sets and CMD runs, below a folder that stands for /."""
+    """The image without Docker: COPY, ENV and CMD are carried out below a folder that stands for /."""
 
     def __init__(
         self, recipe: Recipe, context: Path, root: Path, env: dict[str, str], command: list[str] | None = None
@@ -80,7 +80,7 @@ class Container:
         self.process = subprocess.Popen(
             [sys.executable, *command[1:]],
             cwd=root / recipe.all("WORKDIR")[0].lstrip("/"),
-            env={**told, **env},  # and nothing of this machine
+            env={**told, **env},  # and no variables of this machine
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -64,13 +64,13 @@ class Build:
 class RegisterWorld(Installed):
     """`Installed` with what `register` calls."""
 
-    looks: int = 2  # at a build until it ends
+    looks: int = 2  # looks at a build until it ends
     outcome: str = "SUCCEEDED"
     log: list[str] = field(default_factory=lambda: ["[Container] docker buildx build", "#12 pushing layers done"])
     push: bool = True  # whether a build that succeeds leaves an image
     builds: list[Build] = field(default_factory=list)
     function_error: bool = False
-    interrupt: int | None = None  # the call of a command, counted from 0, at which somebody presses Ctrl-C
+    interrupt: int | None = None  # the call of a command, counted from 0, at which Ctrl-C is pressed
     made: list[str] = field(default_factory=list)  # the calls of commands, not of functions
     asked: list[tuple[str, dict[str, Any]]] = field(default_factory=list)  # the same with their parameters
     docker: Path | None = None  # the folder of `fake_docker`
@@ -91,7 +91,7 @@ class RegisterWorld(Installed):
 
     @property
     def outputs(self) -> dict[str, str]:
-        """With the role that `MotoWorld` has: start_server may pass no other."""
+        """The outputs with `MotoWorld`'s role, because start_server may pass no other."""
         return {**super().outputs, "TaskExecutionRole": self.ids["task_execution_role"]}
 
     def template(self) -> dict[str, Any]:
@@ -100,7 +100,7 @@ class RegisterWorld(Installed):
     # -- looking ------------------------------------------------------------------------------------------------------
 
     def project(self, project_id: str = "maze") -> Project | None:
-        """As it is registered."""
+        """The project as it is registered; None without a registration."""
         if MASTER_LIST not in self.keys():
             return None
         return from_json(self.get(MASTER_LIST), MasterList).find(project_id)
@@ -190,7 +190,7 @@ class RegisterWorld(Installed):
         }
 
     def put_image(self, tag: str) -> None:
-        """A push that has come to its end."""
+        """Store an image, as a finished push does."""
         digest = f"sha256:{abs(hash((tag, time.time_ns()))):064x}"[:71]
         manifest = {
             "schemaVersion": 2,
@@ -204,7 +204,7 @@ class RegisterWorld(Installed):
         )
 
     def _store_pushed(self) -> None:
-        """What `fake_docker` has pushed since."""
+        """Store the images that `fake_docker` has pushed since the last call."""
         pushed = self.docker / "pushed" if self.docker else None
         if pushed and pushed.exists():
             tags = pushed.read_text().split()
@@ -220,7 +220,7 @@ def _stream(body: bytes) -> StreamingBody:
 def fake_docker(
     folder: Path, *, engine: bool = True, buildx: bool = True, build: int = 0, says: str = "#1 DONE"
 ) -> Path:
-    """A `docker` for PATH: writes down how it was called, with the files of the context, and what it pushed."""
+    """A `docker` for PATH: it records its calls with the files of the context, and its pushes."""
     folder.mkdir(parents=True, exist_ok=True)
     script = folder / "docker"
     script.write_text(
@@ -290,7 +290,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def configure(folder: Path, *changes: tuple[str, str]) -> None:
-    """Write the study's config.yml with these texts changed, (old, new)."""
+    """Replace texts of the study's config.yml: pairs of (old, new)."""
     text = CONFIG
     for old, new in changes:
         assert old in text
@@ -299,5 +299,5 @@ def configure(folder: Path, *changes: tuple[str, str]) -> None:
 
 
 def bodies(register_world: RegisterWorld) -> dict[str, bytes]:
-    """What the bucket holds of the study `maze`, by key."""
+    """The contents of the study `maze` in the bucket, by key."""
     return {key: register_world.get(key) for key in register_world.keys("maze/")}

@@ -72,11 +72,11 @@ def function(name: str, body: bytes = b"pass\n") -> build.Function:
     return build.Function(name, (member,), ())
 
 
-_clients: dict[tuple[str, str], Any] = {}  # making one takes longer than most tests
+_clients: dict[tuple[str, str], Any] = {}  # made once: it takes longer than most tests
 
 
 class Limits:
-    """What AWS allows the account. Gap: moto has no such quotas, and no account's settings."""
+    """The account's quotas and settings. Gap: moto has neither."""
 
     def __init__(self) -> None:
         self.executions = 1000
@@ -118,15 +118,15 @@ class WorldAccount(Account):
 
 
 class World:
-    """`account` for the commands, `cloud` to tell CloudFormation what happens."""
+    """An account: `account` is for the commands, `cloud` is the fake CloudFormation."""
 
     def __init__(self) -> None:
         self.cloud = FakeCloudFormation(REGION, ACCOUNT)
         self.limits = Limits()
         self.account = WorldAccount(self.cloud, self.limits)
-        self.docker = True  # whether one answers on this machine
-        self.delegated = Delegation(())  # what the Internet's DNS says of the zone
-        self.caa: dict[str, caa.Caa] = {}  # and which CAA records count for a name
+        self.docker = True  # whether Docker answers on this machine
+        self.delegated = Delegation(())  # the delegation of the zone in public DNS
+        self.caa: dict[str, caa.Caa] = {}  # the CAA records that count for a name
         self.functions = [function("next_step"), function("sweep"), function("unused")]
         self.text = TEMPLATE
         self.zone = self.make_zone(DOMAIN)
@@ -161,7 +161,7 @@ class World:
         } | changed
 
     def stand(self, status: str = "CREATE_COMPLETE", **changed: str) -> None:
-        """A stack as an earlier apply of this very template made it."""
+        """Let the stack exist, as an earlier apply of this template made it."""
         self.cloud.stand(status, self.parameters(**changed), self.built.text)
 
 
@@ -180,6 +180,6 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         monkeypatch.setattr(docker, "available", lambda: world.docker)
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
-        # Gap: moto judges bucket policies without their conditions, so the one against plain HTTP refuses everybody.
+        # Gap: moto ignores the conditions of bucket policies, so the one against plain HTTP would refuse every request.
         monkeypatch.setattr(FakeBucket, "get_permission", lambda *_: PermissionResult.NEUTRAL)
         yield world

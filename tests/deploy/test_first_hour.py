@@ -34,7 +34,7 @@ STUDY = "ms-pacman"
 
 
 class Terminal(io.StringIO):
-    """Somebody who sits there and types this."""
+    """A terminal at which a person types this."""
 
     def isatty(self) -> bool:
         return True
@@ -48,7 +48,7 @@ def running() -> Iterator[RunningInstallation]:
 
 
 def arguments(command: str) -> list[str]:
-    """What make hands to `python -m deploy`."""
+    """The arguments that make passes to `python -m deploy`."""
     line = subprocess.run(
         ["make", "-n", *shlex.split(command)[1:]], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -58,14 +58,14 @@ def arguments(command: str) -> list[str]:
 
 
 def types(running: RunningInstallation, capsys: Any, command: str, answer: str = "") -> None:
-    """Type a command of the page; it prints what the page shows."""
+    """Run a command of the page, and check that it prints what the page shows."""
     # Gap: there is no Internet that could be asked for the site and the zone.
     more = ["--only-aws"] if command.startswith("make doctor") else []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.stdin", Terminal(f"{answer}\n"))
         ran = running.run(capsys, *arguments(command), *more)
     assert ran.code == Exit.DONE, ran.err + ran.out
-    said = ran.err.replace("Begin? [y/N] ", f"Begin? [y/N] {answer}\n") + ran.out  # what is typed is seen at a terminal
+    said = ran.err.replace("Begin? [y/N] ", f"Begin? [y/N] {answer}\n") + ran.out  # a terminal echoes what is typed
     assert first_hour.differs(first_hour.shown()[command], said, running.root_domain) == "", said
 
 
@@ -83,11 +83,13 @@ def test_the_rehearsal_with_bots_prints_what_the_page_shows(
 
 @pytest.fixture
 def played(running: RunningInstallation) -> None:
-    """Somebody has taken part, and their server is gone."""
+    """A participant has taken part, and their server is gone."""
     (project,) = registered_projects(running.platform.documents)
     running.participant("me", answered=5, project=project)
     now = datetime.now(UTC)
-    then = max(now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0))  # it was today
+    then = max(
+        now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0)
+    )  # the page shows a participant of today
     running.record("me", ServerState.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)

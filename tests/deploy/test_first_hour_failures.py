@@ -1,4 +1,4 @@
-"""The failures that docs/first-hour.md lists are said in its words: each is brought about, or its test is named."""
+"""The program reports the failures of docs/first-hour.md in the page's words: each is caused here, or its test is named."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def game(tmp_path: Path) -> project_folder.ProjectFolder:
 
 
 def deploying(world: World, game: project_folder.ProjectFolder, capsys: pytest.CaptureFixture[str]) -> tuple[bool, str]:
-    """Whether it came to its end, and what was said."""
+    """Run deploy. Returns whether it succeeded, and what it printed."""
     try:
         apply(world.account, "hippodrome", StackSettings(domain=DOMAIN), ApplyRequest(game))
     except Problem as problem:

@@ -1,4 +1,4 @@
-"""How many AWS calls it takes to find and remove what is left over of two servers: of one that runs, and of a lost one."""
+"""The AWS calls that find and remove the leftovers of two servers: one that runs, and one that is lost."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def erase(world: Installed) -> None:
             {"ListTasks": 6, "DescribeTasks": 3, "ListClusters": 6, "ListResourceRecordSets": 2}
             | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 2, "DescribeStacks": 1, "GetCallerIdentity": 1}
             | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1}
-            # their documents, their sessions' documents, and what the lobby has of them
+            # their documents, their sessions' documents, and their entries in the lobby
             | {"ListObjectVersions": 20, "ListMultipartUploads": 3, "DeleteObjects": 1},
         ),
     ],
@@ -71,7 +71,9 @@ def test_finding_and_removing_leftovers_takes_these_calls(
     installed.register(msgspec.structs.replace(study(), task_definition="hippodrome"))
     start(installed, "maze", "alice", "bob")
     repository = Repository(installed.platform.documents)
-    stored = repository.server(ids.server_label("maze", "alice"))  # its record is closed, and all the rest is there
+    stored = repository.server(
+        ids.server_label("maze", "alice")
+    )  # its record is closed, and everything else still exists
     assert stored
     repository.save(server.close(stored.server, Reason.STOPPED, installed.platform.now()), stored.etag)
     with installed.recording() as calls:

@@ -1,4 +1,4 @@
-"""What researchers run, they run with the rights of their policy: each command's calls are among its actions."""
+"""The researchers' policy allows every call of the commands that researchers run."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ AS_IAM = {
     "s3:HeadObject": "s3:GetObject",
     "lambda:Invoke": "lambda:InvokeFunction",
 }
-FREE = {"sts:GetCallerIdentity"}  # anybody may
-REFUSED = {"logs:DescribeLogGroups"}  # knows no resources; `logs` goes on without
+FREE = {"sts:GetCallerIdentity"}  # every identity may call this
+REFUSED = {"logs:DescribeLogGroups"}  # this action has no resources; `logs` goes on without it
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What all commands show and take: progress, JSON, `--project`, and what make does with them."""
+"""Output and options of all commands: progress, JSON, `--project`, and the targets of make that run them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run_make(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """`make` as from a shell: of a `make test` that runs this it must not know, or it talks of folders."""
+    """Run `make` as from a shell. Variables of a `make test` around it are removed, or make would print its folders."""
     told = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")}
     return subprocess.run(["make", *arguments], cwd=ROOT, capture_output=True, text=True, check=False, env=told)
 
@@ -116,7 +116,7 @@ def test_make_plan_with_changes_is_no_error(tmp_path: Path, code: int, ends: int
 
 
 def test_deploy_in_a_python_without_packages_continues_in_that_of_make(tmp_path: Path) -> None:
-    """`-S` hides the packages, as another Python of the machine would."""
+    """`-S` hides the packages, as in another Python of the machine."""
     shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=shutil.ignore_patterns("__pycache__"))
     command = [sys.executable, "-I", "-S", "-c", "import sys; sys.path.insert(0, '.'); import deploy.__main__"]
     ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)

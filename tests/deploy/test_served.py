@@ -24,7 +24,7 @@ AT_ONCE = 8
 
 @pytest.fixture
 def restless_threads() -> Iterator[None]:
-    """Threads take turns as often as they can."""
+    """Let Python switch threads as often as possible."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield

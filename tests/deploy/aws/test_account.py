@@ -58,7 +58,7 @@ def test_missing_credentials_and_a_missing_region_are_reported_together(monkeypa
 def test_the_advice_on_credentials_of_aws_login_works(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, chosen: str | None, profile: str
 ) -> None:
-    """What is advised works: here with a command that prints credentials as AWS's command line does."""
+    """The test follows the advice, with a command that prints credentials as AWS's command line does."""
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name)
     monkeypatch.setattr(botocore.credentials, "EC", None)  # without the package awscrt
@@ -85,7 +85,7 @@ def test_the_advice_on_credentials_of_aws_login_works(
 
 
 def test_each_client_is_made_once_and_one_after_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """botocore's sessions are not made for threads; the commands look at many things at once."""
+    """botocore's sessions are not thread-safe, and the commands make requests in several threads."""
     under_way, most, made = 0, 0, []
     counting = threading.Lock()
     real = botocore.session.Session.create_client
@@ -114,7 +114,7 @@ def test_each_client_is_made_once_and_one_after_another(monkeypatch: pytest.Monk
         clients = [one.result() for one in found]
     assert most == 1
     assert clients[: len(SERVICES)] == clients[len(SERVICES) :]
-    assert sorted(made) == sorted([*SERVICES, "s3"])  # the platform has its own, with shorter timeouts
+    assert sorted(made) == sorted([*SERVICES, "s3"])  # the platform makes a client of its own, with shorter timeouts
 
 
 def test_the_region_comes_from_the_option_or_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Pages find room beside the functions behind queues, whatever an account allows."""
+"""The concurrency of the functions behind queues leaves executions for pages, whatever the account allows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEFT = {"HostedZoneId": "Z1", "RootDomain": "example.org", "ZoneA": "us-east-1a"
 
 
 class Lambda(Account):
-    """An account of which only Lambda's limit is known: executions that are not reserved, or an error."""
+    """An account that answers only GetAccountSettings: with this many unreserved executions, or with an error."""
 
     def __init__(self, answer: int | ClientError) -> None:
         self._answer = answer
@@ -35,7 +35,7 @@ REFUSED = ClientError({"Error": {"Code": "AccessDeniedException"}}, "GetAccountS
 
 
 def test_queues_take_at_most_half_of_the_executions_or_the_least_that_lambda_allows() -> None:
-    least = 3 * concurrency.LEAST  # Lambda's MaximumConcurrency is 2 at least, and there are three mappings
+    least = 3 * concurrency.LEAST  # Lambda's MaximumConcurrency is at least 2, and there are three mappings
     for limit in range(8, 1001):
         assert concurrency.workers(limit) <= max(limit / 2, least), limit
 

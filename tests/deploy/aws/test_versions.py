@@ -1,4 +1,4 @@
-"""A bucket is emptied for good: every version and delete marker, whatever appears meanwhile; refusals are told."""
+"""Deleting every version and delete marker of a bucket, including those that appear meanwhile; refusals are reported."""
 
 from __future__ import annotations
 

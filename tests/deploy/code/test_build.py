@@ -1,4 +1,4 @@
-"""The functions' zips: what is in them, that they run on their own, and that they come out the same."""
+"""The functions' zips: their contents, that each runs alone, and that the same input gives the same bytes."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ print("ran")
 
 @pytest.fixture(scope="module")
 def runtime(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what Lambda's runtime has, and nothing else."""
+    """A folder with the packages of Lambda's runtime, and nothing else."""
     folder = tmp_path_factory.mktemp("runtime")
     for name in RUNTIME:
         spec = importlib.util.find_spec(name)
@@ -226,7 +226,7 @@ def test_the_same_input_gives_the_same_bytes(
     assert {name: again[name].key for name in built} == {name: function.key for name, function in built.items()}
     for name, function in sample(built.items(), 4):
         packed = again[name].pack()
-        bytecode._made.clear()  # so that it is compiled again
+        bytecode._made.clear()  # then it is compiled again
         assert hashlib.sha256(packed).digest() == hashlib.sha256(function.pack()).digest()
 
 
@@ -306,7 +306,7 @@ def test_pins_agree_with_the_requirements() -> None:
 
 
 def test_the_pinned_versions_are_those_that_tests_run_with() -> None:
-    """What goes into the zips is what these tests run with."""
+    """The installed versions, with which the tests run, are those that go into the zips."""
     import importlib.metadata
 
     for name, pin in packages.read_pins().items():

@@ -1,4 +1,4 @@
-"""After an update, the list that researchers read holds no secret of an earlier version any more."""
+"""After an update, secrets of an earlier version are removed from the list of projects, which researchers can read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages of apply, stop, erase and destroy: look, plan, execute, verify; on a world that refuses and that changes."""
+"""The stages of apply, stop, erase and destroy (look, plan, execute, verify) in a world that refuses and changes."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ THINGS = ("task", "timer", "name", "cluster", "record")
 
 
 class World:
-    """Things that are to be removed; every call of AWS is written down."""
+    """Things that are to be removed, and a count of the calls that stand for calls of AWS."""
 
     def __init__(self, *things: str) -> None:
         self.things = list(things)
         self.removed: list[str] = []
         self.slept: list[float] = []
         self.refuses: dict[str, int] = {}  # how often each removal fails
-        self.interrupted_at: int | None = None  # which call is cut off, before it does anything
+        self.interrupted_at: int | None = None  # the number of the call that is interrupted before it does anything
         self.calls = 0
         self.executor = Executor(self.slept.append, clock=lambda: 0.0)
 
@@ -82,7 +82,7 @@ def test_with_note_the_other_steps_go_on_and_the_failed_one_is_tried_again() -> 
 def test_interrupted_at_any_call_the_next_run_ends_clean(call: int) -> None:
     world = World(*THINGS)
     world.interrupted_at = call
-    if call < len(THINGS) + 2:  # a look, a removal of each, and the look that proves it
+    if call < len(THINGS) + 2:  # the look, a removal of each thing, and the look that finds nothing
         with pytest.raises(KeyboardInterrupt):
             world.executor.converge(world.look, world.plan, note=lambda _: None)
     world.interrupted_at = None

@@ -1,4 +1,4 @@
-"""What cannot be read in an installation is named by `doctor`, with its remedy, and keeps no command from the rest."""
+"""`doctor` names unreadable documents of an installation with a remedy, and the other commands go on without them."""
 
 # ruff: noqa: F811 - fixtures are imported, and asked for by their names
 
@@ -42,14 +42,14 @@ def prepare(world: Installed, *projects: Project) -> None:
 
 
 def add_broken_entry(world: Installed) -> None:
-    """An entry beside the good one that HIPPO might have written; a step of it is missing."""
+    """Add an entry to the list of projects, in the form of HIPPO's, that lacks a step."""
     listed = json.loads(world.get(MASTER_LIST))
     listed["projects"].append({"id": "broken", "live": True, "steps": {"2": "consent.html"}})
     world.put(MASTER_LIST, json.dumps(listed).encode())
 
 
 def findings_of(account: Account) -> list[Finding]:
-    """What doctor says that is not good. Never an id, and never without a remedy."""
+    """The findings of doctor that are not good. Checks that each has a remedy and none holds the participant's id."""
     findings = [one for one in examine(context(account), CHECKS) if one.mark is not Mark.GOOD]
     assert not any(USER in one.text + one.advice for one in findings)
     assert all(one.advice for one in findings)
@@ -71,7 +71,7 @@ def test_doctor_names_an_unreadable_entry_of_the_list_of_projects(
     assert (line.mark, line.check) == (Mark.BAD, "project broken")
     assert "counts as closed" in line.text
     assert "Register it again" in line.advice
-    assert capsys.readouterr().err == "", "it is a line, and no warning besides"
+    assert capsys.readouterr().err == "", "doctor prints a line and no warning besides"
 
 
 def test_doctor_looks_for_the_pages_of_an_entry_that_hippo_wrote(world: Installed, account: Account) -> None:
@@ -201,7 +201,7 @@ def test_stop_names_unreadable_documents_and_goes_on(world: Installed, capsys: A
 def test_erase_names_unreadable_documents_and_goes_on(
     world: Installed, capsys: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # where the receipt goes
+    monkeypatch.chdir(tmp_path)  # the receipt is written into the current folder
     add_broken_entry(world)
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)

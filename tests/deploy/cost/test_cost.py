@@ -46,7 +46,7 @@ def test_the_servers_cost_what_fargate_charges_for_their_time() -> None:
     servers, addresses = study_lines(MAZE, Prices())[:2]
     assert servers.usd.likely == pytest.approx(25 * HOUR * 0.35)
     assert servers.usd.low == pytest.approx(25 * HOUR * 0.30)
-    assert servers.usd.high == pytest.approx(50 * HOUR)  # maxRuntime, and no room on Spot
+    assert servers.usd.high == pytest.approx(50 * HOUR)  # until maxRuntime, and without capacity on Spot
     assert addresses.usd == Usd(25 * 0.005, 25 * 0.005, 50 * 0.005)
     assert study_lines(MAZE.__class__(**{**vars(MAZE), "spot": False}), Prices())[0].usd.low == pytest.approx(25 * HOUR)
 
@@ -65,7 +65,7 @@ def test_every_line_has_low_likely_and_high_in_order_and_grows_with_the_particip
 
 
 def test_signing_requests_of_servers_are_counted() -> None:
-    """Each is a request to the site, an invocation and a read: two of the certificate, the answer, a recording at least."""
+    """A server has at least four requests signed: two for the certificate, one for the answer, one for a recording."""
     lines = {line.what: line for line in study_lines(MAZE, Prices())}
     looks = MAZE.participants * (2 * MAZE.steps - 1 + POLLS.likely)
     assert lines["HTTP API"].usd.likely >= (looks + 4 * MAZE.participants) * Prices().http_request.usd
@@ -76,7 +76,7 @@ def test_signing_requests_of_servers_are_counted() -> None:
 
 
 def test_five_pollers_ask_each_queue_all_the_time() -> None:
-    """Fewer are an optimization that a mapping with a maximum of its concurrency does not have."""
+    """Lambda reduces the pollers of a quiet queue only for mappings without a maximum concurrency."""
     (queues,) = [line for line in month_lines(Prices(), FixedResources(queues=3)) if "SQS" in line.what]
     asked = 3 * 5 * 730 * 3600 / 20
     assert queues.usd.likely == pytest.approx((asked - 1e6) * Prices().sqs_request.usd)
@@ -84,9 +84,9 @@ def test_five_pollers_ask_each_queue_all_the_time() -> None:
 
 
 def test_the_documentation_states_the_cost_of_an_idle_installation() -> None:
-    """About two dollars likely; about nine where other things in the account have used up what is free."""
+    """About two dollars are likely; about nine if the rest of the account has used up the free tier."""
     idle = total(month_lines(Prices(), _fixed_resources()))
-    assert _fixed_resources() == FixedResources(), "what stands in where there is no template"
+    assert _fixed_resources() == FixedResources(), "the values without a template"
     assert round(idle.likely) == 2
     assert round(idle.high) == 9
     for page in ("docs/aws.md", "docs/running.md"):
@@ -101,7 +101,7 @@ def test_a_study_without_a_game_needs_no_servers() -> None:
 
 
 def test_the_estimate_says_that_every_opened_link_starts_a_server(tmp_path: Path) -> None:
-    """Those who look and leave are no participants, so no figure holds their servers."""
+    """People who open the link and leave are not counted as participants, so no figure includes their servers."""
     said = "Every opened link starts a server."
     assert not any(said in line for line in assumptions(MAZE))
     assert any(said in line for line in assumptions(StudyToEstimate(**{**vars(MAZE), "at_link": True})))
@@ -133,9 +133,9 @@ def test_a_month_is_counted_from_the_template() -> None:
     kinds = [resource["Type"] for resource in resources.values()]
     assert found.alarms == kinds.count("AWS::CloudWatch::Alarm") > 0
     assert (found.queues, found.dashboards) == (3, 1)
-    assert "AWS::EC2::NatGateway" not in kinds  # the line that says so stays true
+    assert "AWS::EC2::NatGateway" not in kinds  # the estimate says that there is none
     assert "AWS::ElasticLoadBalancingV2::LoadBalancer" not in kinds
-    assert FixedResources().alarms == found.alarms  # what is reckoned where the template is not at hand
+    assert FixedResources().alarms == found.alarms  # the values without a template
 
 
 def test_the_estimate_has_the_templates_memory_sizes() -> None:
@@ -163,7 +163,7 @@ def test_the_note_of_another_region_says_whose_prices_these_are() -> None:
 
 
 class PriceList:
-    """The Price List API as it answers: JSON documents in a list. Gap: moto has no such service."""
+    """A fake of the Price List API, which answers with a list of JSON documents. Gap: moto has no such service."""
 
     def __init__(self, *items: dict[str, Any]) -> None:
         self.items = items
@@ -418,7 +418,7 @@ def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: An
 
 
 def answer_bill(world: Installed, *answers: dict[str, float]) -> None:
-    """What Cost Explorer says to the next requests."""
+    """Let Cost Explorer answer the next requests with these costs by service."""
     for services in answers:
         groups = [
             {"Keys": [name], "Metrics": {"UnblendedCost": {"Amount": str(usd), "Unit": "USD"}}}
@@ -505,11 +505,11 @@ def test_the_longest_wait_in_a_lobby_is_the_patience_of_the_study() -> None:
     assert hour.lobby_polls.high == 100 * 1800
     assert hour.lobby_polls.likely == PAIRS.lobby_polls.likely
     assert any("3600 at most" in line for line in assumptions(hour))
-    assert replace(PAIRS, patience=10).lobby_polls.likely == 100 * 5  # no one waits longer than that
+    assert replace(PAIRS, patience=10).lobby_polls.likely == 100 * 5  # nobody waits longer than the patience
 
 
 def test_a_lobby_of_thirty_for_an_hour_costs_less_than_a_dollar() -> None:
-    """Each look lists and writes (as dear as two PUTs), reads the decisions and the membership, and is one request."""
+    """Each poll lists and writes (at the price of two PUTs), and reads the decisions and the membership."""
     prices = Prices()
     study = replace(PAIRS, participants=30, patience=3600)
     looks = study.lobby_polls.high

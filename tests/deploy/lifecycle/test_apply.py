@@ -1,4 +1,4 @@
-"""plan and apply: what they ask of CloudFormation, what people see, and what becomes of every state a stack may be in."""
+"""plan and apply: their calls of CloudFormation, what they print, and their answers to failures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_calls(world: World) -> list[str]:
     return [name for name, _ in world.cloud.calls if not name.startswith(("get_", "describe_", "list_"))]
 
 
-# -- making it ---------------------------------------------------------------------------------------------------------
+# -- creating and updating ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_first_apply_creates_the_stack(world: World, capsys: pytest.CaptureFixture[str]) -> None:
@@ -82,7 +82,7 @@ def test_white_space_that_cloudformation_cut_off_is_no_change(world: World) -> N
 
 
 def test_non_ascii_characters_that_cloudformation_replaces_are_no_change(world: World) -> None:
-    """GetTemplate answers with question marks for whatever is not ASCII."""
+    """GetTemplate answers with question marks for characters that are not ASCII."""
     world.text += "# participants open …/next — 請\n"
     world.stand()
     world.cloud.text = world.cloud.text.encode("ascii", "replace").decode()
@@ -120,7 +120,7 @@ def test_a_change_set_without_changes_is_deleted(world: World, reason: str) -> N
     world.text += "\n# a comment\n"
     world.cloud.failing = reason
     assert not apply(world.account, "hippodrome", AGAIN).changed
-    assert len(world.cloud.called("delete_change_set")) == 2  # an old one of ours, and this one
+    assert len(world.cloud.called("delete_change_set")) == 2  # an old one of ours, and the new one
     assert not world.cloud.called("execute_change_set")
 
 
@@ -143,7 +143,7 @@ def test_a_failed_change_set_is_reported_and_leaves_no_stack(world: World) -> No
     with pytest.raises(Problem, match="EarlyValidation") as caught:
         apply(world.account, "hippodrome", FIRST)
     assert caught.value.details == ("Bucket: it is taken",)
-    assert world.cloud.stack is None  # no empty stack is left
+    assert world.cloud.stack is None  # no empty stack remains
 
 
 def test_warnings_of_validation_are_shown_and_do_not_stop_apply(
@@ -436,7 +436,7 @@ def test_a_foreign_stack_of_that_name_is_left_alone(world: World, status: str) -
 def test_an_update_removes_secrets_from_the_list_of_projects(
     world: World, monkeypatch: pytest.MonkeyPatch, update: bool
 ) -> None:
-    """test_register_function.py has what that does."""
+    """test_register_function.py tests how the secrets are removed."""
     asked: list[str] = []
     monkeypatch.setattr(
         applying.register_function, "hide_secrets", lambda _, installation: asked.append(installation.stack)
@@ -459,6 +459,6 @@ def test_an_installation_without_our_tag_is_recognized(world: World) -> None:
 
 
 def test_apply_does_not_import_pydantic() -> None:
-    """It takes a fifth of a second, in which nothing would be shown."""
+    """pydantic, which reads config.yml, takes a fifth of a second to import, in which nothing would be shown."""
     code = "import sys, deploy.__main__, deploy.lifecycle.apply; sys.exit('pydantic' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""destroy: what goes, what stays, what is asked, and that it may be repeated from anywhere."""
+"""destroy: what it deletes and keeps, what it asks, and that it can be repeated after any interruption."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TAG = [{"Key": "hippodrome:stack", "Value": "hippodrome"}]
 
 @pytest.fixture
 def installed(world: World) -> World:
-    """An installation: the fake's stack, and in moto what commands and functions made beside it."""
+    """An installation: a stack in the fake CloudFormation, and in moto what commands and functions made beside it."""
     s3, ecs = world.account.client("s3"), world.account.client("ecs")
     make_bucket(world, DATA, TAG)
     s3.put_bucket_versioning(Bucket=DATA, VersioningConfiguration={"Status": "Enabled"})
@@ -140,7 +140,7 @@ def test_destroy_deletes_all_but_the_data(
 
 
 def last_commands(said: str) -> list[list[str]]:
-    """The commands that are named at the end, as a shell would read them."""
+    """The commands that the output names at its end, split as a shell would split them."""
     return [shlex.split(line)[3:] for line in said.splitlines() if line.startswith("  python -m deploy ")]
 
 
@@ -245,7 +245,7 @@ def test_destroy_with_data_deletes_the_bucket(installed: World, monkeypatch: pyt
 
 def test_the_data_can_be_deleted_by_a_later_run(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
-    installed.cloud.resources = []  # CloudFormation forgets: the tag remains
+    installed.cloud.resources = []  # CloudFormation has forgotten the stack; the bucket's tag remains
     installed.cloud.stack = None
     assert run(installed, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert buckets(installed) == {DATA}
@@ -357,13 +357,13 @@ def test_a_failed_deletion_is_reported_and_keeps_the_data(installed: World) -> N
     removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
     with pytest.raises(Problem, match="could not be deleted"):
         removal.run(removal.look(), data=True)
-    assert DATA in buckets(installed)  # the data go last
+    assert DATA in buckets(installed)  # the data are deleted last
     removal.run(removal.look(), data=True)
     assert buckets(installed) == set()
 
 
 def test_the_run_after_an_interruption_finishes(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever step is interrupted, the next run finishes."""
+    """The run after an interruption at any of these steps finishes."""
     for step in ("_stop_servers", "_acme_records", "_task_definitions", "_bucket"):
         with monkeypatch.context() as patch:
 
@@ -427,7 +427,7 @@ def test_remains_are_reported_with_the_command_that_removes_them(
 
 
 def test_more_data_than_a_page_are_deleted(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", "5")  # a page; S3's has 1,000
+    monkeypatch.setenv("MOTO_S3_DEFAULT_MAX_KEYS", "5")  # keys in a page; S3's has 1,000
     s3 = installed.account.client("s3")
     for number in range(23):
         s3.put_object(Bucket=DATA, Key=f"study/users/u/trials/{number}", Body=b"")
@@ -453,7 +453,7 @@ def test_every_listing_exists_in_the_models_of_aws(world: World) -> None:
 
 
 def test_every_removal_exists_in_the_models_of_aws(world: World) -> None:
-    """Each operation exists in AWS's own model of the service, and has the option, which takes one name."""
+    """Each operation exists in AWS's own model of the service, and has the options of the command."""
     import boto3
 
     session = boto3.Session(region_name=REGION)
@@ -468,7 +468,7 @@ def test_every_removal_exists_in_the_models_of_aws(world: World) -> None:
         assert options, listing
 
 
-PARTS = {  # what goes with something else, and has no listing of its own: its type, and what it is a part of
+PARTS = {  # types without a listing, because they are deleted with another: the part, and the whole
     "AWS::ApiGatewayV2::ApiMapping": "AWS::ApiGatewayV2::DomainName",
     "AWS::ApiGatewayV2::Integration": "AWS::ApiGatewayV2::Api",
     "AWS::ApiGatewayV2::Route": "AWS::ApiGatewayV2::Api",
@@ -479,7 +479,7 @@ PARTS = {  # what goes with something else, and has no listing of its own: its t
     "AWS::Lambda::EventInvokeConfig": "AWS::Lambda::Function",
     "AWS::Lambda::Permission": "AWS::Lambda::Function",
     "AWS::S3::BucketPolicy": "AWS::S3::Bucket",
-    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # an unconfirmed one goes after three days
+    "AWS::SNS::Subscription": "AWS::SNS::Topic",  # an unconfirmed one is deleted after three days
     "AWS::SNS::TopicPolicy": "AWS::SNS::Topic",
     "AWS::SQS::QueuePolicy": "AWS::SQS::Queue",
 }
@@ -517,7 +517,7 @@ def test_remains_of_a_foreign_deleted_stack_are_left_alone(installed: World, mon
 
 
 def test_warm_servers_are_stopped_also_those_that_start_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sweep of a live study goes on keeping servers warm until it is deleted itself."""
+    """The sweep of a live study starts warm servers again until the sweep itself is deleted."""
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     kept = study(task_definition="hippodrome", warm_servers=2)

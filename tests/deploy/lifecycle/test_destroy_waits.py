@@ -1,4 +1,4 @@
-"""destroy on an AWS that refuses for a while: what is waited for, what is taken away, and that it ends clean."""
+"""destroy when AWS refuses for a while: what it waits for, what it removes first, and that it finishes."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_the_record_of_a_stack_that_was_deleted_by_hand_is_reported(
 def test_a_deleted_hosted_zone_does_not_stop_destroy(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """CloudFormation cannot delete the site's records then: they are gone, and the rest follows without them."""
+    """CloudFormation cannot delete the site's records, which are gone with the zone; destroy deletes the rest without them."""
     stack.delete_zone()
     assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
     assert stack.cloud.stack
@@ -231,7 +231,7 @@ def test_network_interfaces_that_stay_are_named(
     assert interfaces(stack.world)[0] in capsys.readouterr().err
 
 
-# -- and made again
+# -- creating it again
 
 
 def test_apply_waits_until_the_names_of_deleted_queues_are_free(
@@ -246,7 +246,7 @@ def test_apply_waits_until_the_names_of_deleted_queues_are_free(
         kept = (stack.clock.time - gone).total_seconds() < 60
         return [invalid("StartQueue", "hippodrome-start already exists")] if kept else []
 
-    stack.cloud.validation = taken  # CloudFormation looks when it makes the change set
+    stack.cloud.validation = taken  # CloudFormation validates when it makes the change set
     outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
     assert outcome.created
     assert 60 <= (stack.clock.time - gone).total_seconds() <= 80
@@ -319,7 +319,7 @@ def test_apply_waits_until_s3_takes_settings_of_a_new_code_bucket(
     assert bucket.make()
     assert clock.slept == 60
     assert "S3 is still at work on the new bucket" in capsys.readouterr().err
-    assert not bucket.make()  # nothing is left to be set
+    assert not bucket.make()  # all settings are set
 
 
 def test_a_code_bucket_that_s3_never_finishes_is_reported(
@@ -368,7 +368,7 @@ def test_dns_names_of_servers_without_a_record_are_reported(
     assert "another installation's with the same domain, or left over" in said.err
 
 
-# -- what there is no use to wait for
+# -- states, and what is not waited for
 
 
 def test_a_protected_stack_is_left_alone(
@@ -466,7 +466,7 @@ def test_destroy_names_another_region_with_an_installation(
 
 
 class CtrlC:
-    """Ctrl-C at the n-th call of AWS, before it is made or when its answer is on its way."""
+    """Ctrl-C at the n-th call of AWS, before the call or after it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, cloud: FakeCloudFormation, clock: Clock) -> None:
         self.clock, self.thread = clock, threading.current_thread()
@@ -482,7 +482,7 @@ class CtrlC:
             monkeypatch.setattr(cloud, name, lambda real=real, **a: self.count(lambda: real(**a)))
 
     def count(self, act: Callable[[], Any]) -> Any:
-        if self.clock.aws or threading.current_thread() is not self.thread:  # Ctrl-C meets the main thread
+        if self.clock.aws or threading.current_thread() is not self.thread:  # Ctrl-C interrupts only the main thread
             return act()
         self.calls += 1
         now = self.calls == self.at

@@ -1,4 +1,4 @@
-"""What is looked at before anything is made: each thing that would be in the way, its sentence and its remedy."""
+"""The checks before apply makes anything: each problem has its sentence and its remedy."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_plan_of_an_update_shows_its_problems(world: World) -> None:
 
 
 def test_a_plan_names_the_address_that_participants_will_open(world: World) -> None:
-    """Whoever writes DOMAIN=study.example.org sees the second `study` before it is made."""
+    """With DOMAIN=study.example.org the plan shows the second `study` in the address before it is made."""
     first = [line for line, _ in plans.lines(plan(world.account, "hippodrome", FIRST))]
     assert f"Participants will open https://study.{DOMAIN}/next" in first
     apply(world.account, "hippodrome", FIRST)
@@ -171,7 +171,7 @@ def test_of_an_existing_installation_only_changes_are_checked(world: World) -> N
     world.delegated = NOBODY
     world.limits.executions = 10
     world.limits.quotas.clear()
-    record(world, f"study.{DOMAIN}")  # its own
+    record(world, f"study.{DOMAIN}")  # the site's own record
     world.stand()
     assert findings(world, StackSettings(max_runtime=30)) == []
     assert {one.check for one in findings(world, StackSettings(site="lab"))} == {"domain"}
@@ -272,7 +272,7 @@ def record(world: World, name: str) -> None:
 
 
 def test_a_domain_that_is_not_delegated_is_a_problem_with_the_name_servers_to_set(world: World) -> None:
-    """The stack would wait for ACM for hours."""
+    """Without this check the stack would wait for ACM for hours."""
     world.delegated = NOBODY
     found = only(findings(world))
     assert found.mark is Mark.BAD
@@ -288,7 +288,7 @@ def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
     assert (domain.mark, authorities.mark) == (Mark.LOOK, Mark.LOOK)
 
 
-# Any of them lets ACM issue (ACM's user guide, "(Optional) Configure a CAA record").
+# Each of these names allows ACM to issue (ACM's user guide, "(Optional) Configure a CAA record").
 AMAZON = ("amazon.com", "amazontrust.com", "awstrust.com", "amazonaws.com")
 
 
@@ -309,7 +309,7 @@ AMAZON = ("amazon.com", "amazontrust.com", "awstrust.com", "amazonaws.com")
     ],
 )
 def test_caa_records_must_allow_both_authorities(world: World, name: str, records: list[caa.Record], who: str) -> None:
-    """Amazon issues for the site, which is no wildcard; Let's Encrypt for the servers, which is one."""
+    """Amazon issues the site's certificate, which is no wildcard; Let's Encrypt issues the servers' wildcard certificate."""
     for wild in {name, *([DOMAIN, f"servers.{DOMAIN}"] if name == DOMAIN else [])}:
         world.caa[wild] = caa.Caa(name, tuple(records))
     found = findings(world)
@@ -353,7 +353,7 @@ EVERY = {"study.lab.example.org", "lab.example.org", "example.org", "org"}
 def test_dns_is_not_asked_for_names_that_do_not_exist_yet(
     world: World, monkeypatch: pytest.MonkeyPatch, there: list[str], asked: set[str]
 ) -> None:
-    """A resolver remembers for 15 minutes that a name does not exist: the site would be unknown to who deploys it."""
+    """A resolver caches for 15 minutes that a name does not exist: the administrator could not open the new site."""
     monkeypatch.setattr(caa, "find", find_caa)
     for name in there:
         record(world, name)
@@ -385,7 +385,7 @@ def test_caa_records_of_an_existing_name_count(world: World, monkeypatch: pytest
 def test_delegation_is_judged_by_the_answers_of_dns(
     monkeypatch: pytest.MonkeyPatch, records: Any, problem: str, certain: bool
 ) -> None:
-    """A zone that was deleted and made again has other name servers; the old ones answer no more (SERVFAIL)."""
+    """A zone that was deleted and made again has other name servers; the old ones answer SERVFAIL."""
     monkeypatch.setattr(zones, "DNS_TIMEOUT", 2.0)
     with answering(records) as port:
         ask_only(monkeypatch, port)
@@ -478,7 +478,7 @@ OF_NEW_ROLES = [
 
 @pytest.fixture
 def waits(world: World, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The seconds that were waited for ECS's role."""
+    """The pauses (seconds) in which apply waited for ECS's role."""
     slept: list[float] = []
     monkeypatch.setattr(applying.time, "sleep", lambda s: slept.append(s) if s >= applying.ROLE_PAUSE else None)
     return slept

@@ -1,4 +1,4 @@
-"""up: what is done in which order, for whom, and what a missing certificate means."""
+"""up: its steps and their order, for administrators and researchers, and with each state of the certificate."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CONFIG = """project:
 
 
 class FakeStored:
-    """As much of `hippodrome.certificates.rules.StoredCertificate` as is looked at."""
+    """The part of `hippodrome.certificates.rules.StoredCertificate` that `up` reads."""
 
     def __init__(self, directory: str, days: int = 60) -> None:
         self.directory = directory
@@ -44,7 +44,7 @@ def report(directory: str, due: Verdict) -> Report:
 
 
 class FakeAccount:
-    """An account, as far as `up` itself looks."""
+    """The part of an account that `up` itself reads."""
 
     id, region = "123456789012", "ca-central-1"
 
@@ -55,7 +55,7 @@ class FakeAccount:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What `up` has its parts do, in order; the parts have tests of their own."""
+    """The calls that `up` makes to its parts, in order. The parts are replaced here, and have tests of their own."""
     done: list[str] = []
     installation = Installation("hippodrome", "ca-central-1", "CREATE_COMPLETE", {})
 

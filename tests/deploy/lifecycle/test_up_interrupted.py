@@ -1,4 +1,4 @@
-"""up: Ctrl-C at any call of AWS, and the same command again: in the end all of it is there, once."""
+"""up: after Ctrl-C at any call of AWS, the same command completes the installation, and makes nothing twice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["world"]
 
 
 class InterruptedClient:
-    """A client whose calls are counted with those of all others; at one of them somebody presses Ctrl-C."""
+    """A client whose calls are counted with those of all other clients, and interrupted at one of them."""
 
     def __init__(self, client: Any, called: Callable[[str], Iterator[None]]) -> None:
         self._client, self._called = client, called
@@ -43,7 +43,7 @@ class InterruptedClient:
 
 
 class CtrlC:
-    """Presses Ctrl-C at the n-th call: before it, or when AWS has done it and the answer is on its way."""
+    """Ctrl-C at the n-th call of AWS: before the call, or after AWS has executed it."""
 
     def __init__(self) -> None:
         self.at, self.afterwards = -1, False
@@ -75,7 +75,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def deploy_study(world: World, ctrl_c: CtrlC, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
-    """`make deploy` of a study. Certificate and registering, which have such tests of their own, are a call each."""
+    """Runs `make deploy` of a study. One call each stands for certificate and registration, which have tests of their own."""
 
     def mark(what: str) -> Any:
         s3 = world.account.client("s3")
@@ -125,13 +125,13 @@ def check_every_interruption(
 
 
 def empty_account(world: World) -> None:
-    """An account in which nobody has done anything."""
+    """Remove everything from the account."""
     plain = type(world.account).client
     s3, iam = plain(world.account, "s3"), plain(world.account, "iam")
     for bucket in s3.list_buckets()["Buckets"]:
         for one in s3.list_objects_v2(Bucket=bucket["Name"]).get("Contents", ()):
             s3.delete_object(Bucket=bucket["Name"], Key=one["Key"])
-        s3.delete_bucket_tagging(Bucket=bucket["Name"])  # Gap: moto keeps the tags of a bucket that is gone
+        s3.delete_bucket_tagging(Bucket=bucket["Name"])  # Gap: moto keeps the tags of a deleted bucket
         s3.delete_bucket(Bucket=bucket["Name"])
     for role in iam.list_roles()["Roles"]:
         iam.delete_role(RoleName=role["RoleName"])

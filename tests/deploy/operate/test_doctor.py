@@ -1,4 +1,4 @@
-"""`deploy doctor`: each thing that would keep a study from being held is a line, with what to do about it."""
+"""`deploy doctor`: each problem that would stop a study is a line, with its remedy."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def world(installed: Installed) -> Installed:  # noqa: F811
 
 
 def quotas(world: Installed, spot: float = 100, on_demand: float = 100, functions: int = 1000) -> None:
-    """What AWS answers about quotas. Gap: moto has none of these."""
+    """Let AWS answer with these quotas. Gap: moto has none of them."""
     for value in (spot, on_demand):
         world.answer("service-quotas:GetServiceQuota", {"Quota": {"Value": value}})
     limit = {"ConcurrentExecutions": functions, "UnreservedConcurrentExecutions": functions}
@@ -69,7 +69,7 @@ def quotas(world: Installed, spot: float = 100, on_demand: float = 100, function
 
 
 def image(world: Installed, tag: str = "maze-0123456789ab") -> str:
-    """An image in the repository, as uri@digest; the same one for the same tag."""
+    """Push an image (the same one for the same tag). Returns its uri@digest."""
     layer = {"size": 7_000_000, "digest": f"sha256:{hashlib.sha256(tag.encode()).hexdigest()}"}
     manifest = json.dumps({"schemaVersion": 2, "mediaType": V2, "config": layer, "layers": [layer]})
     ecr = world.client("ecr")
@@ -228,7 +228,7 @@ def test_the_project_can_be_named_by_its_folder(world: Installed, capsys: Any, t
     config.write_text(as_it_is.replace("  awsSetup:", "  useAWS: false\n  awsSetup:"))
     ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
-    assert "useAWS" in ran.err  # the study is for one machine
+    assert "useAWS" in ran.err  # this study is for one machine
     config.write_text(as_it_is)
     ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
     assert "The project ms-pacman is not registered" in ran.err
@@ -269,7 +269,7 @@ def authorities() -> set[str]:
 
 
 def test_machines_without_certificate_authorities_use_those_of_mozilla(monkeypatch: Any, tmp_path: Path) -> None:
-    """As Python from python.org is on macOS. What the machine does have counts as well."""
+    """Python from python.org on macOS has no authorities. The machine's own authorities count as well."""
     (tmp_path / "none.pem").touch()
     monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "none.pem"))
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path / "none"))
@@ -310,7 +310,7 @@ def test_the_certificate_of_the_site_must_be_issued(
         (chain("*.example.com", days=50), Mark.BAD, "not for *.servers.example.org"),
         (chain(days=50), Mark.BAD, "It is for no name"),
         (chain("*.servers.example.org", days=50), Mark.GOOD, "50 days left"),
-        # What is renewed with a third of 45 days left, or with half of 160 hours.
+        # Certificates that are renewed when a third of 45 days is left, or half of 160 hours.
         (chain("*.servers.example.org", days=20, lifetime=45), Mark.GOOD, "20 days left"),
         (chain("*.servers.example.org", days=12, lifetime=45), Mark.LOOK, "12 days left"),
         (chain("*.servers.example.org", days=3, lifetime=45), Mark.BAD, "3 days left"),
@@ -344,7 +344,7 @@ def test_quotas_that_are_too_small_come_with_the_command_to_raise_them(world: In
     quotas(world, spot=6, on_demand=6, functions=10)
     one = context(account, at_once=20)
     spot, on_demand = capacity.fargate(one)
-    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)  # a study of six can be held
+    assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.LOOK)  # a study of six participants is possible
     assert "6 vCPU: 6 servers of 1 vCPU at once, and 20 are wanted" in spot.text
     assert "--service-code fargate --quota-code L-36FBB829 --desired-value 20" in spot.advice
     executions = only(capacity.functions(one))
@@ -424,7 +424,9 @@ def test_without_a_live_project_capacity_is_checked_for_servers_of_the_usual_siz
     assert only(images.projects(context(account))).text == "None is live."
     fresh(world)
     quotas(world, spot=6, on_demand=60)
-    spot, on_demand = capacity.fargate(context(account, at_once=20))  # an administrator looks before there is a study
+    spot, on_demand = capacity.fargate(
+        context(account, at_once=20)
+    )  # an administrator may run doctor before a study is registered
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
@@ -570,7 +572,7 @@ def test_the_subscribers_of_alarms_are_checked(world: Installed, account: Accoun
 
 
 class Clock:
-    """Time that passes only when somebody sleeps, and what AWS does meanwhile."""
+    """A clock whose time passes only in `sleep`, in which AWS acts as well."""
 
     def __init__(self, world: Installed, study_functions: StudyOnMoto | None = None) -> None:
         self.now = 0.0
@@ -629,7 +631,7 @@ def test_a_rehearsal_says_that_it_got_a_warm_server(world: Installed) -> None:
 
 
 def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_a_session(world: Installed) -> None:
-    """A start message of a participant would start none; and the sweep must not take it for one too many."""
+    """A participant's start message would start no server; and the sweep must not stop the session's server as needless."""
     whose = msgspec.structs.replace(study(players=2), id="ms-pacman")
     study_functions = StudyOnMoto(world)
     world.register(whose)
@@ -673,7 +675,7 @@ def test_a_rehearsal_cleans_up_if_no_function_acts(world: Installed) -> None:
     assert "No function acted on the start message" in found[0].text
     assert found[0].mark is Mark.BAD
     assert found[-1].mark is Mark.LOOK
-    StudyOnMoto(world).deliver()  # the start message comes at last, and finds the server closed
+    StudyOnMoto(world).deliver()  # the start message arrives late, when the server is closed
     assert_nothing_left(world)
 
 
@@ -710,7 +712,7 @@ def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
 def test_a_rehearsal_decides_how_the_command_ends(
     world: Installed, capsys: Any, monkeypatch: Any, mark: Mark, code: Exit
 ) -> None:
-    """Whatever else is to be mended is told all the same."""
+    """Other problems are still reported."""
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
     assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
     rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")

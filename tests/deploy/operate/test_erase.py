@@ -1,4 +1,4 @@
-"""`deploy erase`: nothing of one participant stays, in any version; everybody else's stays as it is; the receipt says so."""
+"""`deploy erase`: it deletes every version of one participant's data, changes no others', and writes a receipt."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str
 
 
 def versions(world: Installed, prefix: str = "") -> dict[str, int]:
-    """How many versions and delete markers lie under each key."""
+    """The number of versions and delete markers of each key."""
     found: dict[str, int] = {}
     for page in world.client("s3").get_paginator("list_object_versions").paginate(Bucket=world.env["BUCKET"]):
         for line in [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]:
@@ -68,7 +68,7 @@ def versions(world: Installed, prefix: str = "") -> dict[str, int]:
 
 
 def traces(world: Installed, user: str) -> list[str]:
-    """Every key, server and timer that belongs to the participant."""
+    """The keys, servers and timers that belong to the participant."""
     label = ids.server_label("maze", user)
     keys = [key for key in versions(world) if key.startswith(f"maze/users/{user}/") or label in key]
     tasks = [task.name for task in world.platform.tasks.list() if label in task.name]
@@ -76,7 +76,7 @@ def traces(world: Installed, user: str) -> list[str]:
 
 
 def start(world: Installed, user: str = ANN) -> str:
-    """A server that runs, with timer and name; its task."""
+    """Start a participant's server with its timer and DNS name. Returns its task."""
     servers = Servers(world.platform)
     before = set(world.task_arns())
     servers.start(StartServer("maze", user))
@@ -88,7 +88,7 @@ def start(world: Installed, user: str = ANN) -> str:
 
 
 def bodies(world: Installed) -> list[bytes]:
-    """Every version of every document."""
+    """The contents of every version of every document."""
     s3, bucket = world.client("s3"), world.env["BUCKET"]
     found = s3.list_object_versions(Bucket=bucket)["Versions"]
     return [s3.get_object(Bucket=bucket, Key=v["Key"], VersionId=v["VersionId"])["Body"].read() for v in found]
@@ -103,7 +103,7 @@ def test_a_participant_is_erased_from_a_kept_bucket_as_documented(
     for user in (ANN, ANNA):
         assert Slots(world.platform).admit(kept, user)
         world.participant(user, answered=5, recordings=2)
-        Servers(world.platform).start(StartServer("maze", user))  # Ann's is the warm one
+        Servers(world.platform).start(StartServer("maze", user))  # Ann plays on a warm server
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=f"maze/users/{ANN}/answers/1.json")
     before = versions(world, f"maze/users/{ANNA}/")
     names = re.compile(rb"%b\b|%b" % (ANN.encode(), ids.server_label("maze", ANN).encode()))
@@ -133,7 +133,7 @@ def test_everything_of_one_participant_is_erased_and_nothing_of_others(world: In
 
     assert ran.code == Exit.DONE, ran.err
     assert traces(world, ANN) == []
-    assert versions(world) == others  # those of ANN in another project among them
+    assert versions(world) == others  # ANN's data in another project are among them
     assert len([*world.platform.tasks.list()]) == len(world.timers()) == len(world.records()) == 2
     uploads = world.client("s3").list_multipart_uploads(Bucket=world.env["BUCKET"])
     assert "Uploads" not in uploads
@@ -182,7 +182,7 @@ def test_a_mistyped_participant_needs_no_confirmation_and_changes_nothing(world:
     assert versions(world) == before
     assert world.run(capsys, "erase", "../ann", "--project", "maze").code == Exit.FAILED
     assert world.run(capsys, "erase", ANN, "--project", "maze", "--everywhere").code == Exit.FAILED
-    assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # no config.yml here
+    assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # there is no config.yml here
     dry = world.run(capsys, "erase", "no-such-person", "--project", "maze", "--dry-run")
     assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this participant in maze.\n")
 
@@ -233,7 +233,7 @@ def test_more_objects_than_a_listing_or_a_deletion_takes_are_erased(
 def test_documents_that_a_trial_saves_while_it_ends_are_erased_too(
     world: Installed, capsys: Any, monkeypatch: Any
 ) -> None:
-    """Documents are touched only when the task has ended."""
+    """erase deletes documents only after the task has ended."""
     world.participant(ANN, answered=3)
     start(world)
     looks = iter([["x"], ["x"], []])
@@ -251,12 +251,12 @@ def test_documents_that_a_trial_saves_while_it_ends_are_erased_too(
 
     monkeypatch.setattr(EcsTasks, "draining", draining)
     assert run(world, capsys).code == Exit.DONE
-    assert seen[:3] == [4, 5, 6]  # nothing was deleted while it was saving
+    assert seen[:3] == [4, 5, 6]  # nothing was deleted while the trial was saving
     assert traces(world, ANN) == []
 
 
 class LateStore:
-    """Has a presigned request that the participant's server got at the last moment, and uses it at its last moment."""
+    """Uses a presigned request, which the participant's server got at the last moment, just before it expires."""
 
     def __init__(self, world: Installed) -> None:
         self.world = world
@@ -271,7 +271,7 @@ class LateStore:
 
     def _look(self) -> None:
         record = f"_servers/{ids.server_label('maze', ANN)}.json"
-        if self.signed is None and not versions(self.world, record):  # nothing is signed for it any more
+        if self.signed is None and not versions(self.world, record):  # no more requests are signed for this server
             self.signed = self.seconds - 1
         if self.signed is not None and self.seconds == self.signed + VALID_SECONDS:
             self.world.put(f"maze/users/{ANN}/answers/3.json", b"{}")
@@ -426,7 +426,7 @@ def test_a_refused_deletion_fails_the_erasure(world: Installed, capsys: Any) -> 
     assert "AccessDenied" in ran.err
     (receipt,) = Path().glob("erased-*.json")
     deleted = json.loads(receipt.read_text())["projects"][0]["deleted"]
-    assert "participant" not in deleted  # what was refused is not on the receipt
+    assert "participant" not in deleted  # the receipt does not list refused deletions
 
 
 def test_erase_waits_for_a_new_task_that_ecs_does_not_list_yet(world: Installed, monkeypatch: Any) -> None:
@@ -477,7 +477,7 @@ WARM = msgspec.structs.replace(STUDY, warm_servers=2)
 
 
 def take_warm_server(world: Installed, user: str) -> str:
-    """Let somebody take a warm server; its name."""
+    """Let a participant take a warm server. Returns its name."""
     (name,) = world.warm(WARM, 1)
     Servers(world.platform).start(StartServer("maze", user))
     return name

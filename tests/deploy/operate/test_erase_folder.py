@@ -1,4 +1,4 @@
-"""`deploy erase --from`: a participant of a study on this machine, alone and of those who played together."""
+"""`deploy erase --from`: erasing a participant of a study on this machine, who played alone or with others."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Machine:
         return CommandResult(code, printed.out, printed.err)
 
     def contents(self) -> dict[str, bytes]:
-        """Every file; recordings unpacked."""
+        """The contents of every file, with recordings unpacked."""
         found = {}
         for path in self.data.rglob("*"):
             if path.is_file():

@@ -1,4 +1,4 @@
-"""`deploy erase` of a participant who played with others: nothing of them stays, and the others' data stay whole."""
+"""`deploy erase` of a participant who played with others: their data are deleted, and the others' stay whole."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> Command
 
 
 def contents(world: Installed) -> dict[tuple[str, str], bytes]:
-    """Every version of every document by its key and id; recordings unpacked."""
+    """The contents of every version of every document, by key and version id, with recordings unpacked."""
     s3, bucket = world.client("s3"), world.env["BUCKET"]
     found = {}
     for page in s3.get_paginator("list_object_versions").paginate(Bucket=bucket):
         for line in page.get("Versions", ()):
             body = s3.get_object(Bucket=bucket, Key=line["Key"], VersionId=line["VersionId"])["Body"].read()
-            unpack = zlib.decompressobj(31)  # also of one that was cut off
+            unpack = zlib.decompressobj(31)  # also of a recording that was cut off
             found[line["Key"], line["VersionId"]] = unpack.decompress(body) if line["Key"].endswith(".gz") else body
         for line in page.get("DeleteMarkers", ()):
             found[line["Key"], line["VersionId"]] = b""
@@ -83,7 +83,7 @@ def contents(world: Installed) -> dict[tuple[str, str], bytes]:
 
 
 def traces(world: Installed, user: str = ANN) -> list[str]:
-    """Keys of documents that hold anything of this participant, in any version."""
+    """The keys of documents of which a version names this participant."""
     told = [user, said(user), ids.server_label("maze", user), f":{round_trip(user)}"]
     return [
         key for (key, _), body in contents(world).items() if any(each in key or each.encode() in body for each in told)
@@ -95,7 +95,7 @@ def of(world: Installed, user: str) -> dict[tuple[str, str], bytes]:
 
 
 def start(world: Installed, session_id: str = SID) -> str:
-    """The session's server runs; its task."""
+    """Start the session's server. Returns its task."""
     servers, before = Servers(world.platform), set(world.task_arns())
     servers.start(StartServer("maze", session_id))
     (task,) = set(world.task_arns()) - before
@@ -115,7 +115,7 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
 ) -> None:
     pair(world.put, tmp_path)
     pair(world.put, tmp_path, members=("dora-0001", "emil-0001"), session_id=OTHER)
-    world.put(session_key("maze", SID), session(ANN, BOB).to_json())  # an older version stays in the bucket
+    world.put(session_key("maze", SID), session(ANN, BOB).to_json())  # an older version exists in the bucket
     world.put(recording_key(attempt=2), packed(tmp_path, lines()[:9], close=False)[:-3])
     world.client("s3").delete_object(Bucket=world.env["BUCKET"], Key=recording_key(name="3-episode-0002"))
     world.client("s3").create_multipart_upload(Bucket=world.env["BUCKET"], Key=recording_key(name="3-episode-0009"))
@@ -141,7 +141,9 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
         assert hidden not in json.dumps(receipt) + ran.err
     (project,) = receipt["projects"]
     assert (receipt["complete"], project["rewritten"], set(project["remains"].values())) == (True, 2, {0})
-    assert project["deleted"]["sessions"]["versions"] == 4  # two of the recordings, two of the session's document
+    assert (
+        project["deleted"]["sessions"]["versions"] == 4
+    )  # two versions of the recording, two of the session's document
 
 
 def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path, capsys: Any) -> None:
@@ -240,7 +242,7 @@ def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_
 def test_erase_first_stops_a_session_that_plays(
     world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
-    """As a server of one's own is: the trial stores what it has before anything is touched."""
+    """As for a participant who played alone, the trial stores its data before erase deletes anything."""
     pair(world.put, tmp_path)
     start(world)
     order: list[str] = []
@@ -266,7 +268,7 @@ def test_erase_first_stops_a_session_that_plays(
 def test_erase_waits_until_the_sessions_server_can_store_nothing_more(
     world: Installed, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    """Its record stays, for the others: it may get requests for a while after its end."""
+    """The server's record stays for the other members, so requests can be signed for it for a while after its end."""
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", SIGNING)
     pair(world.put, tmp_path)
     world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now())
@@ -368,7 +370,7 @@ def test_questions_and_answers_of_match_are_erased(world: Installed, capsys: Any
 
 @pytest.mark.parametrize("written", [True, False], ids=["carried out", "not carried out"])
 def test_the_lobby_does_not_write_an_erased_participant_again(world: Installed, tmp_path: Path, written: bool) -> None:
-    """A decision may stand in its document for a while after it was carried out, or be carried out later."""
+    """A decision may remain in the lobby's document after it was carried out, or be carried out later."""
     then = datetime.now(UTC) - timedelta(minutes=1)
     other = ids.server_label("maze", BOB)
     formed = Formed(SID, (Matched(LABEL, ANN), Matched(other, BOB)), then)

@@ -1,4 +1,4 @@
-"""`deploy logs`: every line of every function and server, in the order of time."""
+"""`deploy logs`: it shows the lines of all functions and servers in the order of time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOW = datetime.now(UTC)
 def put_messages(
     world: Installed, source: str, *messages: str, ago: float = 60, stream: str = "a", step: float = 0.001
 ) -> None:
-    """Log messages, the first so many seconds ago."""
+    """Put messages into the log of a function, the first of them `ago` seconds ago."""
     client, group = world.client("logs"), resource_names.log_group("hippodrome", source)
     for create, names in (
         (client.create_log_group, {"logGroupName": group}),

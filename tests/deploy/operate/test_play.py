@@ -1,4 +1,4 @@
-"""`doctor --rehearse --play`: bots through a copy of a study in an installation that lives, and what the transcript says."""
+"""`doctor --rehearse --play`: bots walk through a copy of a study in a running installation; the transcript."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write_study(
     project: Mapping[str, Any] = MappingProxyType({}),
     trial: Mapping[str, Any] = MappingProxyType({}),
 ) -> Path:
-    """A study for AWS whose game lasts longer than any bot plays."""
+    """Write a study for AWS whose game lasts longer than any bot plays."""
     (folder / "steps").mkdir(parents=True)
     on_aws = {"useAWS": True, "awsSetup": {"cpu": 0.5, "memory": 1}}
     config = {"project": {**CONFIG["project"], **on_aws, **project}, "trial": {**CONFIG["trial"], **trial}}
@@ -66,7 +66,7 @@ def write_study(
 
 @pytest.fixture
 def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
-    """An installation that lives, with one live study."""
+    """A running installation with one live study."""
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
     with held(write_study(tmp_path / "study"), monkeypatch, play=1.5, email="admin@example.org") as world:
         yield world
@@ -74,7 +74,7 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running
 
 @pytest.fixture
 def running_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
-    """An installation that lives, with one live study in which two participants play together."""
+    """A running installation with one live study in which two participants play together."""
     monkeypatch.setattr(whole, "FRESH", timedelta(0))
     both = {"players": {"left": "human", "right": "human"}, "countdown": 0, "actionSpace": ["noop", "up", "down"]}
     study = write_study(
@@ -92,7 +92,7 @@ def play(running: RunningInstallation, capsys: Any, *arguments: str) -> CommandR
 
 
 def documents(running: RunningInstallation) -> set[str]:
-    """What lies in the bucket."""
+    """The documents in the bucket, by key."""
     return set(running.keys())
 
 
@@ -116,7 +116,7 @@ def test_a_rehearsal_proves_every_line_and_leaves_nothing(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(whole, "FRESH", FRESH)
-    running.visited = f"projectId={STUDY}&userId=somebody"  # so that a function has just read the list of projects
+    running.visited = f"projectId={STUDY}&userId=somebody"  # then a function has just read the list of projects
     running.until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(running))
     before, file = documents(running), tmp_path / "transcript.json"
     ran = play(running, capsys, "--json", "--transcript", str(file))
@@ -135,11 +135,11 @@ def test_a_rehearsal_proves_every_line_and_leaves_nothing(
     assert {stage: bool(seconds) for stage, seconds in stages.items()} == dict.fromkeys(STAGES, True)
     assert walk.KILLED in running.stopped
     assert running.alarmed == ["ALARM", "OK"]
-    # What is kept as evidence names nobody, opens nothing, and does not say whose account this is.
+    # The transcript names no participant and no account, and holds no secret.
     secrets = {*running.secrets, ACCOUNT, running.root_domain, running.env["BUCKET"], running.ids["zone"], "arn:aws"}
     assert [secret for secret in secrets if secret in file.read_text() or secret in ran.err] == []
     assert len(secrets) > 10
-    # And nothing is left of it.
+    # Nothing of the rehearsal is left.
     assert documents(running) == before
     assert_nothing_left(running)
 
@@ -208,7 +208,7 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInst
     copy.make(registered_projects(platform.documents)[0])
     walked = copy.user("1")
     running.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
-    running.record(copy.user("2"), ServerState.CLOSED, copy.project)  # it has nothing but a server's record
+    running.record(copy.user("2"), ServerState.CLOSED, copy.project)  # only a server's record is left of it
     now = datetime.now(UTC)
     assert left_behind(platform.documents, now) == [], "it may be under way"
     assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
@@ -344,7 +344,7 @@ def test_the_copy_has_the_pages_of_the_study() -> None:
     assert below == {"s/steps/one.html": "one.html", "s/steps/photo.png": "photo.png"}
 
 
-# What is kept
+# The transcript
 
 
 @pytest.mark.parametrize(
@@ -391,11 +391,11 @@ def test_a_line_that_was_bad_once_is_not_proven() -> None:
         transcript.good("something else", "fine")
 
 
-# Beside the simulation
+# The rehearsal and the simulation
 
 
 def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
-    """`deploy` imports nothing of `bench`: its table must follow."""
+    """`deploy` imports nothing of `bench`, so its own table must be kept equal."""
     median, sigma, longest = conditions.STARTS
     usual = tuple(float(round(median * math.exp(sign * 2 * sigma))) for sign in (-1, 1))
     assert (STAGES["start"].usual, STAGES["start"].most) == (usual, longest)
@@ -409,7 +409,7 @@ def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
 
 
 def arrows() -> dict[str, list[str]]:
-    """The lines that each row of docs/unproven.md names, by what is not proven."""
+    """The lines of the transcript that each row of docs/unproven.md names, by the row's first column."""
     rows = [line.split("|") for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|"]
     return {row[1].strip(): re.findall(r"`(.*?)`", row[-2].partition("→")[2]) for row in rows[2:]}
 

@@ -1,4 +1,4 @@
-"""`deploy status`: the truth about who is where and what runs, from listings, and without a single id."""
+"""`deploy status`: where participants are and which servers run, from listings, without any id of a participant."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_warm_servers_are_counted_separately_and_not_as_participants(world: Inst
     assert maze["participants"] == 0
     assert found["servers"]["byState"] == {"ready": 4, "starting": 1}
     assert sorted(server["warm"] for server in found["servers"]["open"]) == [False, True, True, True, True]
-    assert found["servers"]["closedToday"] == {}  # somebody plays on it
+    assert found["servers"]["closedToday"] == {}  # a participant plays on it
     text = world.run(capsys, "status").out
     assert "maze: 3 of 4 warm servers ready; 1 taken today." in text
     assert "4 ready, 1 starting, 4 of them warm" in text
@@ -222,7 +222,7 @@ def test_status_shows_queues_alarms_and_the_certificate(world: Installed, capsys
     world.client("cloudwatch").set_alarm_state(
         AlarmName="hippodrome-dead-letters", StateValue="ALARM", StateReason="test"
     )
-    world.client("cloudwatch").put_metric_alarm(  # somebody else's
+    world.client("cloudwatch").put_metric_alarm(  # another owner's
         AlarmName="hippodrome-other", Namespace="x", MetricName="y", Statistic="Maximum", Period=60,
         EvaluationPeriods=1, Threshold=0, ComparisonOperator="GreaterThanThreshold",
     )  # fmt: skip
@@ -284,7 +284,7 @@ def test_status_of_an_installation_without_projects_says_so(installed: Installed
 
 
 def test_a_second_look_reads_only_changed_records(world: Installed, monkeypatch: Any) -> None:
-    monkeypatch.setattr(server_records, "SETTLED", timedelta(0))  # else what was written a moment ago is read again
+    monkeypatch.setattr(server_records, "SETTLED", timedelta(0))  # by default, recently written records are read again
     for user in ("alice", "bob", "carol"):
         world.record(user)
     records = Records(world.platform.documents)

@@ -1,4 +1,4 @@
-"""`deploy stop`: every server goes, nothing of it stays, and it can be said twice."""
+"""`deploy stop`: it stops every server, leaves nothing of it, and can be repeated."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def world(installed: Installed) -> Installed:  # noqa: F811
 
 
 def start(world: Installed, project: str, *users: str) -> None:
-    """Servers that run, with timer and name."""
+    """Start servers of these participants, with their timers and DNS names."""
     servers = Servers(world.platform)
     before = set(world.task_arns())
     for user in users:
@@ -72,7 +72,7 @@ def test_a_second_run_has_nothing_to_do(world: Installed, capsys: Any) -> None:
     start(world, "maze", "alice")
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
     with world.recording() as calls:
-        ran = world.run(capsys, "stop")  # asks nothing
+        ran = world.run(capsys, "stop")  # without a question
     assert ran.code == Exit.DONE
     assert "Nothing runs" in ran.err
     assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]
@@ -123,7 +123,7 @@ def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(worl
 
 
 def test_a_start_message_after_stop_starts_no_server(world: Installed, capsys: Any) -> None:
-    world.record("alice", ServerState.STARTING)  # claimed; neither timer nor task yet
+    world.record("alice", ServerState.STARTING)  # the record is written; there is neither timer nor task yet
     assert world.run(capsys, "stop", "--yes", "--json").json["stopped"] == 1
     Servers(world.platform).start(StartServer("maze", "alice"))
     assert running_servers(world) == []
@@ -141,11 +141,11 @@ def test_warm_servers_are_stopped_too_and_stop_says_that_a_live_study_gets_new_o
 ) -> None:
     world.register(WARM)
     world.warm(WARM, 3)
-    Servers(world.platform).start(StartServer("maze", "alice"))  # takes one of them
+    Servers(world.platform).start(StartServer("maze", "alice"))  # alice takes one of the warm servers
     dry = world.run(capsys, "stop", "--dry-run", "--json").json
     assert dry["found"]["servers"] == 3
     assert sorted(line["warm"] for line in dry["servers"]) == [False, True, True]
-    assert sum(dry["found"].values()) == 3  # what alice plays on is hers, not left over
+    assert sum(dry["found"].values()) == 3  # alice's server is no leftover
     ran = world.run(capsys, "stop", "--yes")
     assert ran.code == Exit.DONE
     assert "3 servers were stopped; nothing is left" in ran.err

@@ -1,4 +1,4 @@
-"""The servers' certificate goes from a removed installation to the next one, so that five of them order once."""
+"""An installation takes over the servers' certificate of a removed one, so five in succession order only once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FULLCHAIN, PRIVKEY, STATE = location(f"servers.{DOMAIN}", DOMAIN)
 
 
 class Authority:
-    """Let's Encrypt, as far as it counts: what was ordered there, and for which accounts."""
+    """A fake Let's Encrypt that records orders and their accounts."""
 
     def __init__(self) -> None:
         self.orders: list[str] = []
@@ -85,7 +85,7 @@ def document(world: World, number: int, key: str) -> bytes:
 
 
 def stored_serial(world: World, number: int) -> str:
-    """The serial number of the certificate that is in place."""
+    """The serial number of the stored certificate."""
     stored = order.read_stored(document(world, number, PRIVKEY))
     assert stored
     return stored.serial

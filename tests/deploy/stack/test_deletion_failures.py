@@ -1,4 +1,4 @@
-"""What CloudFormation says when a deletion is refused, in the words that people have reported, and what helps."""
+"""CloudFormation's messages for refused deletions, as people have reported them, and the remedy for each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from deploy.stack.deletion_failures import TABLE, Recovery, recoveries, recovery
 from deploy.stack.stack import FailedResource
 from testing.template import template
 
-REPORTED = [  # the type, the sentence, what helps; sources beside them
+REPORTED = [  # the type, the message, the remedy; the source is beside each
     ("ECS::Cluster", "The Cluster cannot be deleted while Tasks are active.", Recovery.SERVERS),  # cloud-nuke 368
     ("ECS::Cluster", "The Cluster cannot be deleted while it contains Tasks.", Recovery.SERVERS),
     (

@@ -1,4 +1,4 @@
-"""Servers' names that move to another domain while an installation stands: what `apply` looks at before."""
+"""Changes of the servers' names, the site or the network of an installation: what `apply` checks beforehand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.deploy.installation import KEYS, Installed
 
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installed]:
-    """An installation as earlier versions made it: servers have names directly below example.org."""
+    """An installation of an earlier version: servers have names directly below example.org."""
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     # Gap: moto's hosted zones have ids that begin with anything. AWS's begin with Z.
@@ -31,7 +31,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installed]:
 
 
 def prepared(world: Installed, account: Account | None = None, **changed: str) -> Prepared:
-    """An apply that gives servers a level of their own, or what is said instead."""
+    """A prepared apply that gives the servers' names a level of their own, or other changes."""
     stands = {"RootDomain": "example.org", "HostedZoneId": world.env["HOSTED_ZONE_ID"], "SiteHost": "study"}
     outputs = [{"OutputKey": key, "OutputValue": value} for key, value in world.outputs.items()]
     parameters = [{"ParameterKey": key, "ParameterValue": value} for key, value in stands.items()]
@@ -77,7 +77,7 @@ def test_running_servers_stop_a_change_of_the_site(world: Installed, state: Serv
         assert caught.value.details == ("1 of them",)
     with world.recording() as calls:
         domain_change.check_site(prepared(world))
-    assert calls == []  # the site stays
+    assert calls == []  # the site does not change
     world.record("alice", ServerState.CLOSED)
     domain_change.check_site(prepared(world, SiteHost="lab"))
 
@@ -138,7 +138,7 @@ def test_a_site_cannot_have_a_name_that_the_certificate_of_other_servers_covers(
 
 
 def test_a_manual_certificate_needs_another_for_the_new_names(world: Installed) -> None:
-    domain_change.certify(prepared(world))  # none at all: nobody can play, and nothing is to be kept going
+    domain_change.certify(prepared(world))  # no certificate: nobody can play, so nothing has to go on
     world.put("SSL/privkey.pem", b"-----BEGIN PRIVATE KEY-----\n")
     with pytest.raises(Problem, match=r"there is none for \*\.servers\.example\.org") as caught:
         domain_change.certify(prepared(world))

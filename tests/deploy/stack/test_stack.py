@@ -1,4 +1,4 @@
-"""Stack, template, zone, settings and code bucket: what the plan stands on."""
+"""Stack, template, zone, settings and code bucket, on which plan and apply are built."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_failures_of_earlier_operations_are_not_reported(world: World) -> None:
 
 
 def test_the_status_before_an_operation_is_not_taken_for_its_end(world: World) -> None:
-    """ExecuteChangeSet returns before the stack says IN_PROGRESS: UPDATE_COMPLETE is still that of the last time."""
+    """ExecuteChangeSet returns before the status is IN_PROGRESS; until then UPDATE_COMPLETE is that of the last update."""
     world.stand("UPDATE_COMPLETE")
     stack, stack_id = made(world), world.cloud.stack["StackId"]
     after = stack.last_event(stack_id)
@@ -289,7 +289,7 @@ def test_delegation_is_read_from_a_name_server(dns: Any, monkeypatch: pytest.Mon
 
 @pytest.fixture
 def dns(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A real name server on loopback that answers NS queries; None: one that never answers."""
+    """Starts a real name server on loopback that answers NS queries; with None, one that never answers."""
     import socket
     import threading
 
@@ -353,7 +353,7 @@ def test_the_first_settings_have_the_defaults(world: World) -> None:
 
 
 def test_the_name_of_the_site_must_fit_a_certificate(world: World) -> None:
-    """ACM: the first name has 64 characters at most."""
+    """ACM: the first name of a certificate has at most 64 characters."""
     domain = f"{'x' * 50}.example"
     world.make_zone(domain)
     assert decide(world, StackSettings(domain=domain, site="study"))["SiteHost"] == "study"
@@ -363,7 +363,7 @@ def test_the_name_of_the_site_must_fit_a_certificate(world: World) -> None:
 
 
 def chosen(world: World, previous: dict[str, str] | None = None, **asked: Any) -> dict[str, str]:
-    """The zones that are decided on, with a template that has them as parameters."""
+    """The availability zones that the settings choose, with a template that has them as parameters."""
     defaults = Template(TEMPLATE).defaults | {"ZoneA": None, "ZoneB": None}
     subnets = asked.pop("standing", ())
     settings = StackSettings(domain="example.org", **asked)
@@ -377,7 +377,7 @@ def test_two_zones_with_fargate_are_chosen(world: World, monkeypatch: pytest.Mon
         {"ZoneName": f"ca-central-1{letter}", "ZoneId": f"cac1-az{number}", "State": "available"} | more
         for letter, number, more in [
             ("d", 1, {}),
-            ("c", 4, {}),  # no Fargate
+            ("c", 4, {}),  # a zone without Fargate
             ("b", 2, {}),
             ("a", 1, {"State": "impaired"}),
             ("a-x-1a", 2, {"ZoneType": "local-zone"}),
@@ -392,7 +392,7 @@ def test_two_zones_with_fargate_are_chosen(world: World, monkeypatch: pytest.Mon
 
 
 def test_zones_stay_as_they_are(world: World) -> None:
-    """A subnet that moved would be made anew beside the old one, with the same range."""
+    """CloudFormation would create the moved subnet beside the old one, with the same address range."""
     stood = {"ZoneA": "ca-central-1d", "ZoneB": "ca-central-1a"}
     assert chosen(world, stood) == stood
 

@@ -1,4 +1,4 @@
-"""Every state that a stack may be in: what `apply` says and does, and that the next run goes on from there."""
+"""Every state that a stack may have: what `apply` prints and does, and that the next run continues from there."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WORKS = {
     "IMPORT_ROLLBACK_COMPLETE",
 }
 
-ENDS = {  # how each operation that is under way may end
+ENDS = {  # the possible ends of each operation in progress
     "CREATE_IN_PROGRESS": ["CREATE_COMPLETE", "CREATE_FAILED", "ROLLBACK_COMPLETE"],
     "ROLLBACK_IN_PROGRESS": ["ROLLBACK_COMPLETE", "ROLLBACK_FAILED"],
     "DELETE_IN_PROGRESS": ["DELETE_COMPLETE", "DELETE_FAILED"],
@@ -46,7 +46,7 @@ ENDS = {  # how each operation that is under way may end
 
 
 def what_follows(status: str) -> list[list[Step]]:
-    """What CloudFormation does of what `apply` asks it to, in that state."""
+    """The operations that CloudFormation executes for `apply` in that state."""
     return {
         StackAction.RECREATE: [list(DELETED)],
         StackAction.ROLL_BACK: [list(TAKEN_BACK)],
@@ -77,7 +77,7 @@ def test_from_any_state_a_run_or_the_advised_remedy_and_a_run_succeed(
         assert problem.advice.startswith("Remove it with `python -m deploy destroy --stack hippodrome` (the data stay)")
         assert not world.cloud.called("create_change_set")
         world.cloud.operations = [list(DELETED)]
-        world.cloud.delete_stack(StackName="hippodrome")  # as destroy does
+        world.cloud.delete_stack(StackName="hippodrome")  # destroy does this
         apply(world.account, "hippodrome", FIRST)
     assert world.cloud.stack is not None
     assert world.cloud.stack["StackStatus"] in WORKS
@@ -119,7 +119,7 @@ def test_a_stack_in_an_unknown_state_is_left_alone(world: World) -> None:
 
 
 def test_a_failed_update_is_rolled_back_before_the_next(world: World) -> None:
-    """CloudFormation takes no change set with rollback in UPDATE_FAILED, which is left by updates without rollback."""
+    """In UPDATE_FAILED, the end of a failed update without rollback, CloudFormation accepts no change set with rollback."""
     world.stand("UPDATE_FAILED")
     world.cloud.operations = [list(TAKEN_BACK)]
     assert apply(world.account, "hippodrome", StackSettings(max_runtime=30)).changed

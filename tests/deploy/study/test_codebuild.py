@@ -77,10 +77,10 @@ def test_a_failed_build_reports_its_cause_and_nothing_is_registered(
     register_world.outcome = "SUCCEEDED"
     assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
     assert len(register_world.builds) == 2
-    assert register_world.made.count("s3:PutObject") == 4  # three pages and a bundle, none of them twice
+    assert register_world.made.count("s3:PutObject") == 4  # three pages and a bundle, each once
 
 
-BUILDKIT = [  # as BuildKit tells of a step that fails: as it comes, and once more at the end
+BUILDKIT = [  # BuildKit prints the output of a failed step when it comes, and again at the end
     '#17 [tried 2/2] RUN ["python", "-m", "trial.check", "/hippodrome/check.json", "60"]',
     "#17 2.113 {line}",
     '#17 ERROR: process "python -m trial.check /hippodrome/check.json 60" did not complete successfully: exit code: 1',
@@ -139,7 +139,7 @@ def test_builds_that_stop_or_time_out_are_reported(
 def test_a_build_that_leaves_no_image_is_no_success(
     register_world: RegisterWorld, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A push that was cut off: layers without a manifest are no image."""
+    """A push that was cut off leaves layers without a manifest, which are no image."""
     register_world.push = False
     ran = register_world.run(capsys, "register", str(folder))
     assert ran.code == Exit.FAILED
@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_the_build_running_and_the_next_run_joins_it(
 def test_the_first_of_two_builds_of_the_same_image_counts(
     register_world: RegisterWorld, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its tag is given once: the push of the second is refused, and what is there is just what was wanted."""
+    """A tag is used once: the second push is refused, and the image of the first is the wanted one."""
     register_world.looks, register_world.outcome = 2, "FAILED"
     register_world.log = [
         "ERROR: tag invalid: The image tag already exists and cannot be overwritten because it is immutable"
@@ -236,7 +236,7 @@ def test_rebuild_makes_another_image_that_stays(
     assert register_world.project().task_definition != first
     newest = register_world.project().task_definition
     assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
-    assert register_world.project().task_definition == newest  # and it stays with the newer one
+    assert register_world.project().task_definition == newest  # later runs keep the newer image
     assert len(register_world.builds) == 2
 
 

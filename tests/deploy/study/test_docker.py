@@ -40,7 +40,7 @@ def test_docker_builds_where_it_runs(
         calls[-1]["files"]
     )
     assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
-    assert docker_calls(register_world.docker) == calls  # nothing is built twice
+    assert docker_calls(register_world.docker) == calls  # the image is not built twice
 
 
 def test_build_on_aws_does_not_use_docker(

@@ -1,4 +1,4 @@
-"""The Dockerfile of a project's image, and what the image runs."""
+"""The Dockerfile of a project's image, and the server that the image runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[3]
 def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> None:
     words = [word for word, _ in recipe.steps]
     known = {"ARG", "FROM", "ENV", "RUN", "COPY", "VOLUME", "WORKDIR", "USER", "EXPOSE", "STOPSIGNAL", "CMD"}
-    assert set(words) == known  # no ADD, which fetches from the net; no ENTRYPOINT or HEALTHCHECK of our own
+    assert set(words) == known  # no ADD, which can download; no ENTRYPOINT or HEALTHCHECK of our own
     user, _ = recipe.all("USER")[-1].split(":")
     assert user.isdecimal()
     assert int(user) > 0
@@ -53,7 +53,7 @@ def test_the_dockerfile_runs_what_local_runs(recipe: Recipe) -> None:
 
     command = json.loads(recipe.all("CMD")[0])  # the exec form: python itself gets SIGTERM, not a shell
     assert command == ["python", *(word for word in PYTHON_TRIAL[1:] if word != "-P")]
-    assert recipe.env["PYTHONSAFEPATH"] == "1"  # what -P says
+    assert recipe.env["PYTHONSAFEPATH"] == "1"  # the same as -P
     assert recipe.all("WORKDIR") == [recipe.env["AGENT_DIR"]]
 
 
@@ -61,7 +61,7 @@ def test_a_stage_tries_the_agent_and_adds_nothing_to_the_image(recipe: Recipe) -
     """BuildKit skips a stage of which nothing is used: https://docs.docker.com/build/building/multi-stage/"""
     _, tried, last = stages()
     assert recipe.all("FROM") == ["${BASE} AS image"]
-    assert tried.steps == [  # as the image's own user, with its variables
+    assert tried.steps == [  # as the image's user, with its variables
         ("FROM", "image AS tried"),
         ("COPY", "check.json /hippodrome/check.json"),
         ("RUN", '["python", "-m", "trial.check", "/hippodrome/check.json", "60"]'),
@@ -157,7 +157,7 @@ def test_the_files_of_the_image_can_play_a_game(recipe: Recipe, folder: Path, tm
         container.process.communicate()
     answer = json.loads((tmp_path / "store/maze/users/P1/answers/3.json").read_text())
     assert answer["answers"]["episodes"] == 1
-    assert container.files() == container.before  # nothing is written but below /scratch
+    assert container.files() == container.before  # files are written only below /scratch
 
 
 def test_sigterm_ends_the_server_of_the_image(recipe: Recipe, folder: Path, tmp_path: Path) -> None:

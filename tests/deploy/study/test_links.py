@@ -1,4 +1,4 @@
-"""`deploy links`: what it prints opens the study, and nothing else does."""
+"""`deploy links`: the links that it prints open the study, and changed ones do not."""
 
 from __future__ import annotations
 

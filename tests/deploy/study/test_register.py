@@ -112,7 +112,7 @@ def test_a_study_takes_the_installations_port_when_it_is_registered_again(
 
 
 def test_a_participant_comes_and_a_server_starts(register_world: RegisterWorld, tmp_path: Path, capsys: Capsys) -> None:
-    """The example study as it is shipped: its page is shown, and its server is told where the certificate is."""
+    """The unchanged example study: its page is shown, and its server gets the place of the certificate."""
     study = tmp_path / "example"
     (study / "steps").mkdir(parents=True)
     (study / "config.yml").write_text((ROOT / "config.yml").read_text())
@@ -199,7 +199,7 @@ def test_a_live_study_keeps_its_pages_until_its_new_image_exists(
 
 
 def test_a_page_whose_etag_is_no_md5_is_read(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    """As with a KMS key: the ETag says nothing, the content does."""
+    """With a KMS key the ETag is no hash of the content, so the content itself is compared."""
     register_world.run(capsys, "register", str(folder))
     s3 = register_world.client("s3")
     listed = s3.list_objects_v2(Bucket=register_world.env["BUCKET"], Prefix="maze/steps/")["Contents"]
@@ -243,7 +243,7 @@ def test_another_size_is_another_revision_of_the_same_image(
 def test_pages_of_more_than_a_listing_are_registered(
     register_world: RegisterWorld, folder: Path, capsys: Capsys
 ) -> None:
-    """S3 lists 1,000 keys at a time; here one, which is as good."""
+    """S3 lists 1,000 keys at a time; here a page has one key."""
     for name in ("a.txt", "b.txt", "c.txt"):
         register_world.put(f"maze/steps/{name}", b"x")
     s3 = register_world.client("s3")
@@ -290,8 +290,8 @@ def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: P
     (folder / "agent.py").write_text("class Agent:\n    new = True\n")
     register_world.outcome, register_world.made = "FAILED", []
     ran = register_world.run(capsys, "register", str(folder), "--no-live")
-    assert ran.code == Exit.FAILED  # the new image could not be built
-    assert not register_world.project().live  # but nobody gets in
+    assert ran.code == Exit.FAILED  # because the new image could not be built
+    assert not register_world.project().live  # but no participant is admitted any more
     assert register_world.made.index("lambda:Invoke") == 2
 
 
@@ -309,7 +309,7 @@ def test_a_study_is_closed_although_its_config_is_broken(
 
 
 def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    """Also what records leave out because it is the default, such as 1 vCPU and 2 GB."""
+    """Values that records leave out because they are the default, such as 1 vCPU and 2 GB, stay as well."""
     write_study(folder, steps__consent_DOT_html="x")
     configure(
         folder,
@@ -355,7 +355,7 @@ def test_steps_of_a_study_with_participants_change_only_after_a_yes(
 def test_a_copied_folder_replaces_a_study_with_participants_only_after_a_yes(
     register_world: RegisterWorld, folder: Path, capsys: Capsys
 ) -> None:
-    """Its pages and its agent would be those of the other study's participants."""
+    """Otherwise the other study's participants would get these pages and this agent."""
     assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
     configure(folder, ("A maze", "A second study"))
     assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE, "nobody has taken part yet"

@@ -1,4 +1,4 @@
-"""What `register` says of mistakes, of what AWS refuses, and of what the image lacks."""
+"""`register` reports mistakes, refusals of AWS, and packages that the image lacks."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_with_strict_a_remark_stops_register_beforehand(
 def test_a_clone_of_hippo_gym_is_registered_as_it_is(
     register_world: RegisterWorld, tmp_path: Path, capsys: Capsys
 ) -> None:
-    """Its pages, its agent in App/, its id with an underscore, and nothing of HIPPO's own programs on the way."""
+    """Its pages, its agent in App/ and its id with an underscore are registered, and none of HIPPO's own programs."""
     files = {
         "config.yml": """\
 project:
@@ -152,7 +152,7 @@ def test_a_template_of_hippo_gym_is_registered_with_its_last_page(
 def test_a_study_without_an_id_is_not_registered_by_the_name_of_its_folder(
     register_world: RegisterWorld, tmp_path: Path, capsys: Capsys, use: str, said: str
 ) -> None:
-    """Two clones of the same template would otherwise be one study."""
+    """Otherwise two clones of the same template would be one study."""
     clone = write_study(tmp_path / "HIPPO_Gym")
     configure(clone, ("id: maze", "id:"), ("  useAWS: true\n", f"  {use.rstrip(', ')}\n" if use else ""))
     ran = register_world.run(capsys, "register", str(clone))
@@ -281,7 +281,7 @@ def test_mistakes_that_the_function_finds_are_reported(
 def test_register_advises_an_update_if_the_function_does_not_know_a_key(
     register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here the study has a key more; what the function says of it is the same."""
+    """Here the study has an additional key; the message of an older function would be the same."""
     known = registry.register
 
     def older(platform: Any, registration: dict[str, Any]) -> Any:
@@ -330,7 +330,7 @@ def test_ctrl_c_at_any_change_leaves_no_half_registered_project(
         assert len(register_world.keys(f"{name}/steps/")) == 3
         assert len(register_world.builds) == 1, what
         written = [call.params["Key"] for call in register_world.calls if call.action == "s3:PutObject"]
-        cut_off = calls[place] == "s3:PutObject"  # it is counted, but never arrived
+        cut_off = calls[place] == "s3:PutObject"  # the call is counted, but was never executed
         assert len(set(written)) == len(written) - cut_off, what
 
 

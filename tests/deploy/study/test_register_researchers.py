@@ -1,4 +1,4 @@
-"""Several researchers register at once; what their credentials must allow."""
+"""Several researchers register at once; the permissions that they need."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_two_versions_registered_at_once_both_succeed_and_share_one_image(
 
 
 def _asks(register_world: RegisterWorld, action: str, params: dict[str, Any]) -> list[Ask]:
-    """What a call of `register` needs, by AWS's Service Authorization Reference."""
+    """The permissions that a call of `register` needs, by AWS's Service Authorization Reference."""
     here, bucket = f"us-east-1:{ACCOUNT}", f"arn:aws:s3:::{register_world.env['BUCKET']}"
     stack, families = f"arn:aws:cloudformation:{here}:stack/hippodrome/1", f"arn:aws:ecs:{here}:task-definition"
     service, operation = action.split(":")
