@@ -89,7 +89,7 @@ def played(running: RunningInstallation) -> None:
     now = datetime.now(UTC)
     then = max(
         now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0)
-    )  # the page shows a participant of today
+    )  # today, as the page shows
     running.record("me", ServerState.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)
