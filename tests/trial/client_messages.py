@@ -1,4 +1,4 @@
-"""What every client on a trial server does with messages, whatever it makes of them."""
+"""How the tests' clients take messages from a trial server, whatever each client does with them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 
 
 class TakesMessages:
-    """A client that takes its messages one by one, by `take`."""
+    """A client that receives its messages one by one, in `take`."""
 
     websocket: ClientConnection
 
@@ -21,13 +21,13 @@ class TakesMessages:
         raise NotImplementedError
 
     async def until(self, true: Any, seconds: float = 15) -> None:
-        """Take messages until something is true."""
+        """Take messages until `true()` is true; TimeoutError after `seconds`."""
         async with asyncio.timeout(seconds):
             while not true():
                 await self.take()
 
     async def watch(self, seconds: float) -> None:
-        """Take messages for so long."""
+        """Take messages for `seconds`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 while True:
@@ -35,7 +35,7 @@ class TakesMessages:
 
     @contextlib.asynccontextmanager
     async def reading(self) -> AsyncIterator[None]:
-        """Take what comes meanwhile: who takes no pictures is away after some seconds, and the game of all is held."""
+        """Take messages meanwhile: a client that takes no pictures is away after some seconds, and the game is held for all."""
         task = asyncio.create_task(self.watch(600))
         try:
             yield
@@ -45,14 +45,14 @@ class TakesMessages:
                 await task
 
     async def closed(self, seconds: float = 15) -> int | None:
-        """Take messages until the connection is closed; the code."""
+        """Take messages until the connection is closed; return the code."""
         with contextlib.suppress(ConnectionClosed):
             await self.until(lambda: False, seconds)
         return self.websocket.close_code
 
 
 def play_to_the_end(server: Any, open_client: Any) -> None:
-    """One client starts the game of this server and watches it until the trial is over."""
+    """Let one client start the game of this server and watch it until the trial is over."""
 
     async def play() -> None:
         async with open_client(server.address) as client:

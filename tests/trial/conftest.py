@@ -1,4 +1,4 @@
-"""A real trial server in a process of its own, and a small client to play on it."""
+"""Fixtures: a real trial server in a process of its own, and a small client that plays on it."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def grid_agent(length: int | None = None) -> str:
 
 
 class Running:
-    """A started trial server."""
+    """A trial server that runs in a process of its own."""
 
     def __init__(self, folder: Path, agent: str | None, trial: dict[str, Any], env: dict[str, str]) -> None:
         self.store = folder / "store"
@@ -104,7 +104,7 @@ class Running:
             "PORT": "0",
             "TLS": "off",
             "LINGER_SECONDS": "0.2",
-            "HELLO_SECONDS": "60",  # a machine that is busy with other tests takes its time
+            "HELLO_SECONDS": "60",  # tests at the same time make the machine slow
             "AGENT_DIR": str(agent_dir),
             "PYTHONPATH": str(ROOT),
         }
@@ -122,7 +122,7 @@ class Running:
     def address(self) -> str:
         return f"ws://127.0.0.1:{self.port}/"
 
-    def said(self) -> str:
+    def log_text(self) -> str:
         return self.log.read_text()
 
     def answer(self, step: str = "3") -> dict[str, Any]:
@@ -147,7 +147,7 @@ class Running:
 
 
 class Client(TakesMessages):
-    """What a browser does, with the messages it got kept by kind."""
+    """A client that plays as a browser does, and keeps the messages that it gets by kind."""
 
     def __init__(self, websocket: ClientConnection) -> None:
         self.websocket = websocket
@@ -188,7 +188,7 @@ class Client(TakesMessages):
             self.frames.append((time.monotonic(), frame_id))
             self.kinds.append(data[0])
             if self.acks:
-                with contextlib.suppress(ConnectionClosed):  # what came before the end is still to be read
+                with contextlib.suppress(ConnectionClosed):  # messages that came before the end are still read
                     await self.say(ack=frame_id)
             return
         if data == "done":
@@ -208,14 +208,14 @@ class Client(TakesMessages):
             self.state = message
             self.states.append(message["state"])
 
-    async def heard(self) -> None:
-        """Return when the server has heard all that was said so far; the next picture but one is of a later step."""
+    async def wait_until_heard(self) -> None:
+        """Return when the server has read all messages so far. The picture after the next one shows a later step."""
         self.controls = {}
         await self.say(command="requestUI")
         await self.until(lambda: self.controls)
 
-    async def sees(self, more: int) -> None:
-        """Take messages until so many more pictures have come."""
+    async def see(self, more: int) -> None:
+        """Take messages until `more` further pictures have come."""
         seen = len(self.frames)
         await self.until(lambda: len(self.frames) >= seen + more)
 
@@ -224,7 +224,7 @@ class Client(TakesMessages):
         await self.hello()
         await self.until(lambda: self.controls)
         await self.say(command="start")
-        await self.sees(frames)
+        await self.see(frames)
 
 
 @contextlib.asynccontextmanager

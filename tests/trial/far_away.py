@@ -1,4 +1,4 @@
-"""A network that is slow: a port that holds up every byte."""
+"""A slow network: a port that delays every byte."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator
 
 @contextlib.asynccontextmanager
 async def far_away(port: int, seconds: float) -> AsyncIterator[int]:
-    """A way to the port that holds up each byte for so long, in both directions; yields its own port."""
+    """Relay to the port, each byte `seconds` late in both directions; yield the relay's own port."""
     tasks = set()
 
     async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -89,7 +89,7 @@ class HippoPage(TakesMessages):
             self.frame_count += 1
             self.frame_id = message["frameId"]
 
-    async def heard(self) -> None:
+    async def wait_until_heard(self) -> None:
         """Return when the server has heard all that was said so far; the next picture but one is of a later step."""
         self.ui = []
         await self.command("requestUI")

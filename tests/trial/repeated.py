@@ -122,14 +122,14 @@ class Game:
     }  # fmt: skip
 
     def __init__(self, folder: Path, section: dict[str, Any], earlier: list[dict[str, Any]] | None = None) -> None:
-        self.settings = self.told({**self.SECTION, "players": self.PLAYS, **section})
+        self.settings = self.make_settings({**self.SECTION, "players": self.PLAYS, **section})
         self.trial = Trial(self.settings, "3", trial_id="t", new_seed=lambda: 7)
         agent = adapter(folder)
         self.players, self.policies = cast(agent, folder, self.settings.trial)
         humans = [player.name for player in self.players if player.human]
         stand_ins = humans if self.settings.trial.substitute else ()
         self.calls = JointCalls(agent, self.players, dict, record_observations=True, stand_ins=stand_ins)
-        self.waiting: dict[str, deque[Any]] = defaultdict(deque)  # what each policy has not come to yet
+        self.waiting: dict[str, deque[Any]] = defaultdict(deque)  # what each policy has not handled yet
         self.head: dict[str, Any] = {}
         self.lines: list[dict[str, Any]] = []
         self.now = 100.0
@@ -139,12 +139,12 @@ class Game:
             add_lines(recorded, earlier)
         self.begin(recorded)
 
-    def told(self, section: Mapping[str, Any]) -> TrialSettings:
-        """What the server is told."""
+    def make_settings(self, section: Mapping[str, Any]) -> TrialSettings:
+        """The settings of the server."""
         return settings_of(section, USER_ID="P1")
 
     def begin(self, recorded: RecordedTrial | None) -> None:
-        """The trial starts, and the participants connect."""
+        """Start the trial, and connect the participants."""
         raise NotImplementedError
 
     def event(self, name: str, *args: Any) -> None:
@@ -166,11 +166,11 @@ class Game:
                 effects += self.trial.answer_saved(self.now)
 
     def does(self, what: tuple[str, Any]) -> None:
-        """One thing happens: its name, and what belongs to it."""
+        """Let one thing happen, given by its name and its value."""
         raise NotImplementedError
 
     def plays(self, deeds: Iterable[tuple[str, Any]]) -> Self:
-        """All of this happens."""
+        """Let all of these things happen."""
         for deed in deeds:
             self.does(deed)
         return self
@@ -183,7 +183,7 @@ class Game:
         self.event("advance", self.now)
 
     def answers(self, player: str) -> None:
-        """The policy comes to what it was told, up to the next question, and answers that."""
+        """Let the policy handle its resets up to the next question, and answer that."""
         policy, waiting = self.policies[player], self.waiting[player]
         while waiting:
             effect = waiting.popleft()
@@ -203,7 +203,7 @@ class Game:
 
 
 def settings_of(section: Mapping[str, Any], **env: str) -> TrialSettings:
-    """The settings of a server of the study that is told this section and these variables."""
+    """The settings of a server of the study, from this section and these variables."""
     trial = json.dumps({"game": "x", "actionSpace": SPACE, **section})
     common = {"PROJECT_ID": "study", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
     return TrialSettings.from_env({**common, "TRIAL": trial, **env})
@@ -217,7 +217,7 @@ def adapter(folder: Path) -> JointAdapter:
 
 
 def cast(agent: JointAdapter, folder: Path, section: Section) -> tuple[list[Player], dict[str, Any]]:
-    """Who plays whom, and the policies by player: also those that may stand in for a participant."""
+    """The players, and the policies by player, with those that may play for a participant."""
     players = list(who_plays(section, {name: agent.action_spaces[name] for name in agent.players}, None))
     substitute = section.substitute
     stand_ins = [replace(player, plays=substitute) for player in players if player.human and substitute]
@@ -225,7 +225,7 @@ def cast(agent: JointAdapter, folder: Path, section: Section) -> tuple[list[Play
 
 
 def chosen(policy: Any, *seen: Any) -> Any:
-    """What the policy chooses, or the exception that it raises."""
+    """The action that the policy chooses, or the exception that it raises."""
     try:
         return policy.act(*seen)
     except ValueError as error:
@@ -233,7 +233,7 @@ def chosen(policy: Any, *seen: Any) -> Any:
 
 
 def repeat(folder: Path, section: Section, head: dict[str, Any], lines: list[dict[str, Any]]) -> None:
-    """Play what was recorded again, by the recording alone; assert that it is the same."""
+    """Play the game again from its recording alone, and assert that it goes as recorded."""
     agent = adapter(folder)
     players, policies = cast(agent, folder, section)
     humans = {player.name for player in players if player.human}

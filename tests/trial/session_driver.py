@@ -1,4 +1,4 @@
-"""Feeds the core of a session's trial by hand: two or more members, an agent that answers when it is told to."""
+"""Drives the core of a session's trial by hand: two or more members, and an agent that answers when a test tells it to."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class SessionDriver:
             for name in self.names
         )
         self.event("start", players, recorded, self.now, places=places, vacant=tuple(vacant), answered=answered)
-        self.works()
+        self.answer_calls()
 
     def view(self):
         act = self.names if self.turns is None else (self.turns[self.steps % len(self.turns)],)
@@ -86,8 +86,8 @@ class SessionDriver:
         self.kinds.update(map(type, self.effects))
         return self.effects
 
-    def works(self):
-        """Let the agent and the store answer what they were asked for, but take no step."""
+    def answer_calls(self):
+        """Let the agent and the store answer their calls, but take no step."""
         while True:
             call = self.trial._agent.call
             if isinstance(call, ResetCall):
@@ -114,20 +114,20 @@ class SessionDriver:
     def come(self, *numbers):
         for number in numbers:
             self.event("connect", f"P{number}", f"tab{number}", Window(), self.now)
-        return self.works()
+        return self.answer_calls()
 
     def go(self, *numbers):
         for number in numbers:
             self.event("disconnect", f"tab{number}", self.now)
-        return self.works()
+        return self.answer_calls()
 
     def say(self, number, **message):
         self.event("receive", f"tab{number}", messages.parse(json.dumps(message)), self.now)
-        return self.works()
+        return self.answer_calls()
 
-    def trip(self, number, seconds):
+    def round_trip(self, number, seconds):
         self.event("round_trip", f"P{number}", seconds, self.now)
-        return self.works()
+        return self.answer_calls()
 
     def wait(self, seconds):
         """Let time pass; take each step that is due meanwhile."""
@@ -136,11 +136,11 @@ class SessionDriver:
         while self.trial.wake_at is not None and self.trial.wake_at <= until:
             self.now = max(self.now, self.trial.wake_at)
             self.event("advance", self.now)
-            self.works()
+            self.answer_calls()
             self.take()
         self.now = until
         self.event("advance", self.now)
-        self.works()
+        self.answer_calls()
         return self.take()
 
     def take(self, *, rewards=None, terminated=False):
@@ -151,18 +151,18 @@ class SessionDriver:
             call.heard = len(call.feedback)
             paid = dict.fromkeys(self.names, 0.0) | (rewards or {})
             self.event("call_returned", call, StepTaken(paid, terminated, False, FRAME, b"step", self.view()), self.now)
-            self.works()
+            self.answer_calls()
         return self
 
     def begin(self):
-        """All are here, and the countdown is over; no step was taken."""
+        """Let all members come, and the countdown end; no step was taken."""
         self.come(*range(len(self.places)))
         self.now += self.settings.trial.countdown
         self.event("advance", self.now)
-        return self.works()
+        return self.answer_calls()
 
-    def told(self, number):
-        """What the member was told last of where the trial stands."""
+    def state_seen_by(self, number):
+        """The newest state of the trial that the member was sent."""
         tab, latest_first = f"tab{number}", reversed(self.all)
         texts = (e.text for e in latest_first if isinstance(e, SendState | SendMessage) and e.connection == tab)
         return next(said for said in map(json.loads, texts) if "state" in said)
@@ -183,7 +183,7 @@ class SessionDriver:
 
     @property
     def taken(self):
-        """The steps that have begun."""
+        """The calls of the steps that have begun."""
         return [effect for effect in self.all if isinstance(effect, StepCall)]
 
     @property

@@ -19,7 +19,7 @@ from tests.trial.two_players import two_players
 from trial.recordings import recording
 
 SID = "s.0123456789abcdef0123"
-TOKEN = "the-secret-token"  # of every server that conftest starts
+TOKEN = "the-secret-token"  # of every server that conftest.py starts
 MEMBERS = ("anna", "bert")
 TRIAL: dict[str, Any] = {
     **ONE_HUMAN,
@@ -49,13 +49,13 @@ def document(
 
 
 def form(store: Path, session: SessionDocument | None = None) -> None:
-    """What the lobby does when the session is formed."""
+    """Form the session, as the lobby does."""
     found = session or document()
     put(store, session_key("study", SID), found.to_json())
 
 
 def put(store: Path, key: str, body: bytes) -> None:
-    """Create a document whole."""
+    """Create a document at once, never half-written."""
     path = store / key
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".new")
@@ -64,13 +64,13 @@ def put(store: Path, key: str, body: bytes) -> None:
 
 
 def launch_session(launch: Any, *, trial: dict[str, Any] | None = None, agent: str | None = None, **env: str) -> Any:
-    """Start the server of the session; its document is another matter (`form`)."""
+    """Start the server of the session. `form` writes the session's document."""
     told = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60", **env}
     return launch(agent=agent or two_players(), trial={**TRIAL, **(trial or {})}, **told)
 
 
 def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
-    """What a member's page says first."""
+    """The fields of the hello that a member's page sends."""
     return {"userId": user_id, "token": member_token(TOKEN, user_id), "step": "3", **change}
 
 
@@ -78,9 +78,9 @@ def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
 async def member(
     server: Any, user_id: str, *, port: int = 0, forms: bool = False, **change: Any
 ) -> AsyncIterator[Client]:
-    """A member's client that has been let in, by another `port` perhaps.
+    """Yield a member's client that has been let in, on another `port` if one is given.
 
-    The session is formed before, or when the client is connected: the server's idle time begins then.
+    The session is formed before, or with `forms` when the client is connected: the server's idle time begins then.
     """
     async with client_of(f"ws://127.0.0.1:{port or server.port}/") as client:
         if forms:
@@ -89,12 +89,12 @@ async def member(
         try:
             await client.until(lambda: client.controls or client.done)
         except ConnectionClosed as closed:
-            raise AssertionError(f"{client.errors}; the server said:\n{server.said()}") from closed
+            raise AssertionError(f"{client.errors}; the server said:\n{server.log_text()}") from closed
         yield client
 
 
 async def refused(server: Any, open_client: Any, code: int = 4401, **hello: Any) -> str:
-    """Connect with this hello; the server closes the connection with this code. Return what it says."""
+    """Connect with this hello; the server must close the connection with this code. Return its last error."""
     async with open_client(server.address) as client:
         await client.hello(**{"userId": None, "token": None, **hello})
         assert await client.closed() == code, client.errors
@@ -105,20 +105,20 @@ async def refused(server: Any, open_client: Any, code: int = 4401, **hello: Any)
 
 
 async def both_play(server: Any, frames: int = 5) -> tuple[Client, Client]:
-    """Both members play until they have so many pictures; then one stops the game."""
+    """Let both members play until they have `frames` pictures; then one stops the game."""
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await anna.say(command="start")
         try:
             await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in (anna, bert)))
         except ConnectionClosed as closed:
-            raise AssertionError(f"{anna.errors}, {bert.errors}; the server said:\n{server.said()}") from closed
+            raise AssertionError(f"{anna.errors}, {bert.errors}; the server said:\n{server.log_text()}") from closed
         await anna.say(command="stop")
         assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
         return anna, bert
 
 
-async def both_see(frames: int, *clients: Client) -> None:
-    """Whoever did not take their pictures would be away after some seconds, and the game would be held."""
+async def wait_for_pictures(frames: int, *clients: Client) -> None:
+    """Let all clients take pictures: a client that took none would be away after some seconds, and the game would be held."""
     await asyncio.gather(*(each.until(lambda each=each: len(each.frames) >= frames) for each in clients))
 
 
@@ -129,6 +129,6 @@ def answer(store: Path, user_id: str, step: str = "3") -> dict[str, Any]:
 
 
 def recordings(store: Path, server: str = "pair-1") -> dict[str, list[dict[str, Any]]]:
-    """What a server of the session has recorded, by file."""
+    """The lines that a server of the session has recorded, by file."""
     folder = store / f"study/sessions/{SID}/trials/{server}"
     return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob("*.gz*"))}

@@ -17,7 +17,6 @@ from tests.trial.sessions import (
     SID,
     TOKEN,
     answer,
-    both_see,
     document,
     form,
     hello_of,
@@ -26,6 +25,7 @@ from tests.trial.sessions import (
     put,
     recordings,
     refused,
+    wait_for_pictures,
 )
 from trial.core.messages import Hello
 from trial.server import assignment, handshake
@@ -117,7 +117,7 @@ def test_what_was_played_with_one_whose_data_were_erased_counts_for_the_others(l
     async def play():
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(action="up", held=True)
-            await both_see(21, anna, bert)
+            await wait_for_pictures(21, anna, bert)
             first.terminate()
             await asyncio.gather(anna.closed(), bert.closed())
 

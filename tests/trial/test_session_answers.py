@@ -14,7 +14,6 @@ from tests.trial.sessions import (
     TRIAL,
     answer,
     both_play,
-    both_see,
     document,
     form,
     hello_of,
@@ -23,6 +22,7 @@ from tests.trial.sessions import (
     put,
     recordings,
     refused,
+    wait_for_pictures,
 )
 from tests.trial.two_players import two_players
 from trial.core.session import PARTNER_STOPPED
@@ -123,11 +123,11 @@ def test_no_members_id_stands_in_a_line_of_a_recording_or_of_the_log(launch):
     asyncio.run(run())
     server.wait()
     written = json.dumps(recordings(server.store))
-    assert "ValueError" in server.said()
+    assert "ValueError" in server.log_text()
     for each in members:
-        assert each not in server.said()
+        assert each not in server.log_text()
         assert each not in written
-    assert "(participant)" in server.said()
+    assert "(participant)" in server.log_text()
     hidden = said.replace(members[1], "(participant)")
     assert f"ValueError: {hidden}" in written
     assert f"KeyError: '{hidden}'" in written
@@ -242,7 +242,7 @@ def test_after_a_kill_the_next_server_goes_on_at_the_last_recorded_step_for_both
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(command="start")
             await anna.say(action="up", lasts=None)
-            await both_see(40, anna, bert)
+            await wait_for_pictures(40, anna, bert)
             first.process.kill()
             await asyncio.gather(anna.closed(), bert.closed())
 
@@ -273,7 +273,7 @@ def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_pr
     async def killed():
         async with member(first, "anna") as anna, member(first, "bert") as bert:
             await anna.say(command="start")
-            await both_see(30, anna, bert)
+            await wait_for_pictures(30, anna, bert)
             first.process.kill()
 
     asyncio.run(killed())
@@ -290,13 +290,13 @@ def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_pr
 REPORTING = """
 import os, json
 NAMES = ("USER_ID", "GROUP", "SESSION", "TOKEN")
-def told():
+def variables():
     return {name: os.environ.get(name) for name in NAMES}
-_first = told()
+_first = variables()
 class Reporting(Agent):
     def reset(self, seed=None):
         seen, infos = super().reset(seed)
-        return seen, {"left": {"first": _first, "now": told()}, "right": {}}
+        return seen, {"left": {"first": _first, "now": variables()}, "right": {}}
 Agent = Reporting
 """
 

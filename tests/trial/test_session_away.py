@@ -66,7 +66,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
                 await bert.until(lambda: bert.done)
 
     asyncio.run(run())
-    assert server.wait() == 0, server.said()
+    assert server.wait() == 0, server.log_text()
     lines = [line for found in recordings(server.store).values() for line in found]
     head = next(line for line in lines if line["kind"] == "header")
     assert head["players"]["left"] == {
@@ -110,4 +110,4 @@ def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, fo
                 task.cancel()
 
     asyncio.run(run())
-    assert "Traceback" not in server.said()
+    assert "Traceback" not in server.log_text()

@@ -68,21 +68,21 @@ def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_formed(l
 def test_the_server_looks_for_the_session_by_itself(launch):
     server = launch_session(launch, SPARE_SECONDS="0.1")
     form(server.store)
-    until(lambda: "the members of the session are known now: 2 of 2" in server.said(), 15)
+    until(lambda: "the members of the session are known now: 2 of 2" in server.log_text(), 15)
 
 
 def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
     server = launch_session(launch, IDLE_SECONDS="0", GRACE_SECONDS="0", DEADLINE=str(time.time() + 3))
     assert server.wait() == 0
-    assert "ending: deadline" in server.said()
-    assert "idle" not in server.said()
+    assert "ending: deadline" in server.log_text()
+    assert "idle" not in server.log_text()
 
 
 def test_a_session_whose_members_never_come_ends_the_server(launch):
     server = launch_session(launch, SPARE_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
     form(server.store)
     assert server.wait() == 0
-    assert "ending: idle" in server.said()
+    assert "ending: idle" in server.log_text()
 
 
 def test_a_member_who_comes_while_the_server_still_looks_for_old_recordings_is_not_sent_away(
@@ -141,12 +141,12 @@ def test_policies_of_each_group_are_there_before_the_group_is_known(launch):
     players = {"left": "human", "right": "human"}
     groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
     server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
-    until(lambda: "the agent is ready" in server.said(), 15)
-    assert "the third player's policy is made" in server.said()
+    until(lambda: "the agent is ready" in server.log_text(), 15)
+    assert "the third player's policy is made" in server.log_text()
     form(server.store, document(group=1))
     asyncio.run(both_play(server))
     assert server.wait() == 0
-    assert server.said().count("the third player's policy is made") == 1
+    assert server.log_text().count("the third player's policy is made") == 1
     (lines,) = recordings(server.store).values()
     assert lines[0]["players"]["third"]["policy"] == "agent:Third"
 
@@ -181,13 +181,13 @@ def test_a_bad_document_is_said_once_and_a_good_one_is_taken_later(launch, open_
     async def run():
         for _ in range(2):
             await refused(server, open_client, 1013, **hello_of("anna"))
-        assert server.said().count("cannot see whose this server is") == 1
+        assert server.log_text().count("cannot see whose this server is") == 1
         form(server.store)
         async with member(server, "anna"):
             pass
 
     asyncio.run(run())
-    assert "anna" not in server.said()
+    assert "anna" not in server.log_text()
 
 
 # ---- warm servers
@@ -207,7 +207,7 @@ def test_a_warm_server_that_is_handed_to_a_session_is_that_sessions(launch, open
 
     asyncio.run(run())
     assert server.wait() == 0
-    assert "this server is assigned to a session now" in server.said()
+    assert "this server is assigned to a session now" in server.log_text()
     assert {answer(server.store, each)["answers"]["session"] for each in MEMBERS} == {SID}
     assert recordings(server.store)
 
@@ -230,13 +230,13 @@ def test_an_idle_time_begins_when_the_session_is_formed_not_at_the_handover(laun
     time.sleep(0.5)
     put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
     asyncio.run(ask(server))
-    until(lambda: "assigned to a session now" in server.said(), 15)
+    until(lambda: "assigned to a session now" in server.log_text(), 15)
     time.sleep(1.5)
     assert server.process.poll() is None
     form(server.store)
     asyncio.run(ask(server))
     assert server.wait() == 0
-    assert "ending: idle" in server.said()
+    assert "ending: idle" in server.log_text()
 
 
 async def ask(server):
@@ -262,7 +262,7 @@ def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(l
 
     asyncio.run(run())
     assert server.wait() == 0
-    assert "ending: idle" in server.said()
+    assert "ending: idle" in server.log_text()
 
 
 def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_them_for_gather_seconds(launch):
@@ -274,7 +274,7 @@ def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_
 
     asyncio.run(run())
     assert server.wait() == 0
-    assert "ending: idle" in server.said()
+    assert "ending: idle" in server.log_text()
 
 
 # ---- its environment

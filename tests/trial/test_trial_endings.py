@@ -73,7 +73,7 @@ def test_sigterm_before_anyone_comes(launch):
     time.sleep(0.3)
     server.terminate()
     assert server.wait() == 0
-    assert "Traceback" not in server.said()
+    assert "Traceback" not in server.log_text()
 
 
 def test_kill_loses_a_second_at_most(launch, open_client):
@@ -110,7 +110,7 @@ def test_kill_loses_a_second_at_most(launch, open_client):
 def test_nobody_comes(launch):
     server = launch(IDLE_SECONDS="1", GRACE_SECONDS="30")
     assert server.wait() == 0
-    assert "idle" in server.said()
+    assert "idle" in server.log_text()
 
 
 def test_a_participant_who_leaves_is_waited_for(launch, open_client):
@@ -146,7 +146,7 @@ def test_deadline(launch, open_client):
 
     asyncio.run(play())
     assert server.wait() == 0
-    assert "deadline" in server.said()
+    assert "deadline" in server.log_text()
     assert server.recordings()
     assert not server.answered()
 
@@ -176,7 +176,7 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
             await client.play(10)
             await client.say(command="stop")
             await client.until(lambda: client.state["state"] == "ended")
-            while "trying again" not in server.said():
+            while "trying again" not in server.log_text():
                 await client.watch(0.05)
             assert not server.answered()
             assert client.done is None, "not done before the data are safe"
@@ -189,8 +189,8 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
     assert server.answered()
     (lines,) = server.recordings().values()
     assert len(steps_of(lines)) >= 9
-    assert "trying again" in server.said()
-    assert "P1" not in server.said()
+    assert "trying again" in server.log_text()
+    assert "P1" not in server.log_text()
 
 
 def test_nobody_connected_costs_nothing(launch, open_client):

@@ -257,7 +257,7 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
                 worst = [0.0]
                 watching = asyncio.create_task(stalls(worst))
                 since = time.monotonic_ns()
-                await client.sees(90)
+                await client.see(90)
                 ended = time.monotonic_ns()
                 watching.cancel()
                 assert hanging.is_alive()

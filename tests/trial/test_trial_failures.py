@@ -62,8 +62,8 @@ def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_cli
     assert len(client.errors) == 3
     answers = server.answer()["answers"]
     assert (answers["outcome"], answers["episodes"], answers["score"]) == ("failed", 3, 9)
-    assert "ValueError: boom" in server.said()
-    assert "Traceback" in server.said()
+    assert "ValueError: boom" in server.log_text()
+    assert "Traceback" in server.log_text()
     recordings = server.recordings()
     assert len(recordings) == 3
     error, end = recordings["3-episode-0002.jsonl.gz"][-2:]
@@ -125,7 +125,7 @@ def does_not_begin(server, open_client, user, status=NO_AGENT):
     asyncio.run(play())
     assert server.wait() == status
     assert not (server.store / f"study/users/{user}/answers").exists()
-    assert user not in server.said()
+    assert user not in server.log_text()
 
 
 @pytest.mark.parametrize("name", BROKEN)
@@ -133,7 +133,7 @@ def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
     source, last_line = BROKEN[name]
     server = launch(source, NAMES, USER_ID=f"P-{name}")
     does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
-    said = server.said().splitlines()
+    said = server.log_text().splitlines()
     assert said.count("Traceback (most recent call last):") == 1
     (begin,) = [n for n, line in enumerate(said) if line.startswith("Traceback")]
     assert " ERROR the agent " in said[begin - 1]
@@ -148,7 +148,7 @@ def test_no_names_of_actions_and_no_such_game(launch, open_client):
     (server.log.parent / "agent" / "agent.py").unlink()
     server = launch(None, {"game": "Nowhere-v1"}, USER_ID="P-game")
     does_not_begin(server, open_client, "P-game")
-    assert "\ngymnasium.error.NameNotFound: " in server.said()
+    assert "\ngymnasium.error.NameNotFound: " in server.log_text()
 
 
 def test_a_broken_helper_is_named(launch, open_client, tmp_path):
@@ -156,7 +156,7 @@ def test_a_broken_helper_is_named(launch, open_client, tmp_path):
     (tmp_path / "agent" / "my_helper.py").write_text("x = (\n")
     server = launch("import my_helper\n", NAMES, USER_ID="P-help")
     does_not_begin(server, open_client, "P-help")
-    assert "\nmy_helper.py:1: SyntaxError: '(' was never closed\n" in server.said()
+    assert "\nmy_helper.py:1: SyntaxError: '(' was never closed\n" in server.log_text()
 
 
 def test_a_start_that_never_returns(launch, open_client):
@@ -193,8 +193,8 @@ def test_failing_in_the_middle_names_the_line_and_is_kept(launch, open_client):
     server = launch(source, NAMES)
     end_of(server, open_client)
     assert server.answer()["answers"]["outcome"] == "failed"
-    assert "\nagent.py:11: ValueError: boom\n" in server.said()
-    assert server.said().count("Traceback") == 1, "the same failure again needs no traceback again"
+    assert "\nagent.py:11: ValueError: boom\n" in server.log_text()
+    assert server.log_text().count("Traceback") == 1, "the same failure again needs no traceback again"
 
 
 def test_a_step_that_never_returns(launch, open_client):
@@ -273,7 +273,7 @@ def steps_by(launch, open_client, source):
             await client.say(command="start")
             await client.until(lambda: len(client.frames) > 3)
             await client.say(action="left", held=True)
-            await client.heard()
+            await client.wait_until_heard()
             server.log.with_name("go_on").touch()
             assert await client.closed() == 1000
 

@@ -51,7 +51,7 @@ def test_wrong_greetings_are_closed(launch, open_client):
             await client.until(lambda: client.frames)
 
     asyncio.run(all_of_them())
-    log = server.said()
+    log = server.log_text()
     assert "Traceback" not in log
     assert "wrong" not in log
 
@@ -101,7 +101,7 @@ def test_nonsense_is_answered_in_words_and_the_third_time_closed(launch, open_cl
             assert await client.closed() == 4400
 
     asyncio.run(play())
-    assert "Traceback" not in server.said()
+    assert "Traceback" not in server.log_text()
 
 
 def test_long_messages_are_1009(launch, open_client):
@@ -152,7 +152,7 @@ def test_many_strangers_do_not_keep_the_participant_out(launch, open_client):
                 stranger.websocket.transport.abort()
 
     asyncio.run(play())
-    assert "Traceback" not in server.said()
+    assert "Traceback" not in server.log_text()
 
 
 @pytest.mark.parametrize(("path", "status"), [("healthz", 200), ("", 426), ("etc/passwd", 404)])

@@ -42,7 +42,7 @@ def test_a_game_in_turns_against_a_file_with_legal_actions_alone(launch: Any, op
             return client
 
     client = asyncio.run(run())
-    assert server.wait() == 0, server.said()
+    assert server.wait() == 0, server.log_text()
     assert len(client.errors) == 1, "square 8 is taken"
     (lines,) = server.recordings().values()
     head = lines[0]

@@ -57,8 +57,8 @@ def test_plays_from_hello_to_answer(launch, open_client, grid):
     assert (told["episodes"], told["score"], told["frames"], told["outcome"]) == (2, 60, 40, "finished")
     assert 0.3 < told["seconds"] < 10
     assert list(server.recordings()) == ["3-episode-0001.jsonl.gz", "3-episode-0002.jsonl.gz"]
-    assert "the-secret-token" not in server.said()
-    assert "P1" not in server.said()
+    assert "the-secret-token" not in server.log_text()
+    assert "P1" not in server.log_text()
 
 
 def test_recording_says_what_happened(launch, open_client, grid, tmp_path):
@@ -159,7 +159,7 @@ def test_frame_rate_stays_in_its_limits(launch, open_client):
             for wish, rate in (("faster", 40), ("slower", 30), (1, 5), (1e9, 40), (12, 12)):
                 await client.say(changeFrameRate=wish)
                 await client.until(lambda rate=rate: client.state["frameRate"] == rate)
-            await client.sees(18)
+            await client.see(18)
             server.terminate()
             await client.closed()
 
@@ -334,7 +334,7 @@ def test_hippo_client(launch, open_client, grid):
             await client.until(lambda: client.jpegs)
             await client.say(command="start")
             await client.say(action="left")
-            await client.heard()
+            await client.wait_until_heard()
             seen = len(client.jpegs)
             await client.until(lambda: len(client.jpegs) >= seen + 15)
             await client.say(command="stop")
@@ -375,8 +375,8 @@ def test_ms_pacman_with_the_example_agent(launch, open_client):
             assert "upleft" in client.controls["actionSpace"]
             for key in ("left", "up", "right"):
                 await client.say(action=key, held=True)
-                await client.heard()
-                await client.sees(5)
+                await client.wait_until_heard()
+                await client.see(5)
             await client.say(command="stop")
             assert await client.closed() == 1000
 
@@ -455,10 +455,10 @@ def test_an_agent_that_was_changed_within_a_second_is_the_new_one(launch, grid, 
         os.utime(file, (1_000_000_000, 1_000_000_000))
         server = launch(None, PYTHONDONTWRITEBYTECODE="")
         until = time.monotonic() + 15
-        while "agent\n" not in server.said():
-            assert time.monotonic() < until, server.said()
+        while "agent\n" not in server.log_text():
+            assert time.monotonic() < until, server.log_text()
             time.sleep(0.02)
-        assert f"the {word} agent" in server.said()
+        assert f"the {word} agent" in server.log_text()
         server.process.kill()
         server.process.wait()
         server.log.unlink()

@@ -43,7 +43,7 @@ def steps(server, name="a1"):
 def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
     server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 5})
     client = played(server, open_client, frames=6, keys=["up"])
-    assert client.errors == [], server.said()
+    assert client.errors == [], server.log_text()
     assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
     lines = steps(server)
     parts = [line["players"] for line in lines]
@@ -135,9 +135,11 @@ def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_clie
     assert {part["action"] for part in parts} == {0}, "it idles"
     assert {part["by"] for part in parts} <= {"none", "late"}
     assert parts[-1]["by"] == "none"
-    (told,) = [line for line in server.said().splitlines() if "the policy of right (agent:Partner) failed: " in line]
+    (told,) = [
+        line for line in server.log_text().splitlines() if "the policy of right (agent:Partner) failed: " in line
+    ]
     assert said in told
-    assert "it idles until the episode is over" in server.said()
+    assert "it idles until the episode is over" in server.log_text()
     lines = [line for found in server.recordings().values() for line in found]
     assert any(line["kind"] == "error" and line.get("player") == "right" for line in lines)
 
@@ -145,8 +147,8 @@ def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_clie
 def test_the_log_of_a_policy_that_fails_does_not_hold_the_participants_id(launch, open_client):
     server = launch(two_players(act="raise ValueError('not for ' + __import__('os').environ['USER_ID'])"), trial=TRIAL)
     played(server, open_client)
-    assert "ValueError: not for (participant)" in server.said()
-    assert "P1" not in server.said()
+    assert "ValueError: not for (participant)" in server.log_text()
+    assert "P1" not in server.log_text()
 
 
 def test_a_policy_that_hangs_holds_up_nothing(launch, open_client):
@@ -168,7 +170,7 @@ def test_a_file_that_takes_hours_does_not_make_the_server_fail_at_its_end(launch
             await client.until(lambda: client.done)
 
     asyncio.run(run())
-    assert server.wait() == 0, server.said()
+    assert server.wait() == 0, server.log_text()
     assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
 
 
@@ -191,8 +193,8 @@ def test_players_that_do_not_fit_are_named_before_anybody_plays(launch, open_cli
 
     assert asyncio.run(run()) == 1011
     assert server.wait() == 3, "the agent cannot be started"
-    assert said in server.said()
-    assert "Traceback" not in server.said()
+    assert said in server.log_text()
+    assert "Traceback" not in server.log_text()
 
 
 def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_client):
@@ -213,7 +215,7 @@ def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_cl
         (lines,) = server.recordings(f"{step}-*.gz").values()
         asked = [line["players"]["right"]["by"] for line in lines if line["kind"] == "step"]
         assert len(asked) == 3
-        assert "policy" in asked, server.said()
+        assert "policy" in asked, server.log_text()
 
 
 # ---- an interrupted game
@@ -227,7 +229,7 @@ def test_an_interrupted_game_of_two_goes_on_where_it_was(launch, open_client):
     second = launch(two_players(), trial=trial, SERVER="a-2")
     played(second, open_client, frames=6)
     after = steps(second, "a-2")
-    assert [line["step"] for line in before + after] == list(range(1, len(before + after) + 1)), second.said()
+    assert [line["step"] for line in before + after] == list(range(1, len(before + after) + 1)), second.log_text()
     parts = [line["players"]["right"] for line in before + after]
     fresh = [part for part in parts if "observed" in part]
     asked = [part["action"] for part in fresh]

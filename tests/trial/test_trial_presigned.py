@@ -134,7 +134,7 @@ def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
     town.failing = [500, 403]
     played(running, open_client)
     assert running.wait() == 0
-    said = running.said()
+    said = running.log_text()
     assert "CREDENTIAL" not in said
     assert "TOKEN" not in said
     for secret in (town.variables(record)["CREDENTIAL"], "X-Amz", USER + "/", "127.0.0.1:"):

@@ -162,7 +162,7 @@ def test_an_environment_that_plays_otherwise_begins_the_episode_again(launch, op
     assert [line["kind"] for line in lines[:2]] == ["header", "reset"]
     assert lines[1]["episode"] == 1
     assert second.answer()["answers"]["frames"] == len(steps(lines))
-    assert "begins again" in second.said()
+    assert "begins again" in second.log_text()
 
 
 def test_a_damaged_recording_only_costs_the_game_that_was_on(launch, open_client):

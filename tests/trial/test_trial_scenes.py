@@ -70,7 +70,7 @@ def test_a_client_is_told_of_the_picture_and_gets_scenes(launch: Any, open_clien
             assert client.scene.hud == "Step 0"
 
     asyncio.run(play())
-    assert "render()" not in server.said()
+    assert "render()" not in server.log_text()
 
 
 def test_a_client_that_comes_back_gets_the_whole_scene(launch: Any, open_client: Any, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_what_cannot_be_drawn_is_said_once_and_the_game_goes_on(launch: Any, ope
 
     asyncio.run(play())
     assert server.answer()["answers"]["episodes"] == 1
-    said = server.said()
+    said = server.log_text()
     assert said.count("render(): the object 'bad' cannot be drawn: its x is no finite number (nan)") == 1
     assert said.count("render(): the object 'e' shows the image '../../etc/passwd', which is not in assets/") == 1
 
@@ -177,7 +177,7 @@ def test_objects_without_a_scene_in_config_yml_end_the_game_with_a_sentence(
             await client.closed()
 
     asyncio.run(play())
-    assert "say in config.yml how large the picture is, as trial.scene" in server.said()
+    assert "say in config.yml how large the picture is, as trial.scene" in server.log_text()
 
 
 def test_a_picture_of_pixels_may_come_between(launch: Any, open_client: Any, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_answers_wait_for_a_recording_that_cannot_be_stored_but_not_for_ever(lau
     form(server.store)
     in_the_way = refuse_recordings(server.store)
     codes, waited = asyncio.run(play_to_the_end(server))
-    assert codes == [1000, 1000], server.said()
+    assert codes == [1000, 1000], server.log_text()
     assert waited > 1.4
     assert outcomes(server.store) == {"anna": "stopped", "bert": "partnerLeft"}
     time.sleep(1)  # well after LINGER_SECONDS
@@ -155,7 +155,7 @@ def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_
 
     asyncio.run(run())
     assert server.wait(25) == 0
-    assert "ending: deadline" in server.said()
+    assert "ending: deadline" in server.log_text()
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
 

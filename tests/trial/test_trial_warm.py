@@ -125,9 +125,9 @@ def test_only_who_has_the_token_makes_it_look(launch_warm_server, open_client):
         give(server)
         for _ in range(5):
             await refused(server, open_client, 4401, token="wrong")
-        assert "assigned to a participant now" not in server.said()
+        assert "assigned to a participant now" not in server.log_text()
         await refused(server, open_client, 4401, userId="P2")
-        assert "assigned to a participant now" in server.said()
+        assert "assigned to a participant now" in server.log_text()
 
     asyncio.run(strangers())
 
@@ -141,7 +141,7 @@ def test_nobody_coming_does_not_end_a_warm_server(launch_warm_server):
 def test_the_deadline_ends_a_warm_server_that_nobody_took(launch_warm_server):
     server = launch_warm_server(DEADLINE=str(time.time() + 2))
     assert server.wait() == 0
-    assert "deadline" in server.said()
+    assert "deadline" in server.log_text()
     assert not server.store.exists()
 
 
@@ -150,14 +150,14 @@ def test_sigterm_ends_a_warm_server_that_nobody_took(launch_warm_server, open_cl
     asyncio.run(refused(server, open_client, 1013))
     server.terminate()
     assert server.wait() == 0
-    assert "Traceback" not in server.said()
+    assert "Traceback" not in server.log_text()
     assert not server.store.exists()
 
 
 def test_a_warm_server_whose_agent_does_not_start_is_replaced(launch_warm_server):
     server = launch_warm_server("raise ValueError('broken')")
     assert server.wait() == NO_AGENT
-    assert "ValueError: broken" in server.said()
+    assert "ValueError: broken" in server.log_text()
 
 
 # ---- somebody's
@@ -175,7 +175,7 @@ def test_the_participant_plays_and_all_lies_where_it_always_does(launch_warm_ser
     assert len(steps(lines)) == server.answer()["answers"]["frames"]
     assert not (server.store / "study/users/P1/trials" / WARM_SERVER).exists()
     assert not list(server.store.rglob("*.part"))
-    assert "P1" not in server.said()
+    assert "P1" not in server.log_text()
 
 
 def test_nobody_else_gets_in_with_the_same_token(launch_warm_server, open_client):
@@ -280,7 +280,7 @@ def test_idle_counts_from_the_giving(launch_warm_server):
     give(server)
     assert server.wait() == 0
     assert time.monotonic() - given_at >= 2
-    assert "idle" in server.said()
+    assert "idle" in server.log_text()
     assert not (server.store / "study/users").exists()
 
 
@@ -422,7 +422,7 @@ def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_cli
         await play_to_the_end(server, open_client)
 
     asyncio.run(come())
-    said = server.said()
+    said = server.log_text()
     assert "cannot see whose this server is (its document is not JSON)" in said
     assert "Traceback" not in said
     assert "P1" not in said
@@ -442,7 +442,7 @@ def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
         await play_to_the_end(server, open_client)
 
     asyncio.run(come())
-    said = server.said()
+    said = server.log_text()
     assert said.count("cannot see whose this server is (NotADirectoryError") == 1, "said once, not at every look"
     assert WARM_SERVER not in said
 

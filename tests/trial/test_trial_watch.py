@@ -29,12 +29,12 @@ async def ask(websocket: ClientConnection, method: str, **params: Any) -> Any:
     """The answer to a request; lines that come before it are left out."""
     await websocket.send(json.dumps({"method": method, "params": params}))
     while True:
-        said = await heard(websocket)
+        said = await next_line(websocket)
         if not (isinstance(said, dict) and "kind" in said):
             return said
 
 
-async def heard(websocket: ClientConnection) -> Any:
+async def next_line(websocket: ClientConnection) -> Any:
     async with asyncio.timeout(ANSWER_SECONDS):
         return json.loads(await websocket.recv())
 
@@ -51,7 +51,7 @@ async def steps(websocket: ClientConnection, count: int) -> list[dict[str, Any]]
     """The next lines of steps."""
     found: list[dict[str, Any]] = []
     while len(found) < count:
-        line = await heard(websocket)
+        line = await next_line(websocket)
         if line["kind"] == "step":
             found.append(line)
     return found
@@ -68,9 +68,9 @@ def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
                 await client.until(lambda: client.controls)
                 await client.say(action="right", held=True)
                 await client.say(command="start")
-                lines = [await heard(websocket)]
+                lines = [await next_line(websocket)]
                 while lines[-1]["kind"] != "end":
-                    lines.append(await heard(websocket))
+                    lines.append(await next_line(websocket))
                 await client.closed()
         return lines
 
@@ -142,7 +142,7 @@ def test_what_cannot_be_done_gets_a_sentence(launch, open_client, grid, request_
         async with program(server) as websocket, open_client(server.address) as client:
             await client.play(1)
             await websocket.send(json.dumps(request_))
-            return await heard(websocket), await ask(websocket, "watch")
+            return await next_line(websocket), await ask(websocket, "watch")
 
     error, watching = asyncio.run(play())
     assert error["error"]["message"] == words

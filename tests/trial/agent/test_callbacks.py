@@ -1,4 +1,4 @@
-"""Callbacks of the agent: when they are called, what stands in the recording, and that none of them ends the game."""
+"""Callbacks of the agent: when they are called, what they record, and that none of them ends the game."""
 
 import asyncio
 import dataclasses
@@ -23,8 +23,8 @@ from trial.recordings import recording
 FACTS = TrialFacts("trial-1", "3", 1)
 
 
-def made(agent, seconds=5.0, facts=FACTS, **more):
-    """The callbacks of an agent, and a list of what raised."""
+def callbacks_of(agent, seconds=5.0, facts=FACTS, **more):
+    """The callbacks of an agent, and the list of those that raised, with their errors."""
     raised = []
     callbacks = Callbacks(
         listening(agent),
@@ -38,7 +38,7 @@ def made(agent, seconds=5.0, facts=FACTS, **more):
     return callbacks, raised
 
 
-def lines(callbacks):
+def recorded_lines(callbacks):
     return [json.loads(line) for line in callbacks.take()]
 
 
@@ -71,9 +71,9 @@ class Noting:
         self.sessions.append(("end", session))
 
 
-def test_callbacks_are_told_how_the_session_stands():
+def test_callbacks_are_told_the_state_of_the_session():
     agent = Noting()
-    callbacks, raised = made(agent)
+    callbacks, raised = callbacks_of(agent)
     play(callbacks)
     assert [name for name, _ in agent.sessions] == ["start", "episode", "tick", "tick", "over", "end"]
     tick = agent.sessions[2][1]
@@ -90,33 +90,33 @@ def test_callbacks_are_told_how_the_session_stands():
     over = agent.sessions[4][1]
     assert (over.ticks, over.scores, over.why) == (2, {"player_0": 3.0}, "terminated")
     assert not raised
-    assert not lines(callbacks), "what returns nothing leaves no line"
+    assert not recorded_lines(callbacks), "what returns nothing leaves no line"
     callbacks.close()
 
 
-def test_what_they_return_and_record_becomes_lines():
+def test_values_that_callbacks_return_or_record_become_lines():
     class Agent:
         def on_tick(self, session):
             session.record("lean", session.ticks / 2)
             return {"seen": session.observations["player_0"]}
 
-    callbacks, _ = made(Agent())
+    callbacks, _ = callbacks_of(Agent())
     play(callbacks, steps=1)
-    assert lines(callbacks) == [
+    assert recorded_lines(callbacks) == [
         {"kind": "callback", "episode": 4, "step": 1, "name": "lean", "callback": "on_tick", "value": 0.5},
         {"kind": "callback", "episode": 4, "step": 1, "name": "on_tick", "callback": "on_tick", "value": {"seen": 1}},
     ]
     callbacks.close()
 
 
-def test_the_lines_of_later_calls_stay_behind_until_their_turn():
+def test_the_lines_of_a_later_step_are_not_written_with_those_of_an_earlier_one():
     """The agent's thread may be at the next step when the event loop writes the lines of the last one."""
 
     class Agent:
         def on_tick(self, session):
             session.record("t", session.ticks)
 
-    callbacks, _ = made(Agent())
+    callbacks, _ = callbacks_of(Agent())
     callbacks.episode_began(1, {}, {})
     callbacks.stepped(*[{"player_0": 0}] * 4)
     recorded = callbacks.recorded
@@ -126,13 +126,13 @@ def test_the_lines_of_later_calls_stay_behind_until_their_turn():
     callbacks.close()
 
 
-def test_what_a_callback_changes_of_its_session_changes_no_record():
+def test_a_callback_that_changes_its_session_changes_no_record():
     class Agent:
         def on_tick(self, session):
             for given in (session.actions, session.rewards, session.observations, session.infos, session.scores):
                 given.clear()
 
-    callbacks, raised = made(Agent())
+    callbacks, raised = callbacks_of(Agent())
     values = [{"player_0": value} for value in (2, 1.5, "seen", {"t": 1})]
     callbacks.episode_began(1, {}, {})
     callbacks.stepped(*values)
@@ -141,13 +141,13 @@ def test_what_a_callback_changes_of_its_session_changes_no_record():
     callbacks.close()
 
 
-def test_a_callback_that_cannot_even_be_looked_up_is_an_error_of_the_agents_start(launch, grid):
+def test_a_callback_whose_attribute_raises_is_an_error_of_the_agents_start(launch, grid):
     server = launch(grid(5) + "\nclass Agent(Agent):\n    on_join = property(lambda self: 1 / 0)\n")
     assert server.wait() == exits.NO_AGENT
-    assert "the agent cannot be started" in server.said()
+    assert "the agent cannot be started" in server.log_text()
 
 
-def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
+def test_callbacks_of_feedback_joining_and_leaving_are_told_the_player():
     class Agent:
         def on_feedback(self, session, player, word):
             return [player, word]
@@ -157,11 +157,11 @@ def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
 
         on_leave = on_return = on_join
 
-    callbacks, _ = made(Agent())
+    callbacks, _ = callbacks_of(Agent())
     callbacks.fed_back("player_0", "good")
     for name in ("on_join", "on_leave", "on_return"):
         callbacks.player_moved(name, "player_0")
-    found = lines(callbacks)
+    found = recorded_lines(callbacks)
     assert [(line["name"], line["value"]) for line in found] == [
         ("on_feedback", ["player_0", "good"]),
         ("on_join", "player_0"),
@@ -172,7 +172,7 @@ def test_feedback_and_those_who_come_and_go_are_told_with_their_player():
     callbacks.close()
 
 
-def test_where_several_take_part_a_line_says_who_did_what_it_is_about():
+def test_with_several_humans_a_line_names_the_player_that_it_is_about():
     class Agent:
         def on_feedback(self, session, player, word):
             session.record("heard", word)
@@ -183,10 +183,12 @@ def test_where_several_take_part_a_line_says_who_did_what_it_is_about():
         def on_tick(self, session):
             return "tick"
 
-    callbacks, _ = made(Agent(), facts=TrialFacts("t-1", "3", players=("left", "right"), humans=("left", "right")))
+    callbacks, _ = callbacks_of(
+        Agent(), facts=TrialFacts("t-1", "3", players=("left", "right"), humans=("left", "right"))
+    )
     callbacks.fed_back("right", "good")
     callbacks.stepped({}, {}, {}, {})
-    found = [(line["callback"], line["name"], line.get("player")) for line in lines(callbacks)]
+    found = [(line["callback"], line["name"], line.get("player")) for line in recorded_lines(callbacks)]
     assert found == [
         ("on_feedback", "heard", "right"),
         ("on_feedback", "on_feedback", "right"),
@@ -195,13 +197,15 @@ def test_where_several_take_part_a_line_says_who_did_what_it_is_about():
     callbacks.close()
 
 
-class Wordless(Exception):
+class ErrorWithoutText(Exception):
     def __str__(self):
         raise SystemExit
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), SystemExit(3), KeyboardInterrupt(), Wordless()])
-def test_a_callback_that_raises_is_told_once_and_called_again(error):
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("by zero"), SystemExit(3), KeyboardInterrupt(), ErrorWithoutText()]
+)
+def test_a_callback_that_raises_is_reported_once_and_called_again(error):
     calls = []
 
     class Agent:
@@ -209,17 +213,17 @@ def test_a_callback_that_raises_is_told_once_and_called_again(error):
             calls.append(session.ticks)
             raise error
 
-    callbacks, raised = made(Agent())
+    callbacks, raised = callbacks_of(Agent())
     play(callbacks, steps=3)
     assert calls == [1, 2, 3]
     assert raised == [("on_tick", error)]
-    (line,) = lines(callbacks)
+    (line,) = recorded_lines(callbacks)
     assert (line["name"], line["step"]) == ("on_tick", 1)
     assert line["error"].startswith(type(error).__name__)
     callbacks.close()
 
 
-def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(caplog):
+def test_the_game_does_not_wait_for_a_slow_callback_and_skips_others(caplog):
     go = threading.Event()
     came = threading.Event()
 
@@ -229,7 +233,7 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
                 go.wait(20)
             return session.ticks
 
-    callbacks, _ = made(Agent(), seconds=0.05, late=lambda recorded: came.set())
+    callbacks, _ = callbacks_of(Agent(), seconds=0.05, late=lambda recorded: came.set())
     callbacks.episode_began(1, {}, {})
     with caplog.at_level(logging.WARNING, "trial"):
         began = time.monotonic()
@@ -238,20 +242,20 @@ def test_a_callback_that_takes_long_is_not_waited_for_and_others_are_skipped(cap
         assert time.monotonic() - began < 2
     assert len([r for r in caplog.records if "on_tick has not returned within callbackSeconds" in r.message]) == 1
     assert callbacks.busy
-    assert not lines(callbacks)
+    assert not recorded_lines(callbacks)
     go.set()
     assert came.wait(10), "lines that come late are announced"
-    assert [(line["step"], line.get("value"), line.get("skipped")) for line in lines(callbacks)] == [
+    assert [(line["step"], line.get("value"), line.get("skipped")) for line in recorded_lines(callbacks)] == [
         (1, 1, None),
         (1, None, 4),
     ]
     callbacks.stepped({}, {}, {}, {})
     until(lambda: not callbacks.busy, 10)
-    assert [(line["step"], line["value"]) for line in lines(callbacks)] == [(6, 6)]
+    assert [(line["step"], line["value"]) for line in recorded_lines(callbacks)] == [(6, 6)]
     callbacks.close()
 
 
-def test_a_callback_that_returns_as_its_time_is_over_is_on_time_or_announced(monkeypatch):
+def test_a_callback_that_returns_just_as_its_time_ends_is_on_time_or_reported_as_late(monkeypatch):
     before = {*threading.enumerate()}
 
     class Returned(threading.Event):
@@ -265,12 +269,12 @@ def test_a_callback_that_returns_as_its_time_is_over_is_on_time_or_announced(mon
 
     monkeypatch.setattr(callbacks_module, "threading", SimpleNamespace(**{**vars(threading), "Event": Returned}))
     announced = []
-    callbacks, _ = made(Noting(), late=announced.append)
+    callbacks, _ = callbacks_of(Noting(), late=announced.append)
     callbacks.episode_began(1, {}, {})
     assert (callbacks.first_late is not None) == bool(announced)
 
 
-def test_what_is_recorded_is_bounded():
+def test_the_amount_that_callbacks_record_is_limited():
     class Agent:
         def on_tick(self, session):
             session.record("small", 1)
@@ -280,9 +284,9 @@ def test_what_is_recorded_is_bounded():
             for _ in range(2 * MOST_VALUES):
                 session.record("many", 0)
 
-    callbacks, raised = made(Agent())
+    callbacks, raised = callbacks_of(Agent())
     callbacks.stepped({}, {}, {}, {})
-    found = lines(callbacks)
+    found = recorded_lines(callbacks)
     assert not raised
     assert len(found) == MOST_VALUES
     assert found[0]["value"] == 1
@@ -293,7 +297,7 @@ def test_what_is_recorded_is_bounded():
     callbacks.close()
 
 
-def test_what_an_earlier_server_recorded_is_not_recorded_again():
+def test_lines_that_an_earlier_server_recorded_are_not_recorded_again():
     seen = []
 
     class Agent:
@@ -302,19 +306,19 @@ def test_what_an_earlier_server_recorded_is_not_recorded_again():
             seen.append(session.replaying)
             return 2
 
-    callbacks, _ = made(Agent())
+    callbacks, _ = callbacks_of(Agent())
     callbacks.replaying = True
     callbacks.stepped({}, {}, {}, {})
     callbacks.replaying = False
     callbacks.stepped({}, {}, {}, {})
     assert seen == [True, False]
-    assert [line["step"] for line in lines(callbacks)] == [2, 2]
+    assert [line["step"] for line in recorded_lines(callbacks)] == [2, 2]
     callbacks.close()
 
 
 def test_an_agent_without_callbacks_has_none():
     assert not listening(object())
-    callbacks, _ = made(object())
+    callbacks, _ = callbacks_of(object())
     assert not callbacks
     play(callbacks)
     assert not callbacks.busy
@@ -347,11 +351,11 @@ class Agent(Agent):
 """
 
 
-def values(found):
+def recorded_values(found):
     return [(line["name"], line["value"]) for line in found if line["kind"] == "callback" and line["name"] != "t"]
 
 
-def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
+def test_a_real_recording_holds_the_values_that_callbacks_recorded(launch, grid, open_client):
     agent = grid(30) + CALLBACKS + WAITS
     server = launch(agent, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
 
@@ -368,7 +372,7 @@ def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
     play_to_the_end(server, open_client)
     assert server.wait() == 0
     first, second = server.recordings().values()
-    assert values(first) == [
+    assert recorded_values(first) == [
         ("on_session_start", "begun"),
         ("on_episode_start", 1),
         ("on_join", "player_0"),
@@ -377,7 +381,7 @@ def test_recordings_hold_what_callbacks_recorded(launch, grid, open_client):
         ("on_return", "player_0"),
         ("on_episode_end", ["terminated", {"player_0": 45.0}]),
     ]
-    assert values(second) == [
+    assert recorded_values(second) == [
         ("on_episode_start", 2),
         ("on_episode_end", ["terminated", {"player_0": 45.0}]),
         ("on_session_end", "ended"),
@@ -401,7 +405,7 @@ def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, ope
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "finished"
     assert server.answer()["answers"]["frames"] == 40
-    said = server.said()
+    said = server.log_text()
     assert "agent.py:" in said
     assert said.count("ValueError: no such thing") == 1
     assert said.count("on_episode_end has not returned within callbackSeconds") == 1
@@ -446,7 +450,7 @@ class Agent(Agent):
 def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid, open_client):
     deterministic = grid(60) + RESUMED + WAITS
 
-    async def some(server):
+    async def play_a_little(server):
         async with open_client(server.address) as client:
             await client.hello()
             await client.until(lambda: client.controls)
@@ -455,7 +459,7 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
 
     trial = {**TRIAL, "maxEpisodes": 1}
     first = launch(deterministic, trial, SERVER="a-1")
-    asyncio.run(some(first))
+    asyncio.run(play_a_little(first))
     first.terminate()
     first.log.with_name("go_on").touch()
     first.wait()
@@ -473,14 +477,14 @@ def test_the_callbacks_of_the_documentation_run(tmp_path):
     (tmp_path / "agent.py").write_text(text.split("```python\n")[1].split("```")[0])
     agent = AgentAdapter(tmp_path, "CartPole-v1", None)
     agent.start()
-    callbacks, raised = made(agent._agent)
+    callbacks, raised = callbacks_of(agent._agent)
     first, info, _ = agent.reset(1)
     callbacks.episode_began(1, {"player_0": first}, {"player_0": info})
     result = agent.step(1)
     callbacks.stepped({"player_0": 1}, {"player_0": 1.0}, {"player_0": result.observation}, {})
     callbacks.episode_ended("terminated")
     assert not raised
-    assert [line["name"] for line in lines(callbacks)] == ["furthest", "on_episode_end"]
+    assert [line["name"] for line in recorded_lines(callbacks)] == ["furthest", "on_episode_end"]
     for name in NAMES:
         assert f"`{name}(session" in text
     for field in dataclasses.fields(Session):

@@ -26,7 +26,7 @@ def _no_window(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
-def started(
+def start_agent(
     folder: Path, source: str = "", *, game: str = "none", names: tuple[str, ...] = (), players: tuple[str, ...] = ()
 ) -> Any:
     if source:
@@ -34,14 +34,14 @@ def started(
     return start(AgentAdapter(folder, game, names), players)
 
 
-def joint(folder: Path, source: str = "", **more: Any) -> JointAdapter:
-    found = started(folder, source, **more)
+def joint_adapter(folder: Path, source: str = "", **more: Any) -> JointAdapter:
+    found = start_agent(folder, source, **more)
     assert isinstance(found, JointAdapter)
     return found
 
 
-def played(adapter: JointAdapter, seed: int = 3) -> list[Joint]:
-    """An episode of random legal actions, to its end."""
+def play_episode(adapter: JointAdapter, seed: int = 3) -> list[Joint]:
+    """Play an episode of random legal actions to its end; return its steps."""
     chance = random.Random(seed)
     now, _ = adapter.reset(seed)
     found = [now]
@@ -61,7 +61,7 @@ def played(adapter: JointAdapter, seed: int = 3) -> list[Joint]:
 
 
 def test_a_parallel_environment_by_the_name_of_its_module(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, game=PONG)
+    adapter = joint_adapter(tmp_path, game=PONG)
     assert adapter.players == ("paddle_0", "paddle_1")
     assert adapter.action_spaces == {"paddle_0": ("0", "1", "2"), "paddle_1": ("0", "1", "2")}
     assert adapter.observation_spaces["paddle_1"].shape == (280, 480, 3)
@@ -75,21 +75,21 @@ def test_a_parallel_environment_by_the_name_of_its_module(tmp_path: Path) -> Non
     picture = adapter.pictures()
     assert isinstance(picture, np.ndarray)
     assert (picture.shape[2], picture.dtype) == (3, np.uint8)
-    last = played(adapter)[-1]
+    last = play_episode(adapter)[-1]
     assert (last.over, last.why, last.to_act) == (True, "terminated", frozenset())
     adapter.close()
 
 
 def test_the_same_seed_and_actions_give_the_same_rewards(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, game=PONG)
-    one, two = ([step.rewards for step in played(adapter, 5)] for _ in range(2))
+    adapter = joint_adapter(tmp_path, game=PONG)
+    one, two = ([step.rewards for step in play_episode(adapter, 5)] for _ in range(2))
     assert one == two
     assert any(any(rewards.values()) for rewards in one)
 
 
 def test_in_an_aec_environment_players_act_in_turn(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, game=TICTACTOE)
-    steps = played(adapter)
+    adapter = joint_adapter(tmp_path, game=TICTACTOE)
+    steps = play_episode(adapter)
     turns = [sorted(step.to_act) for step in steps[:4]]
     assert turns == [["player_1"], ["player_2"], ["player_1"], ["player_2"]]
     assert sum(steps[0].masks["player_1"]) == 9
@@ -103,7 +103,7 @@ def test_in_an_aec_environment_players_act_in_turn(tmp_path: Path) -> None:
 
 
 def test_in_an_aec_environment_that_is_parallelizable_all_act_at_once(tmp_path: Path) -> None:
-    steps = played(joint(tmp_path, game=ROCK_PAPER_SCISSORS))
+    steps = play_episode(joint_adapter(tmp_path, game=ROCK_PAPER_SCISSORS))
     assert {step.to_act for step in steps[:-1]} == {frozenset({"player_0", "player_1"})}
     assert steps[-1].why == "truncated"
 
@@ -125,11 +125,11 @@ class Agent:
         ("rps_v2", "parallel_env", ["player_0", "player_1"]),
     ],
 )
-def test_a_class_may_leave_all_but_start_to_the_environment(
+def test_a_class_may_have_start_alone_and_leave_the_rest_to_the_environment(
     tmp_path: Path, module: str, make: str, first: list[str]
 ) -> None:
-    adapter = joint(tmp_path, RETURNED.format(module=module, make=make))
-    steps = played(adapter)
+    adapter = joint_adapter(tmp_path, RETURNED.format(module=module, make=make))
+    steps = play_episode(adapter)
     assert sorted(steps[0].to_act) == first
     assert steps[-1].over
     adapter.close()
@@ -139,16 +139,16 @@ def test_a_class_may_draw_and_leave_the_rest_to_the_environment(tmp_path: Path) 
     source = RETURNED.format(module="tictactoe_v3", make="env") + (
         "    def render(self):\n        import numpy\n        return numpy.full((2, 3, 3), 7, numpy.uint8)\n"
     )
-    adapter = joint(tmp_path, source)
+    adapter = joint_adapter(tmp_path, source)
     adapter.reset(1)
     picture = adapter.pictures()
     assert isinstance(picture, np.ndarray)
     assert (picture.shape, picture[0, 0, 0]) == ((2, 3, 3), 7)
 
 
-def test_players_who_leave_before_the_others_are_not_to_act_any_more(tmp_path: Path) -> None:
+def test_players_who_leave_before_the_others_do_not_act_any_more(tmp_path: Path) -> None:
     """PettingZoo takes them out of `agents`."""
-    steps = played(joint(tmp_path, game="pettingzoo.butterfly.knights_archers_zombies_v11"), 1)
+    steps = play_episode(joint_adapter(tmp_path, game="pettingzoo.butterfly.knights_archers_zombies_v11"), 1)
     left = [step for step in steps if 0 < len(step.to_act) < 4]
     assert left, "with this seed, a player leaves early"
     for step in left:
@@ -157,17 +157,17 @@ def test_players_who_leave_before_the_others_are_not_to_act_any_more(tmp_path: P
         assert len(gone) + len(step.to_act) == 4
 
 
-def test_a_version_that_there_is_not_is_told_with_the_one_that_there_is(tmp_path: Path) -> None:
+def test_the_error_about_a_missing_version_names_the_version_that_there_is(tmp_path: Path) -> None:
     with pytest.raises(AgentError) as refused:
-        started(tmp_path, game="pettingzoo.butterfly.cooperative_pong_v5")
+        start_agent(tmp_path, game="pettingzoo.butterfly.cooperative_pong_v5")
     assert str(refused.value) == (
         "there is no module pettingzoo.butterfly.cooperative_pong_v5; its package has cooperative_pong_v6"
     )
 
 
-def test_a_module_that_makes_no_environment(tmp_path: Path) -> None:
+def test_a_module_that_makes_no_environment_is_refused(tmp_path: Path) -> None:
     with pytest.raises(AgentError, match=r"the module email\.utils has neither parallel_env\(\) nor env\(\)"):
-        started(tmp_path, game="email.utils")
+        start_agent(tmp_path, game="email.utils")
 
 
 # ---- methods with dictionaries
@@ -208,7 +208,7 @@ class Agent:
 
 
 def test_five_methods_with_dictionaries_whose_names_are_numbers(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, OWN, names=("left", "right"))
+    adapter = joint_adapter(tmp_path, OWN, names=("left", "right"))
     assert adapter.players == ("0", "1")
     assert adapter.action_spaces == {"0": ("left", "right"), "1": ("left", "right")}
     first, seeded = adapter.reset(9)
@@ -223,7 +223,7 @@ def test_five_methods_with_dictionaries_whose_names_are_numbers(tmp_path: Path) 
 
 
 def test_each_player_has_a_view_of_their_own_if_render_takes_a_player(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, OWN, names=("left", "right"))
+    adapter = joint_adapter(tmp_path, OWN, names=("left", "right"))
     adapter.reset(1)
     views = adapter.pictures()
     assert isinstance(views, dict)
@@ -234,12 +234,12 @@ def test_each_player_has_a_view_of_their_own_if_render_takes_a_player(tmp_path: 
     assert list(views) == ["1"]
 
 
-def test_feedback_says_whose_it_is_if_the_method_asks(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, OWN, names=("left", "right"))
+def test_feedback_comes_with_its_player_if_the_method_takes_one(tmp_path: Path) -> None:
+    adapter = joint_adapter(tmp_path, OWN, names=("left", "right"))
     adapter.feedback("1", "good")
     assert adapter.agent.heard == [("good", 1)]
     (tmp_path / "other").mkdir()
-    other = joint(
+    other = joint_adapter(
         tmp_path / "other", OWN.replace("word, player", "word", 1).replace("(word, player)", "word"), names=("a",)
     )
     other.feedback("0", "bad")
@@ -260,21 +260,23 @@ def test_feedback_says_whose_it_is_if_the_method_asks(tmp_path: Path) -> None:
         ("{}, {}\n", "{}, {0: {'action_mask': [1, 0, 1]}}\n", "action_mask of 0 has 3 values; there are 2 actions"),
     ],
 )  # fmt: skip
-def test_what_breaks_the_contract_is_told_in_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_result_that_breaks_the_contract_gets_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
     assert old in OWN
-    adapter = joint(tmp_path, OWN.replace(old, new), names=("left", "right"))
+    adapter = joint_adapter(tmp_path, OWN.replace(old, new), names=("left", "right"))
     with pytest.raises(AgentError) as refused:
         begin_and_step(adapter)
     assert str(refused.value).startswith(said)
 
 
 def test_an_agent_may_say_who_is_to_act(tmp_path: Path) -> None:
-    by_method = joint(tmp_path, OWN + "    def to_act(self):\n        return [self.n % 2]\n", names=("left", "right"))
+    by_method = joint_adapter(
+        tmp_path, OWN + "    def to_act(self):\n        return [self.n % 2]\n", names=("left", "right")
+    )
     assert by_method.reset(1)[0].to_act == {"0"}
     assert by_method.step({"0": 1}).to_act == {"1"}
     (tmp_path / "other").mkdir()
     by_info = OWN.replace("{}, {}\n", "{}, {0: {'to_act': self.n % 2 == 0}, 1: {'to_act': self.n % 2 == 1}}\n")
-    other = joint(tmp_path / "other", by_info, names=("left", "right"))
+    other = joint_adapter(tmp_path / "other", by_info, names=("left", "right"))
     other.reset(1)
     assert [sorted(other.step({}).to_act) for _ in range(2)] == [["1"], ["0"]]
 
@@ -283,7 +285,7 @@ def test_a_mask_may_be_in_the_info(tmp_path: Path) -> None:
     source = OWN.replace(
         "{}, {}\n", "{}, {0: {'action_mask': numpy.array([0, 1], numpy.int8)}, 1: {'action_mask': [0, 0]}}\n"
     )
-    adapter = joint(tmp_path, source, names=("left", "right"))
+    adapter = joint_adapter(tmp_path, source, names=("left", "right"))
     adapter.reset(1)
     assert adapter.step({}).masks == {"0": (False, True)}
 
@@ -291,7 +293,9 @@ def test_a_mask_may_be_in_the_info(tmp_path: Path) -> None:
 def test_an_environment_that_gives_dictionaries_by_a_key_of_config(tmp_path: Path) -> None:
     """Where neither agent nor environment say who plays, `trial.players` does."""
     source = OWN.replace("possible_agents = [0, 1]", "")
-    adapter = joint(tmp_path, source.replace("0:", "'a':").replace("1:", "'b':"), names=("x",), players=("a", "b"))
+    adapter = joint_adapter(
+        tmp_path, source.replace("0:", "'a':").replace("1:", "'b':"), names=("x",), players=("a", "b")
+    )
     assert adapter.players == ("a", "b")
 
 
@@ -299,8 +303,8 @@ def test_an_environment_that_gives_dictionaries_by_a_key_of_config(tmp_path: Pat
 
 
 def test_a_gymnasium_environment_has_one_player(tmp_path: Path) -> None:
-    assert type(started(tmp_path, game="CartPole-v1")) is AgentAdapter
-    assert type(started(tmp_path, game="CartPole-v1", players=("player_0",))) is AgentAdapter
+    assert type(start_agent(tmp_path, game="CartPole-v1")) is AgentAdapter
+    assert type(start_agent(tmp_path, game="CartPole-v1", players=("player_0",))) is AgentAdapter
 
 
 SINGLE = """
@@ -321,17 +325,17 @@ class Agent:
 
 
 def test_a_class_with_a_step_of_its_own_may_play_the_others_itself(tmp_path: Path) -> None:
-    """As it could before there were several players; `trial.players` says otherwise."""
-    adapter = started(tmp_path, SINGLE, names=("rock", "paper", "scissors"))
+    """As before environments had several players, unless `trial.players` says otherwise."""
+    adapter = start_agent(tmp_path, SINGLE, names=("rock", "paper", "scissors"))
     assert type(adapter) is AgentAdapter
     adapter.reset(1)
     assert adapter.step(1).reward == 0
-    assert isinstance(started(tmp_path, SINGLE, players=("player_0", "player_1")), JointAdapter)
+    assert isinstance(start_agent(tmp_path, SINGLE, players=("player_0", "player_1")), JointAdapter)
 
 
 def test_a_class_may_leave_methods_to_a_gymnasium_environment_too(tmp_path: Path) -> None:
     source = "class Agent:\n    def start(self, game):\n        import gymnasium\n        return gymnasium.make(game, render_mode='rgb_array')\n"
-    adapter = started(tmp_path, source, game="CartPole-v1")
+    adapter = start_agent(tmp_path, source, game="CartPole-v1")
     assert type(adapter) is AgentAdapter
     assert adapter.action_space == ("0", "1")
     _, _, seeded = adapter.reset(3)
@@ -347,21 +351,21 @@ def test_a_class_may_leave_methods_to_a_gymnasium_environment_too(tmp_path: Path
         ("class Agent:\n    def start(self, game):\n        return 1\n    def rendr(self):\n        pass\n", "Agent in agent.py has no render; is rendr meant to be render?"),
     ],
 )  # fmt: skip
-def test_methods_that_nobody_has_are_named(tmp_path: Path, source: str, said: str) -> None:
+def test_missing_methods_are_named(tmp_path: Path, source: str, said: str) -> None:
     with pytest.raises(AgentError) as refused:
-        started(tmp_path, source)
+        start_agent(tmp_path, source)
     assert str(refused.value) == said
 
 
 def test_names_of_actions_come_from_config_as_far_as_a_player_has_actions(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, game=PONG, names=("stay", "up"))
+    adapter = joint_adapter(tmp_path, game=PONG, names=("stay", "up"))
     assert adapter.action_spaces["paddle_0"] == ("stay", "up", "2")
-    assert joint(tmp_path, game=PONG, names=("a", "b", "c", "d")).action_spaces["paddle_1"] == ("a", "b", "c")
+    assert joint_adapter(tmp_path, game=PONG, names=("a", "b", "c", "d")).action_spaces["paddle_1"] == ("a", "b", "c")
 
 
-def test_actions_that_nobody_names(tmp_path: Path) -> None:
+def test_without_names_of_actions_the_error_asks_for_action_space(tmp_path: Path) -> None:
     with pytest.raises(AgentError, match=r"list the game's actions as trial\.actionSpace in config\.yml"):
-        started(tmp_path, OWN)
+        start_agent(tmp_path, OWN)
 
 
 def test_numbers_of_actions_begin_where_the_players_space_begins(tmp_path: Path) -> None:
@@ -380,7 +384,7 @@ class Env:
 class Agent:
     def start(self, game): return Env()
 """
-    adapter = joint(tmp_path, source)
+    adapter = joint_adapter(tmp_path, source)
     adapter.reset(1)
     adapter.step({"a": 2})
     assert adapter.env.taken == {"a": 1}
@@ -410,7 +414,7 @@ class Agent:
 
 
 def test_spaces_may_be_one_dictionary_space_for_all_players(tmp_path: Path) -> None:
-    adapter = joint(tmp_path, DICT_SPACES)
+    adapter = joint_adapter(tmp_path, DICT_SPACES)
     assert adapter.action_spaces == {"left": ("0", "1"), "right": ("0", "1", "2")}
     assert adapter.observation_spaces["right"].shape == (5,)
 
@@ -479,7 +483,7 @@ def test_whatever_step_returns_is_read_or_refused_with_a_sentence(results: list[
         assert not (now.over and now.to_act)
 
 
-def test_what_a_policy_acted_upon_is_kept_as_it_was_unless_it_holds_itself() -> None:
+def test_a_snapshot_of_an_observation_keeps_its_values_unless_it_contains_itself() -> None:
     seen = {"grid": np.zeros(2), "order": (1, [2])}
     kept = snapshot(seen)
     seen["grid"][0] = 5

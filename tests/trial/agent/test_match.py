@@ -25,33 +25,33 @@ from trial.settings import TrialSettings
 QUESTION = {"id": "0" * 20, "players": 2, "waiting": [{"id": name, "answers": {"skill": name}} for name in "abcd"]}
 
 
-def groups(function: Callable[..., Any]) -> tuple[list[list[str]], str]:
+def groups_of(function: Callable[..., Any]) -> tuple[list[list[str]], str]:
     return match.groups(function, QUESTION)
 
 
-def test_a_group_holds_ids_or_those_who_wait() -> None:
-    assert groups(lambda waiting: [["a", "b"], waiting[2:]]) == ([["a", "b"], ["c", "d"]], "")
+def test_a_group_holds_ids_or_entries_of_waiting_participants() -> None:
+    assert groups_of(lambda waiting: [["a", "b"], waiting[2:]]) == ([["a", "b"], ["c", "d"]], "")
 
 
-def test_match_may_ask_how_many_play() -> None:
-    assert groups(lambda waiting, players: [waiting[:players]]) == ([["a", "b"]], "")
+def test_match_may_take_the_number_of_players() -> None:
+    assert groups_of(lambda waiting, players: [waiting[:players]]) == ([["a", "b"]], "")
 
 
-def test_all_that_match_is_told_is_there() -> None:
+def test_match_gets_id_waiting_time_group_and_answers() -> None:
     seen: list[Any] = []
-    groups(lambda waiting: seen.extend(waiting) or [])
+    groups_of(lambda waiting: seen.extend(waiting) or [])
     assert seen[0] == {"id": "a", "waited": 0, "group": None, "answers": {"skill": "a"}}
 
 
 @pytest.mark.parametrize("returned", [None, "ab", {"a": "b"}, 5, [5], ["ab"], [[1, 2]], [None]])
-def test_what_is_no_groups_is_refused(returned: Any) -> None:
+def test_a_result_that_is_no_list_of_groups_is_refused(returned: Any) -> None:
     with pytest.raises(BadGroups):
-        groups(lambda waiting: returned)
+        groups_of(lambda waiting: returned)
 
 
 @pytest.mark.parametrize("bad", [["a"], ["a", "a"], ["a", "x"], ["a", "b", "d"], ["c", "a"]])
-def test_a_group_that_cannot_play_is_left_out_and_told(bad: list[str]) -> None:
-    found, problem = groups(lambda waiting: [["c", "d"], bad])
+def test_a_group_that_cannot_play_is_left_out_and_reported(bad: list[str]) -> None:
+    found, problem = groups_of(lambda waiting: [["c", "d"], bad])
     assert found == [["c", "d"]]
     assert problem
 
@@ -86,8 +86,10 @@ def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: li
     assert match.groups(found["match"], {"id": "0" * 20, "players": 2, "waiting": PEOPLE}) == (chosen, "")
 
 
-def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 20, question: bytes | None = None) -> Any:
-    """The answer that a server without members stores; None if it stores none within so many seconds."""
+def stored_answer(
+    tmp_path: Path, function: Callable[..., Any], seconds: float = 20, question: bytes | None = None
+) -> Any:
+    """The answer that a server without members stores; None if it stores none within `seconds`."""
     store = FolderStore(tmp_path)
     store.create(waiting_key("maze"), question if question is not None else json.dumps(QUESTION).encode())
 
@@ -109,16 +111,18 @@ def served(tmp_path: Path, function: Callable[..., Any], seconds: float = 20, qu
 
 
 def test_a_server_stores_what_match_chooses(tmp_path: Path) -> None:
-    assert served(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["a", "c"]]}
+    assert stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["a", "c"]]}
 
 
-def test_an_answer_that_another_server_has_given_stays(tmp_path: Path) -> None:
+def test_the_answer_of_another_server_is_not_overwritten(tmp_path: Path) -> None:
     FolderStore(tmp_path).create(groups_key("maze", "0" * 20), b'{"groups": [["b", "d"]]}')
-    assert served(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["b", "d"]]}
+    assert stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["b", "d"]]}
 
 
-def test_a_match_that_raises_matches_nobody_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert served(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
+def test_a_match_that_raises_matches_no_participants_and_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert stored_answer(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
     assert "KeyError: 'age'" in caplog.text
 
 
@@ -126,7 +130,7 @@ def test_a_match_that_hangs_is_given_up(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(match, "SECONDS", 0.1)
-    assert served(tmp_path, lambda waiting: time.sleep(1) or []) == {"groups": []}
+    assert stored_answer(tmp_path, lambda waiting: time.sleep(1) or []) == {"groups": []}
     assert "match() has not returned within 0.1 s" in caplog.text
 
 
@@ -134,6 +138,6 @@ def test_a_match_that_hangs_is_given_up(
     "body",
     [b"", b"[" * 100_000, b"[]", b'{"id": "../../x", "players": 2, "waiting": []}', b'{"id": "00000000000000000000"}'],
 )
-def test_a_question_that_is_none_is_left_alone(tmp_path: Path, body: bytes) -> None:
+def test_a_wrong_question_is_not_answered(tmp_path: Path, body: bytes) -> None:
     assert matching.read(body) is None
-    assert served(tmp_path, lambda waiting: [], 0.3, question=body) is None
+    assert stored_answer(tmp_path, lambda waiting: [], 0.3, question=body) is None

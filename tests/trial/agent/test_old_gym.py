@@ -34,7 +34,7 @@ def gym() -> Iterator[Any]:
         del sys.modules[name]
 
 
-def quiet(gym: Any, name: str, **how: Any) -> Any:
+def make_without_warnings(gym: Any, name: str, **how: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return gym.make(name, **how)
@@ -66,7 +66,7 @@ def test_later_versions_of_the_old_interface(gym: Any) -> None:
     assert np.array_equal(gymnasium.make("CartPole-v1").reset(seed=5)[0], first), "the same as Gymnasium's"
 
 
-def test_the_time_limit_says_so(gym: Any) -> None:
+def test_an_end_by_the_time_limit_is_marked_in_info(gym: Any) -> None:
     env = gym.make("MountainCar-v0")
     assert env._max_episode_steps == env.spec.max_episode_steps == 200
     env._max_episode_steps = 3  # as many scripts do
@@ -79,7 +79,7 @@ def test_the_time_limit_says_so(gym: Any) -> None:
     assert gym.make("MountainCar-v0", max_episode_steps=7)._max_episode_steps == 7
 
 
-def test_what_lies_below(gym: Any) -> None:
+def test_the_wrapped_environment_can_be_reached(gym: Any) -> None:
     env = gym.make("CartPole-v1")
     env.reset()
     assert env.unwrapped is env.env
@@ -126,13 +126,13 @@ def test_an_id_that_gymnasium_has_in_a_newer_version(gym: Any) -> None:
 
 
 def test_text_environments_show_text(gym: Any) -> None:
-    env = quiet(gym, "FrozenLake-v0")
+    env = make_without_warnings(gym, "FrozenLake-v0")
     env.reset()
     assert "FFF" in env.render(mode="ansi")
     assert env.unwrapped.base.render_mode == "rgb_array"
 
 
-def test_a_render_mode_asks_for_the_interface_of_gym_026(gym: Any) -> None:
+def test_with_a_render_mode_an_environment_has_the_interface_of_gym_026(gym: Any) -> None:
     env = gym.make("CartPole-v1", render_mode="rgb_array")
     observation, info = env.reset(seed=1)
     assert (observation.shape, info) == ((4,), {})
@@ -295,7 +295,7 @@ def test_the_names_that_agents_import() -> None:
 # ---- in a trial
 
 
-def test_a_real_gym_comes_first(tmp_path: Path) -> None:
+def test_an_installed_gym_is_imported_instead(tmp_path: Path) -> None:
     (tmp_path / "site").mkdir()
     (tmp_path / "site/gym.py").write_text("REAL = True\n")
     (tmp_path / "agent").mkdir()

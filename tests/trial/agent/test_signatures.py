@@ -48,7 +48,7 @@ def adapter(folder: Path, source: str, **names: Any) -> AgentAdapter:
     return AgentAdapter(folder, "a-game", ("noop", "left"), **names)
 
 
-def started(folder: Path, old: str = "", new: str = "", source: str = AGENT) -> AgentAdapter:
+def started_agent(folder: Path, old: str = "", new: str = "", source: str = AGENT) -> AgentAdapter:
     assert old in source
     player = adapter(folder, source.replace(old, new))
     player.start()
@@ -79,7 +79,7 @@ def started(folder: Path, old: str = "", new: str = "", source: str = AGENT) -> 
     ],
 )
 def test_methods_with_and_without_the_environment(tmp_path: Path, old: str, new: str) -> None:
-    player = started(tmp_path, old, new)
+    player = started_agent(tmp_path, old, new)
     player.reset(1)
     player.step(1)
     player.render()
@@ -87,37 +87,39 @@ def test_methods_with_and_without_the_environment(tmp_path: Path, old: str, new:
     assert player.env.said == ["reset", ("step", 1), "close"]
 
 
-def test_start_may_take_the_section_as_hippos_trial_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some of HIPPO's agents read their own keys in it, which stand under `options` here."""
+def test_start_may_take_the_trial_section_in_hippos_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some of HIPPO's agents read keys of their own there; here these keys stand under `options`."""
     section = {"game": "maze", "maxEpisodes": 2, "ui": {"left": True, "up": False}, "options": {"rows": 6, "game": "x"}}
     monkeypatch.setenv("TRIAL", json.dumps(section))
     monkeypatch.setenv("PROJECT_ID", "my_study")
-    player = started(tmp_path, "start(self, game):", "start(self, config):\n        Env.config = config")
+    player = started_agent(tmp_path, "start(self, game):", "start(self, config):\n        Env.config = config")
     assert player.env.config == {"game": "maze", "maxEpisodes": 2, "ui": ["left"], "rows": 6, "projectId": "my_study"}
     monkeypatch.delenv("TRIAL")
-    player = started(tmp_path, "start(self, game):", "start(self, config: dict = None):\n        Env.config = config")
+    player = started_agent(
+        tmp_path, "start(self, game):", "start(self, config: dict = None):\n        Env.config = config"
+    )
     assert player.env.config == {"ui": [], "projectId": "my_study"}
 
 
-def test_the_environment_that_start_returned_is_given(tmp_path: Path) -> None:
+def test_methods_get_the_environment_that_start_returned(tmp_path: Path) -> None:
     source = AGENT.replace("self.env = Env()", "self.env = Env(); other = Env(); other.mine = True").replace(
         "return self.env", "return other"
     )
-    player = started(
+    player = started_agent(
         tmp_path, "step(self, action):", "step(self, env, action):\n        assert env.mine", source=source
     )
     assert player.step(1).reward == 1.0
 
 
-def test_a_seed_is_given_where_reset_takes_one(tmp_path: Path) -> None:
-    player = started(tmp_path, "reset(self):", "reset(self, env, seed=None):\n        self.seed = seed")
+def test_reset_gets_a_seed_if_it_takes_one(tmp_path: Path) -> None:
+    player = started_agent(tmp_path, "reset(self):", "reset(self, env, seed=None):\n        self.seed = seed")
     assert player.reset(7)[2] is True
     assert player._agent.seed == 7
-    assert started(tmp_path).reset(7)[2] is False
+    assert started_agent(tmp_path).reset(7)[2] is False
 
 
 def test_functions_without_a_class(tmp_path: Path) -> None:
-    player = started(
+    player = started_agent(
         tmp_path,
         source="""
 import numpy
@@ -141,7 +143,7 @@ def close(env):
     assert player.env == {"game": "a-game", "steps": [1, 0], "closed": True}
 
 
-def test_some_functions_are_no_agent(tmp_path: Path) -> None:
+def test_functions_without_all_five_names_are_no_agent(tmp_path: Path) -> None:
     player = adapter(tmp_path, "def start(game): pass\ndef step(env, action): pass\n")
     with pytest.raises(AgentError, match=r"no class Agent, and of its functions no render, reset, close"):
         player.start()
@@ -170,24 +172,24 @@ def test_some_functions_are_no_agent(tmp_path: Path) -> None:
         ("start(self, game)", "start(self, game, more)", "start(game, more) cannot be called; write start(game)"),
     ],
 )
-def test_a_method_that_takes_something_else_is_refused_with_a_sentence(
+def test_a_method_with_wrong_parameters_is_refused_with_a_sentence(
     tmp_path: Path, old: str, new: str, words: str
 ) -> None:
     with pytest.raises(AgentError) as raised:
-        started(tmp_path, old, new)
+        started_agent(tmp_path, old, new)
     assert str(raised.value) == words
 
 
-def test_an_environment_that_is_not_known_is_asked_for(tmp_path: Path) -> None:
+def test_if_a_method_takes_the_environment_start_must_return_it(tmp_path: Path) -> None:
     hidden = AGENT.replace("        return self.env\n", "").replace("self.env", "self.mine")
-    assert started(tmp_path, source=hidden).reset(1) == (None, {}, False)
-    player = started(tmp_path, "step(self, action)", "step(self, env, action)", source=hidden)
+    assert started_agent(tmp_path, source=hidden).reset(1) == (None, {}, False)
+    player = started_agent(tmp_path, "step(self, action)", "step(self, env, action)", source=hidden)
     with pytest.raises(AgentError, match=r"step\(\) takes the environment; return it from start\(game\)"):
         player.step(1)
 
 
-def test_the_newest_word_reaches_a_step_that_asks_for_it(tmp_path: Path) -> None:
-    player = started(
+def test_a_step_that_takes_a_reward_gets_the_newest_feedback(tmp_path: Path) -> None:
+    player = started_agent(
         tmp_path, "step(self, action):", "step(self, action, reward):\n        self.env.said.append(reward)"
     )
     player.step(0)
@@ -198,7 +200,7 @@ def test_the_newest_word_reaches_a_step_that_asks_for_it(tmp_path: Path) -> None
     assert [word for word in player.env.said if isinstance(word, str)] == ["None", "good", "None"]
 
 
-def test_what_says_nothing_of_its_parameters_is_called_as_usual() -> None:
+def test_a_callable_without_a_signature_is_called_as_usual() -> None:
     assert signatures.read("step", dict) == signatures.usual("step")
 
 
@@ -211,7 +213,7 @@ def test_a_step_may_return_only_whether_it_is_done(done: Any) -> None:
     assert read_step_result(np.False_).terminated is False
 
 
-def test_numbers_of_numpy() -> None:
+def test_numbers_of_numpy_are_read() -> None:
     found = read_step_result({"reward": np.array([2.5]), "done": np.array([True]), "observation": 0})
     assert (found.reward, found.terminated) == (2.5, True)
     with pytest.raises(AgentError, match="a reward that is no number"):
@@ -230,7 +232,7 @@ def test_gyms_time_limit_truncates(of_hippo: bool) -> None:
     assert ended(False, {"TimeLimit.truncated": True}) == (False, False)
 
 
-def test_what_else_is_in_the_dict_is_kept() -> None:
+def test_other_entries_of_the_dict_are_kept() -> None:
     found = read_step_result({"reward": 1, "done": False, "info": {}, "agentAction": 2, "q": [1, 2]})
     assert found.extra == {"agentAction": 2, "q": [1, 2]}
     assert read_step_result({"reward": 1, "done": False, "info": {}, "observation": 0}).extra is None
@@ -242,7 +244,7 @@ def test_what_else_is_in_the_dict_is_kept() -> None:
 
 
 def line_of(folder: Path, returned: str, more: str = "") -> dict[str, Any]:
-    player = started(folder, "return 0, 1.0, False, {}", f"return {returned}", AGENT + more)
+    player = started_agent(folder, "return 0, 1.0, False, {}", f"return {returned}", AGENT + more)
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(
         limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={"episode": 1, "step": 1}
@@ -263,14 +265,14 @@ def test_the_dict_of_a_step_is_recorded_whole(tmp_path: Path) -> None:
     assert np.array_equal(recording.read_observation(extra["map"]), np.arange(1000, dtype=np.uint16).reshape(10, 100))
 
 
-def test_a_tuple_has_nothing_beside_it(tmp_path: Path) -> None:
+def test_a_step_that_returns_a_tuple_records_no_extra(tmp_path: Path) -> None:
     assert "extra" not in line_of(tmp_path, "0, 1.0, False, {}")
 
 
-def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
+def test_an_entry_that_is_too_large_is_logged_once_and_the_others_are_recorded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    player = started(
+    player = started_agent(
         tmp_path, "return 0, 1.0, False, {}", 'return {"done": False, "small": 1, "large": "x" * 2_000_000, "last": 2}'
     )
     calls = AgentCalls(player, dict, record_observations=False)
@@ -283,11 +285,11 @@ def test_what_is_too_large_is_said_once_and_the_rest_is_recorded(
     ]
 
 
-def test_an_info_that_is_too_large_is_said_once_and_the_rest_of_it_is_recorded(
+def test_an_info_that_is_too_large_is_logged_once_and_the_rest_of_it_is_recorded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     info = '{"small": 1, "large": "x" * 2_000_000, "last": [2]}'
-    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
@@ -298,11 +300,9 @@ def test_an_info_that_is_too_large_is_said_once_and_the_rest_of_it_is_recorded(
     ]
 
 
-def test_an_info_of_many_values_leaves_no_more_than_a_mark_of_what_is_too_much(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_info_of_too_many_values_is_cut_off_with_a_mark(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     info = "{str(number): 'x' * 100 for number in range(50_000)}"
-    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
@@ -316,9 +316,9 @@ def test_an_info_of_many_values_leaves_no_more_than_a_mark_of_what_is_too_much(
 
 
 @pytest.mark.timeout(60)
-def test_an_info_of_fifty_megabytes_is_written_as_fast_as_another(tmp_path: Path) -> None:
+def test_thirty_infos_of_fifty_megabytes_are_written_within_the_tests_time(tmp_path: Path) -> None:
     info = '{"text": "x" * 50_000_000, "array": numpy.zeros((10, 1_000_000)), "last": 1}'
-    player = started(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
+    player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     first, *others = [json.loads(text_of_line(calls.run(step).line))["info"] for _ in range(30)]
@@ -328,14 +328,14 @@ def test_an_info_of_fifty_megabytes_is_written_as_fast_as_another(tmp_path: Path
     assert others == [first] * 29
 
 
-def test_a_small_info_after_a_large_one_is_recorded_as_ever(tmp_path: Path) -> None:
+def test_a_small_info_after_a_large_one_is_recorded_as_usual(tmp_path: Path) -> None:
     info = '{"a": ["x" * 2_000_000, 1][game.steps > 1], "on": {True: [1]}, "deep": deep}'
     more = """
 class game: steps = 0
 deep = []
 for _ in range(25): deep = [deep]
 """
-    player = started(
+    player = started_agent(
         tmp_path, "return 0, 1.0, False, {}", f"game.steps += 1; return 0, 1.0, False, False, {info}", AGENT + more
     )
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
@@ -345,9 +345,9 @@ for _ in range(25): deep = [deep]
     assert later["on"] == {"true": [1]}
 
 
-def test_an_info_stays_as_it_is_beside_something_large(tmp_path: Path) -> None:
+def test_an_info_is_recorded_whole_beside_a_large_observation(tmp_path: Path) -> None:
     info, observation = '{"many": numpy.arange(200)}', "numpy.random.default_rng(1).bytes(3_000_000).hex()"
-    player = started(tmp_path, "return 0, 1.0, False, {}", f"return {observation}, 1.0, False, False, {info}")
+    player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return {observation}, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=True)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     line = json.loads(text_of_line(calls.run(step).line))
@@ -358,7 +358,7 @@ def test_an_info_stays_as_it_is_beside_something_large(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", ["game.steps", "[game.steps]", "{'x': (game.steps,)}", "numpy.int64(game.steps)"])
 def test_an_info_that_the_game_changes_afterwards_stays_as_it_was(tmp_path: Path, value: str) -> None:
     changes = f"game.steps += 1; game.info['lives'] = {value}; return 0, 1.0, False, False, game.info"
-    player = started(tmp_path, "return 0, 1.0, False, {}", changes, AGENT + "\nclass game: steps, info = 0, {}\n")
+    player = started_agent(tmp_path, "return 0, 1.0, False, {}", changes, AGENT + "\nclass game: steps, info = 0, {}\n")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     lines = [calls.run(step).line for _ in range(3)]
@@ -392,12 +392,12 @@ def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written() -
         assert recording.LaterLine("step", fields).text() == recording.line("step", **fields)
 
 
-def test_a_circle_in_the_dict_ends_somewhere(tmp_path: Path) -> None:
+def test_a_dict_that_contains_itself_is_recorded(tmp_path: Path) -> None:
     returned = '(lambda c: c.update(me=c) or {"done": False, "circle": c})({})'
     assert "circle" in line_of(tmp_path, returned)["extra"]
 
 
-def test_shapes_of_a_step():
+def test_a_step_may_return_a_tuple_or_hippos_dict():
     five = read_step_result((1, np.float32(2), np.bool_(True), False, {"a": 1}))
     assert (five.reward, five.terminated, five.truncated, five.info) == (2.0, True, False, {"a": 1})
     assert read_step_result((1, 2, True, None)).terminated

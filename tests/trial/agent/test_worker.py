@@ -46,7 +46,7 @@ def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
     assert [heard[0][1], heard[2][1]] == ["quick", True]
 
 
-def test_a_limit_that_is_left_over_from_before_ends_nothing() -> None:
+def test_the_limit_of_an_earlier_call_does_not_end_a_later_one() -> None:
     async def work() -> Heard:
         worker, heard, loop, later = Worker(), Heard(), asyncio.get_running_loop(), [0.0]
         clock = loop.time
@@ -68,7 +68,7 @@ def test_a_limit_that_is_left_over_from_before_ends_nothing() -> None:
     assert asyncio.run(work()) == [(True, None)] * 3
 
 
-def test_a_failure_in_what_hears_of_one_result_loses_no_other() -> None:
+def test_a_failure_while_one_result_is_taken_loses_no_other() -> None:
     async def work() -> tuple[Heard, list[Any]]:
         worker, heard, free, wrong = Worker(), Heard(), threading.Event(), []
         asyncio.get_running_loop().set_exception_handler(lambda _, said: wrong.append(said["exception"]))
@@ -107,7 +107,7 @@ def test_a_worker_serves_one_event_loop_after_the_other() -> None:
     worker.close()
 
 
-def test_a_function_that_returns_when_its_loop_has_ended_harms_nobody() -> None:
+def test_a_function_that_returns_when_its_loop_has_ended_does_no_harm() -> None:
     worker, free = Worker(), threading.Event()
 
     async def work() -> None:

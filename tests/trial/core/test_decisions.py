@@ -1,4 +1,4 @@
-"""The decisions of a trial, event by event: its core is fed with events and times, and says what is to be done."""
+"""The decisions of a trial, event by event: the test gives the core events and times, and checks the effects it returns."""
 
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ FRAME = np.zeros((2, 2, 3), np.uint8)
 
 
 class Driver:
-    """Feeds a trial by hand: an agent that answers when it is told to, and a clock that is set."""
+    """Drives a trial by hand, with an agent that answers when a test tells it to, and a clock that the test sets."""
 
     def __init__(self, **section):
         section = {"game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, **section}
@@ -58,7 +58,7 @@ class Driver:
         self.all = []
 
     def event(self, name, *args):
-        """Bring an event; what it leads to, recordings opened at once."""
+        """Bring an event; return its effects, and those of the recordings that it opens."""
         self.effects = getattr(self.trial, name)(*args)
         for effect in self.effects:
             if isinstance(effect, OpenRecording):
@@ -91,7 +91,7 @@ class Driver:
         return self.returns(Begun(b"reset", FRAME))
 
     def step(self, reward=1.0, terminated=False):
-        """Let the step come that is due, and take it."""
+        """Wait for the step that is due, and take it."""
         if not isinstance(self.call, StepCall):
             self.wait(self.trial.wake_at - self.now)
         call = self.call
@@ -99,7 +99,7 @@ class Driver:
         return self.returns(StepTaken({PLAYER: reward}, terminated, False, FRAME, b"step"))
 
     def playing(self):
-        """A client is connected and the game is on; no step was taken."""
+        """Connect a client and start the game; no step was taken."""
         self.begin()
         self.reset()
         self.connect()
@@ -171,7 +171,7 @@ def test_an_agent_that_does_not_start_leaves_no_answer():
     assert driver.trial.phase is Phase.CLOSED
 
 
-def test_a_step_that_an_earlier_server_has_answered_is_done_at_once():
+def test_a_game_step_that_an_earlier_server_has_answered_is_done_at_once():
     driver = Driver()
     driver.event("already_played", {"episodes": 2, "score": 340})
     assert driver.trial.finished
@@ -202,7 +202,7 @@ def test_a_second_tab_of_a_player_replaces_the_first_and_holds_the_game():
     assert driver.trial.progress.state.value == "paused"
 
 
-def test_another_player_is_shown_the_same_and_replaces_nobody():
+def test_another_participant_is_shown_the_same_frames_and_replaces_no_client():
     driver = Driver().playing()
     driver.connect("phone", player="P2")
     assert driver.of(Close) == []
@@ -212,7 +212,7 @@ def test_another_player_is_shown_the_same_and_replaces_nobody():
     assert len({effect.frame_id for effect in frames}) == 1
 
 
-def test_a_client_that_goes_holds_the_game():
+def test_the_game_is_held_when_its_client_disconnects():
     driver = Driver().playing()
     driver.step()
     driver.event("disconnect", "tab", driver.now)
@@ -239,7 +239,7 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     assert driver.trial.wake_at is None
 
 
-def test_what_is_refused_is_answered_in_words():
+def test_a_refused_message_gets_a_sentence():
     driver = Driver(ui={"start": True}).playing()
     assert sent(driver.say(command="stop")) == [{"error": "stop is not offered in this game"}]
     assert sent(driver.say(action="jump")) == [{"error": "that action is not in this game's actionSpace"}]
@@ -480,7 +480,7 @@ def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
     assert driver.trial.progress.score == 4.5
 
 
-def test_an_episode_that_plays_differently_begins_again_with_its_seed():
+def test_an_episode_whose_replay_differs_begins_again_with_its_seed():
     driver = Driver().begin(recorded(STEPS))
     driver.fails(ValueError("it plays differently now"))
     assert isinstance(driver.call, ResetCall)
@@ -495,7 +495,7 @@ def test_an_episode_that_plays_differently_begins_again_with_its_seed():
 # ---- the server must end
 
 
-def test_closing_writes_down_where_the_game_stands_and_stores_no_answer():
+def test_closing_records_where_the_game_stands_and_stores_no_answer():
     driver = Driver().playing()
     driver.step()
     effects = driver.event("close", driver.now)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from trial.core.flow_control import STALLED_SECONDS, Window
 
 
-def test_window_fits_the_round_trip():
+def test_more_frames_may_be_under_way_if_the_round_trip_is_longer():
     for round_trip, rate, wanted in ((0.001, 30, 3), (0.1, 30, 5), (0.1, 60, 8), (10, 60, 15)):
         window = Window()
         assert window.wait(0.0, rate) == 0.0
@@ -28,8 +28,8 @@ def test_window_fits_the_round_trip():
         assert window.wait(104.0, rate) == 0.0
 
 
-def under_way(window: Window, rate: int, first: int, now: float) -> int:
-    """So many frames, from this one, are sent to a client that acknowledges none of them."""
+def send_until_it_must_wait(window: Window, rate: int, first: int, now: float) -> int:
+    """Send frames from number `first` on, until one must wait for an acknowledgement; return how many were sent."""
     number = first
     while window.wait(now, rate) == 0.0:
         window.sent(number, now)
@@ -44,11 +44,11 @@ def test_a_client_that_acknowledges_two_frames_at_once_may_have_one_more_under_w
     window.sent(2, 1.0)
     window.sent(3, 1.0)
     window.acknowledged(3, 1.1)
-    assert under_way(window, 30, 4, 2.0) == 6
+    assert send_until_it_must_wait(window, 30, 4, 2.0) == 6
     window.acknowledged(9, 2.2)  # the six of them
     window.sent(10, 3.0)
     window.acknowledged(10, 3.1)
-    assert under_way(window, 30, 11, 4.0) == 5, "it acknowledges each frame again"
+    assert send_until_it_must_wait(window, 30, 11, 4.0) == 5, "it acknowledges each frame again"
 
 
 def test_frames_that_are_acknowledged_in_pairs_never_wait():
@@ -65,8 +65,8 @@ def test_frames_that_are_acknowledged_in_pairs_never_wait():
 
 
 @given(st.floats(0.05, 1.0), st.lists(st.tuples(st.floats(0.001, 0.3), st.booleans()), min_size=1, max_size=60))
-def test_rows_of_a_picture_do_not_make_the_line_seem_quick(round_trip, sendings):
-    """Several messages with one id are under way: what is acknowledged may be an earlier one of them."""
+def test_rows_of_a_picture_do_not_make_the_round_trip_seem_shorter(round_trip, sendings):
+    """Several messages with one id are under way, and the client may acknowledge an earlier one of them."""
     window, now, number, acks = Window(), 0.0, 1, []
     for pause, is_new in sendings:
         now += pause

@@ -1,4 +1,4 @@
-"""Keys of the project's own, presses that are single actions, the first picture that stands, limits of an episode."""
+"""The project's own keys, `input: single`, how long the first picture stands, and limits of an episode."""
 
 import json
 import math
@@ -24,7 +24,7 @@ def controls(keys=KEYS, **more):
     return Controls(SPACE, 1, keys=keys, **more)
 
 
-def taken(these, steps=1):
+def actions_of(these, steps=1):
     return [SPACE[these.take()[0]] for _ in range(steps)]
 
 
@@ -34,7 +34,7 @@ def taken(these, steps=1):
 def test_a_key_takes_the_action_that_the_project_gives_it():
     these = controls()
     these.hold(KEY + "a")
-    assert taken(these, 2) == ["left", "left"]
+    assert actions_of(these, 2) == ["left", "left"]
     these.release(KEY + "a")
     assert these.take() == (0, False)
 
@@ -42,26 +42,26 @@ def test_a_key_takes_the_action_that_the_project_gives_it():
 def test_keys_that_are_held_together_take_their_action_in_any_order_and_one_of_them_may_have_none():
     these = controls()
     these.hold(KEY + "ArrowUp")
-    assert taken(these) == ["noop"]
+    assert actions_of(these) == ["noop"]
     these.hold(KEY + "ArrowLeft")
-    assert taken(these) == ["leftup"]
+    assert actions_of(these) == ["leftup"]
     these.release(KEY + "ArrowUp")
-    assert taken(these) == ["left"]
+    assert actions_of(these) == ["left"]
     these.hold(KEY + "ArrowUp")
-    assert taken(these) == ["leftup"]
+    assert actions_of(these) == ["leftup"]
 
 
 def test_a_key_pressed_and_released_between_two_steps_acts_once():
     these = controls()
     these.hold(KEY + " ")
     these.release(KEY + " ")
-    assert taken(these, 2) == ["jump", "noop"]
+    assert actions_of(these, 2) == ["jump", "noop"]
 
 
-def test_a_key_is_no_action_and_an_action_is_no_key():
+def test_keys_and_actions_of_the_same_name_are_told_apart():
     these = controls({"left": "jump"})
     these.hold("left")
-    assert taken(these) == ["left"]
+    assert actions_of(these) == ["left"]
     assert not these.knows(KEY + "up")
 
 
@@ -70,14 +70,14 @@ def test_keys_of_actions_that_do_not_exist_do_nothing():
 
 
 @given(st.lists(st.tuples(st.sampled_from(sorted({"ArrowLeft", "ArrowUp", "a", " "})), st.booleans()), max_size=12))
-def test_the_action_is_one_of_those_that_held_keys_make(moves):
+def test_the_action_is_one_that_the_held_keys_give(moves):
     these = controls()
     for key, down in moves:
         (these.hold if down else these.release)(KEY + key)
     these.take()
     held = {name.removeprefix(KEY) for name in these.held}
     possible = {action for combined, action in KEYS.items() if set(combined.split("+")) <= held}
-    assert taken(these)[0] in (possible or {"noop"})
+    assert actions_of(these)[0] in (possible or {"noop"})
 
 
 # ---- single presses
@@ -86,12 +86,12 @@ def test_the_action_is_one_of_those_that_held_keys_make(moves):
 def test_with_single_a_press_is_one_action_also_while_the_key_is_held():
     these = controls(single=True)
     these.hold(KEY + "a")
-    assert taken(these, 3) == ["left", "noop", "noop"]
+    assert actions_of(these, 3) == ["left", "noop", "noop"]
     these.hold(KEY + "a")  # the keyboard repeats
-    assert taken(these) == ["noop"]
+    assert actions_of(these) == ["noop"]
     these.release(KEY + "a")
     these.hold(KEY + "a")
-    assert taken(these, 2) == ["left", "noop"]
+    assert actions_of(these, 2) == ["left", "noop"]
 
 
 def test_with_single_no_press_is_lost_up_to_a_few():
@@ -99,14 +99,14 @@ def test_with_single_no_press_is_lost_up_to_a_few():
     for _ in range(PRESSES + 3):
         these.press("jump")
     these.press(KEY + "a")
-    assert taken(these, PRESSES + 2) == ["jump"] * PRESSES + ["noop"] * 2
+    assert actions_of(these, PRESSES + 2) == ["jump"] * PRESSES + ["noop"] * 2
 
 
 def test_with_single_the_action_is_that_of_the_keys_that_are_held_when_a_key_goes_down():
     these = controls(single=True)
     these.hold(KEY + "ArrowUp")
     these.hold(KEY + "ArrowLeft")
-    assert taken(these, 2) == ["leftup", "noop"]
+    assert actions_of(these, 2) == ["leftup", "noop"]
 
 
 def test_with_single_presses_before_the_game_goes_on_do_nothing():
@@ -121,7 +121,7 @@ def test_with_single_presses_before_the_game_goes_on_do_nothing():
 # ---- messages
 
 
-def test_a_key_is_told_by_name():
+def test_a_message_names_its_key():
     assert messages.parse('{"key": "ArrowLeft", "held": true}').record() == {"key": "ArrowLeft", "held": True}
     assert messages.parse('{"key": "A"}').key == "A"
 
@@ -129,7 +129,7 @@ def test_a_key_is_told_by_name():
 @pytest.mark.parametrize(
     "said", [{"key": 3}, {"key": ""}, {"key": "x" * 33}, {"key": "x", "action": "up"}, {"held": True}]
 )
-def test_what_is_no_key_is_refused(said):
+def test_a_message_with_a_wrong_key_is_refused(said):
     with pytest.raises(messages.BadMessage):
         messages.parse(json.dumps(said))
 
@@ -147,7 +147,7 @@ def test_the_client_is_told_keys_labels_and_input_only_if_the_project_gives_them
     assert not {"keys", "labels", "input", "startsIn", "timeLeft"} & said.keys()
 
 
-def test_a_key_acts_and_one_that_the_project_does_not_name_is_refused():
+def test_a_key_of_the_project_acts_and_another_key_is_refused():
     driver = Driver(keys={"Space": "up"}).playing()
     driver.say(key=" ", held=True)
     assert played(driver) == "up"
@@ -155,7 +155,7 @@ def test_a_key_acts_and_one_that_the_project_does_not_name_is_refused():
     assert "actionSpace" in driver.effects[0].text
 
 
-def test_the_arrows_of_ui_take_no_key_of_the_project_away():
+def test_an_action_that_has_a_key_needs_no_button_in_ui():
     driver = Driver(keys={"x": "right"}, ui={"start": True}).playing()
     driver.say(action="right", held=True)
     assert played(driver) == "right"
@@ -195,7 +195,7 @@ def test_keys_do_nothing_while_the_first_picture_stands_and_those_held_then_act(
     assert played(driver) == "noop"
 
 
-def test_a_picture_that_stood_when_the_game_was_paused_stands_as_long_again():
+def test_after_a_pause_the_first_picture_stands_for_its_whole_time_again():
     driver = Driver(resetFreeze=3).playing()
     driver.wait(2)
     driver.say(command="pause")
@@ -208,7 +208,7 @@ def test_a_picture_that_stood_when_the_game_was_paused_stands_as_long_again():
     assert isinstance(driver.call, StepCall)
 
 
-def test_who_connects_again_is_told_how_long_the_picture_still_stands():
+def test_a_client_that_asks_is_told_how_long_the_first_picture_still_stands():
     driver = Driver(resetFreeze=3).playing()
     driver.wait(1)
     driver.say(command="requestUI")
@@ -220,7 +220,7 @@ def test_who_connects_again_is_told_how_long_the_picture_still_stands():
 
 
 def played(driver, steps=1):
-    """Take steps, one each tenth of a second."""
+    """Take steps, one each tenth of a second; return the action of the step that is due then."""
     for _ in range(steps):
         driver.step()
         driver.wait(0.1)
@@ -272,7 +272,7 @@ def test_the_next_episode_begins_with_all_its_time(between):
     assert (said["state"], said["episode"], said["timeLeft"]) == ("playing", 2, 1)
 
 
-def test_an_end_of_the_environments_own_at_the_limit_is_not_the_limits():
+def test_an_episode_that_terminates_at_the_limit_is_not_truncated():
     driver = Driver(maxSteps=1, maxEpisodes=2).playing()
     driver.step(terminated=True)
     assert [each["why"] for each in ends(driver)] == ["terminated"]
@@ -302,7 +302,7 @@ def test_the_time_that_is_left_shrinks_by_what_was_played(events):
         assert time.left(now) == pytest.approx(max(0.0, 20 - played), abs=1e-6)
 
 
-def test_without_a_limit_no_time_is_left_over():
+def test_without_a_limit_there_is_no_time_left_to_tell():
     assert EpisodeTime(0, 0).left(math.pi) is None
 
 

@@ -1,4 +1,4 @@
-"""The clocks of a session's members, without a game: their version is another one whenever they are told something new."""
+"""The clocks of a session's members, without a game: their version changes whenever members are to be told something new."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from trial.core.presence import Presence, Rules
 
 
-def arrives(presence: Presence, now: float) -> None:
+def comes_and_is_measured(presence: Presence, now: float) -> None:
     presence.come("right", now)
     presence.round_trip("right", 0.02, now)
 
@@ -27,7 +27,7 @@ def counts_down_again(presence: Presence, now: float) -> None:
 CHANGES: dict[str, Callable[[Presence, float], object]] = {
     "comes": lambda presence, now: presence.come("left", now),
     "is fast enough": lambda presence, now: presence.round_trip("left", 0.02, now),
-    "the other arrives": arrives,
+    "the other comes_and_is_measured": comes_and_is_measured,
     "looks away": lambda presence, now: presence.hides("left", now),
     "comes back": lambda presence, now: presence.come("left", now),
     "goes on": lambda presence, now: presence.goes_on("left", now),
@@ -43,7 +43,7 @@ CHANGES: dict[str, Callable[[Presence, float], object]] = {
 
 
 @pytest.mark.parametrize("last", CHANGES)
-def test_whenever_members_are_to_be_told_something_new_the_version_is_another(last: str) -> None:
+def test_the_version_changes_whenever_members_are_to_be_told_something_new(last: str) -> None:
     presence = Presence(Rules(30, 60, 3, 100, 1), ("left", "right"), reads=True, begun=False)
 
     def told() -> tuple[object, ...]:

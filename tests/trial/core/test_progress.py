@@ -95,7 +95,7 @@ def test_the_third_failure_in_a_row_ends_the_trial():
     assert game.ended == [Episode(number, 0, 0.0, "failed") for number in (1, 2, 3)]
 
 
-def test_a_good_episode_forgives_the_failures_before_it():
+def test_after_a_good_episode_failures_are_counted_anew():
     game = playing(maxEpisodes=4)
     for fails in (True, True, False, True):
         if fails:
@@ -113,7 +113,7 @@ def test_a_reset_that_fails_is_tried_again_in_the_same_episode():
     assert (game.episode, game.over, game.ended) == (1, False, [])
 
 
-def test_code_that_will_never_answer_ends_the_trial_at_once():
+def test_a_fatal_failure_ends_the_trial_at_once():
     game = playing()
     game.stepped({PLAYER: 1.0}, False, False)
     game.failed(fatal=True)
@@ -131,7 +131,7 @@ def test_the_last_episode_ends_the_trial(how, outcome):
     assert counts(game) == (1, 1, 1, 1, 1.0, 1.0)
 
 
-def test_a_reset_ends_an_episode_in_which_something_happened():
+def test_a_reset_ends_an_episode_that_has_steps():
     game = playing()
     game.reset()
     assert (game.episode, game.ended) == (1, [])
@@ -164,7 +164,7 @@ def test_only_a_game_that_plays_can_be_paused():
     assert game.playing
 
 
-def test_a_break_lets_go_of_the_keys_and_forgets_those_that_came_and_went():
+def test_a_break_lets_go_of_the_keys_and_ignores_those_that_are_tapped_in_it():
     game = playing(betweenEpisodes=5)
     game.act("up", True)
     game.stepped({PLAYER: 1.0}, True, False)
@@ -193,7 +193,7 @@ def test_the_frame_rate_stays_within_the_projects_limits(wish, rate):
     assert game.frame_rate == rate
 
 
-def test_a_press_acts_only_while_the_game_plays_and_a_key_once_it_does():
+def test_a_press_acts_only_while_the_game_plays_and_a_held_key_as_soon_as_it_plays():
     game = new_game(actionBufferLifespan=2)
     game.act("up", None)
     game.start()
@@ -210,7 +210,7 @@ def test_a_press_acts_only_while_the_game_plays_and_a_key_once_it_does():
         game.act("jump", True)
 
 
-def test_keys_that_came_and_went_are_forgotten_and_held_ones_are_not():
+def test_taps_are_forgotten_and_held_keys_are_not():
     controls = Controls(SPACE, 5)
     controls.press("left")
     controls.hold("up")
@@ -230,7 +230,7 @@ def test_frames_are_due_at_even_intervals_from_the_first_one():
     assert pacer.next(9.0, 10) == 9.0
 
 
-def test_frames_that_were_missed_are_skipped_on_the_old_grid():
+def test_missed_frames_are_skipped_and_the_intervals_stay_as_they_were():
     pacer = Pacer()
     pacer.next(0.0, 10)
     assert pacer.next(0.15, 10) == pytest.approx(0.1), "less than one frame late: it is due at once"

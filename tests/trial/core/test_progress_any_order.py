@@ -26,7 +26,7 @@ EVENTS = st.one_of(
 
 
 @given(st.lists(EVENTS, max_size=80), st.integers(1, 4), st.sampled_from([0, 3]))
-def test_game_goes_forward_only(events, limit, pause):
+def test_the_counts_of_a_game_never_go_back(events, limit, pause):
     game = new_game(maxEpisodes=limit, minFrameRate=3, maxFrameRate=60, betweenEpisodes=pause)
     steps = 0
     for event in events:
@@ -101,7 +101,7 @@ def test_three_failures_in_a_row_end_the_trial():
     assert game.outcome == "failed"
 
 
-def test_an_episode_that_ends_well_forgives_the_failures_before_it():
+def test_after_an_episode_that_ends_well_failures_are_counted_anew():
     game = new_game(betweenEpisodes=0)
     game.start()
     for why in ("failed", "failed", "good", "failed", "failed"):
@@ -145,7 +145,7 @@ def test_leaving_lets_go_of_the_keys():
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.2), st.integers(1, 90)), max_size=100))
-def test_pacer_never_bursts(delays):
+def test_a_frame_is_due_at_most_one_interval_before_or_after_now(delays):
     pacer, now, previous = Pacer(), 100.0, None
     for delay, rate in delays:
         due = pacer.next(now, rate)
@@ -157,7 +157,7 @@ def test_pacer_never_bursts(delays):
         now = max(now, due) + delay
 
 
-def test_pacer_does_not_drift():
+def test_frames_that_are_taken_late_do_not_delay_the_later_ones():
     pacer, now = Pacer(), 0.0
     for _ in range(301):
         due = pacer.next(now, 30)

@@ -20,30 +20,30 @@ POLICY = {"afterAbsent": "policy", "substitute": "random"}
 
 def test_the_game_begins_by_itself_when_all_are_here_and_have_counted_down():
     driver = SessionDriver().come(0)
-    told = driver.told(0)
+    told = driver.state_seen_by(0)
     assert (told["you"], told["people"]) == ("left", {"left": "here", "right": "awaited"})
     assert (told["state"], told["heldFor"]) == ("ready", 60)
     assert "beginsIn" not in told
     driver.wait(10)
     assert driver.taken == []
     driver.come(1)
-    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
-    assert driver.told(1)["beginsIn"] == 3
-    assert driver.told(0).keys().isdisjoint({"heldFor", "turnOf"})
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.state_seen_by(1)["beginsIn"] == 3
+    assert driver.state_seen_by(0).keys().isdisjoint({"heldFor", "turnOf"})
     driver.wait(2.9)
     assert driver.taken == []
     driver.wait(0.1)
     assert len(driver.taken) == 1
-    assert [driver.told(number)["state"] for number in (0, 1)] == ["playing", "playing"]
-    assert "turnOf" not in driver.told(0), "in real time it is all players' turn"
+    assert [driver.state_seen_by(number)["state"] for number in (0, 1)] == ["playing", "playing"]
+    assert "turnOf" not in driver.state_seen_by(0), "in real time it is all players' turn"
 
 
-def test_start_of_one_does_not_begin_without_the_other():
+def test_the_start_of_one_member_does_not_begin_the_game_without_the_other():
     driver = SessionDriver().come(0).say(0, command="start").wait(5)
     assert driver.taken == []
 
 
-def test_whoever_leaves_in_the_countdown_ends_it():
+def test_a_member_who_leaves_in_the_countdown_ends_it():
     driver = SessionDriver().come(0, 1).wait(2).go(1).wait(2)
     assert driver.taken == []
     driver.come(1).wait(2.9)
@@ -69,14 +69,14 @@ def test_a_policy_plays_for_a_member_who_does_not_come():
     driver.wait(0.1)
     action = driver.taken[-1].actions["right"]
     assert (ask.player, action.index, action.by) == ("right", 2, "policy")
-    assert driver.told(0)["people"] == {"left": "here", "right": "policy"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "policy"}
     assert driver.presence() == [("left", "joined"), ("right", "replaced")]
 
 
 def test_in_a_seat_without_a_member_a_policy_plays_from_the_start():
     driver = SessionDriver(vacant=("right",), **POLICY).come(0)
-    assert driver.told(0)["people"] == {"left": "here", "right": "policy"}
-    assert driver.told(0)["beginsIn"] == 3
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "policy"}
+    assert driver.state_seen_by(0)["beginsIn"] == 3
     driver.wait(4)
     assert len(driver.taken) > 5
     assert [ask.player for ask in driver.calls(AskPolicy)] == ["right"]
@@ -86,11 +86,11 @@ def test_in_a_seat_without_a_member_a_policy_plays_from_the_start():
 
 def test_the_game_begins_when_all_have_gone_on_from_the_instructions():
     driver = SessionDriver(instructions="rules.html").come(0, 1).wait(60)
-    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    assert driver.state_seen_by(0)["people"] == {"left": "reads", "right": "reads"}
     assert driver.taken == []
     driver.say(0, command="start")
-    assert driver.told(1)["people"] == {"left": "here", "right": "reads"}
-    assert driver.told(0)["heldFor"] == 60
+    assert driver.state_seen_by(1)["people"] == {"left": "here", "right": "reads"}
+    assert driver.state_seen_by(0)["heldFor"] == 60
     driver.wait(50)
     assert driver.taken == []
     driver.say(1, command="start").wait(3)
@@ -99,59 +99,59 @@ def test_the_game_begins_when_all_have_gone_on_from_the_instructions():
 
 def test_a_member_who_reads_for_ever_holds_the_others_only_for_gather_seconds():
     driver = SessionDriver(instructions="rules.html").come(0, 1).say(0, command="start").wait(59.9)
-    assert "beginsIn" not in driver.told(0)
+    assert "beginsIn" not in driver.state_seen_by(0)
     driver.wait(0.1)
-    assert driver.told(1)["beginsIn"] == 3
+    assert driver.state_seen_by(1)["beginsIn"] == 3
     assert driver.wait(3.1).taken
 
 
-def test_no_time_of_the_game_is_used_before_it():
+def test_a_member_may_come_late_although_absent_is_zero():
     driver = SessionDriver(absent=0).come(0).wait(50).come(1).wait(3.2)
     assert driver.taken
     driver.go(1)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
 
 
-def test_who_has_gone_on_from_the_instructions_still_reads_the_page_after_the_first_episode():
+def test_members_who_have_read_the_instructions_also_read_the_page_between_episodes():
     driver = SessionDriver(instructions="rules.html", betweenEpisodes="between.html", maxEpisodes=2).come(0, 1)
     driver.say(0, command="start").say(1, command="start").wait(3.05)
     driver.trial.progress.stepped({}, True, False)
     taken = len(driver.wait(0.2).taken)
-    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    assert driver.state_seen_by(0)["people"] == {"left": "reads", "right": "reads"}
     assert len(driver.wait(30).taken) == taken
 
 
-def test_members_are_told_parts_of_a_second_too():
+def test_members_are_told_times_in_thousandths_of_a_second():
     driver = SessionDriver().come(0).wait(59.4996).say(0, command="requestUI")
-    assert driver.told(0)["heldFor"] == 0.5, "thousandths, no more"
+    assert driver.state_seen_by(0)["heldFor"] == 0.5, "thousandths, no more"
     driver.come(1).wait(2.5).say(1, command="requestUI")
-    assert driver.told(1)["beginsIn"] == 0.5
+    assert driver.state_seen_by(1)["beginsIn"] == 0.5
 
 
 def test_a_substitute_of_an_empty_place_does_not_play_for_members_who_leave():
     driver = SessionDriver(3, vacant=("third",), substitute="random").begin().go(1).wait(30)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
-    assert driver.told(0)["people"] == {"left": "here", "right": "away", "third": "policy"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "away", "third": "policy"}
 
 
 # ---- away and back
 
 
-def test_the_game_is_held_while_one_is_away_and_goes_on_with_a_countdown():
+def test_the_game_is_held_while_a_member_is_away_and_goes_on_with_a_countdown():
     driver = SessionDriver().begin().wait(1)
     driver.go(1)
     held = len(driver.taken)
-    told = driver.told(0)
+    told = driver.state_seen_by(0)
     assert (told["state"], told["people"], told["heldFor"]) == ("paused", {"left": "here", "right": "away"}, 30)
     driver.wait(12).come(1)
-    assert driver.told(0)["beginsIn"] == 3
+    assert driver.state_seen_by(0)["beginsIn"] == 3
     driver.wait(2.9)
     assert len(driver.taken) == held
     assert len(driver.wait(0.2).taken) > held
     assert driver.presence()[2:] == [("right", "left"), ("right", "returned")]
 
 
-def test_the_game_ends_for_all_when_one_stays_away():
+def test_the_game_ends_for_all_when_a_member_stays_away():
     driver = SessionDriver().begin().wait(1).go(1).wait(30)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
     assert driver.errors(0) == [PARTNER_LEFT]
@@ -159,7 +159,7 @@ def test_the_game_ends_for_all_when_one_stays_away():
     assert driver.lines("end")[-1]["outcomes"] == {"left": "partnerLeft", "right": "left"}
 
 
-def test_the_returned_find_the_game_ended_and_why():
+def test_a_member_who_returns_too_late_is_told_why_the_game_ended():
     driver = SessionDriver().begin().wait(1).go(1)
     driver.now += 30
     driver.event("advance", driver.now)  # the answers are not stored yet
@@ -167,10 +167,10 @@ def test_the_returned_find_the_game_ended_and_why():
     assert driver.errors(1) == [LEFT]
 
 
-def test_a_policy_takes_the_place_and_gives_it_back_at_the_next_step():
+def test_a_policy_takes_an_absent_members_place_and_gives_it_back_at_the_next_step():
     driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
-    assert driver.told(0)["people"]["right"] == "policy"
-    assert driver.told(0)["beginsIn"] == 3
+    assert driver.state_seen_by(0)["people"]["right"] == "policy"
+    assert driver.state_seen_by(0)["beginsIn"] == 3
     (ask,) = driver.calls(AskPolicy)
     assert (ask.player, ask.observation) == ("right", driver.steps)
     driver.event("policy_acted", "right", ask.ask_id, 2, driver.now)
@@ -178,7 +178,7 @@ def test_a_policy_takes_the_place_and_gives_it_back_at_the_next_step():
     action = driver.taken[-1].actions["right"]
     assert (action.index, action.by) == (2, "policy")
     driver.come(1).say(1, action="up", held=True)
-    assert driver.told(0)["state"] == "playing", "nobody waits for who comes back"
+    assert driver.state_seen_by(0)["state"] == "playing", "nobody waits for who comes back"
     driver.wait(0.2)
     action = driver.taken[-1].actions["right"]
     assert (action.index, action.by) == (1, "human")
@@ -203,12 +203,12 @@ def test_a_policy_that_plays_for_a_member_begins_each_episode_anew():
     assert len(resets) == 2
 
 
-def test_nothing_runs_out_while_all_are_gone():
+def test_no_time_runs_while_all_members_are_gone():
     driver = SessionDriver().begin().wait(1).go(0).wait(10).go(1).wait(3600)
     assert not driver.trial.progress.over
     assert driver.trial.wake_at is None
     driver.come(1)
-    assert driver.told(1)["heldFor"] == pytest.approx(20, abs=0.01)
+    assert driver.state_seen_by(1)["heldFor"] == pytest.approx(20, abs=0.01)
     driver.wait(20.1)
     assert driver.outcomes == {"P0": "left", "P1": "partnerLeft"}
 
@@ -223,13 +223,13 @@ def test_a_page_that_stops_answering_is_away_until_it_answers():
     driver.wait(3.05)
     window.sent(2, driver.now)
     driver.wait(STALLED_SECONDS + 0.5)
-    assert driver.told(0)["people"]["right"] == "away"
+    assert driver.state_seen_by(0)["people"]["right"] == "away"
     held = len(driver.taken)
     driver.wait(5)
     assert len(driver.taken) == held
     window.acknowledged(2, driver.now)
     driver.say(1, ack=2)
-    assert driver.told(0)["people"]["right"] == "here"
+    assert driver.state_seen_by(0)["people"]["right"] == "here"
     assert len(driver.wait(3.1).taken) > held
     assert driver.presence()[2:] == [("right", "left"), ("right", "returned")]
     said = [message for step in driver.taken for message in step.fields.get("messages", ()) if "event" in message]
@@ -242,13 +242,13 @@ def test_another_tab_of_a_member_takes_their_own_place():
     taken = len(driver.taken)
     assert len(driver.wait(0.3).taken) > taken, "the others do not wait"
     driver.event("disconnect", "tab1", driver.now)
-    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
 
 
 # ---- who does what
 
 
-def test_nobodys_key_moves_another():
+def test_a_members_keys_move_their_own_player_alone():
     driver = SessionDriver().begin()
     driver.say(0, action="up", held=True).say(1, action="right", held=True).wait(0.2)
     step = driver.taken[-1].actions
@@ -258,7 +258,7 @@ def test_nobodys_key_moves_another():
     assert (step["left"].name, step["right"].name) == ("noop", "right"), "only the keys of who left are let go"
 
 
-def test_the_recording_says_when_the_key_was_pressed_that_acts():
+def test_an_action_says_when_its_key_was_pressed():
     driver = SessionDriver().begin()
     driver.now += 0.03
     driver.say(1, action="up", held=True)
@@ -268,7 +268,7 @@ def test_the_recording_says_when_the_key_was_pressed_that_acts():
     assert {step.actions["left"].pressed_at for step in driver.taken} == {None}
 
 
-def test_messages_and_feedback_say_whose_they_are():
+def test_messages_and_feedback_name_their_player():
     driver = SessionDriver().begin().say(1, command="good").say(0, command="bad").wait(0.2)
     step = next(step for step in driver.taken if step.feedback)
     assert step.feedback == (("good", "right"), ("bad", "left"))
@@ -276,7 +276,7 @@ def test_messages_and_feedback_say_whose_they_are():
     assert said == [("right", "good"), ("left", "bad")]
 
 
-def test_who_sends_very_much_takes_no_room_from_the_others_messages():
+def test_a_member_who_sends_very_many_messages_takes_no_room_from_the_others():
     driver = SessionDriver().begin().wait(0.5).say(0, command="pause")
     for _ in range(MESSAGES_KEPT + 10):
         driver.trial.receive("tab0", messages.Message(command="good"), driver.now)
@@ -287,28 +287,28 @@ def test_who_sends_very_much_takes_no_room_from_the_others_messages():
     assert step.fields["messagesDropped"] > 0
 
 
-def test_a_pause_of_one_holds_all_and_any_goes_on():
+def test_any_member_may_pause_the_game_for_all_and_any_may_go_on():
     driver = SessionDriver().begin().wait(0.5).say(0, command="pause")
     paused = len(driver.taken)
     driver.wait(100)
     assert len(driver.taken) == paused
-    assert driver.told(1)["state"] == "paused"
+    assert driver.state_seen_by(1)["state"] == "paused"
     driver.say(1, command="start")
-    assert driver.told(0)["beginsIn"] == 3
+    assert driver.state_seen_by(0)["beginsIn"] == 3
     assert len(driver.wait(3.2).taken) > paused
 
 
-def test_a_pause_in_a_break_holds_the_next_episode_until_one_goes_on():
+def test_a_pause_in_a_break_holds_the_next_episode_until_a_member_goes_on():
     driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2).begin()
     driver.take(terminated=True).wait(1).say(0, command="pause")
-    assert driver.told(1)["state"] == "paused"
+    assert driver.state_seen_by(1)["state"] == "paused"
     taken = len(driver.taken)
     driver.wait(60)
     assert len(driver.taken) == taken
     assert len(driver.say(1, command="start").wait(3.2).taken) > taken
 
 
-def test_stop_of_one_ends_it_for_all_and_the_answers_say_whose_it_was():
+def test_one_members_stop_ends_the_game_for_all_and_the_answers_say_who_stopped():
     driver = SessionDriver().begin().wait(0.5)
     driver.say(1, command="stop").take()
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "stopped"}
@@ -317,7 +317,7 @@ def test_stop_of_one_ends_it_for_all_and_the_answers_say_whose_it_was():
     assert driver.lines("end")[-1]["outcomes"] == {"left": "partnerLeft", "right": "stopped"}
 
 
-def test_who_has_stopped_the_game_is_known_on_the_next_server_too():
+def test_the_next_server_knows_who_has_stopped_the_game():
     first = SessionDriver().begin().wait(0.5)
     first.say(1, command="stop").take()
     second = SessionDriver(recorded=recorded_of(first))
@@ -337,7 +337,7 @@ def test_each_member_has_their_own_score():
     assert driver.done(0).outcome == "finished"
 
 
-def test_who_is_replaced_at_the_end_has_left():
+def test_a_member_whom_a_policy_replaces_at_the_end_has_left():
     driver = SessionDriver(maxEpisodes=1, **POLICY).begin().wait(1).go(1).wait(33.05)
     driver.trial.progress.stop()
     driver.wait(0.2)
@@ -347,16 +347,16 @@ def test_who_is_replaced_at_the_end_has_left():
 # ---- breaks
 
 
-def test_a_break_with_a_page_ends_when_all_who_are_here_have_gone_on():
+def test_a_break_with_a_page_ends_when_all_present_members_have_gone_on():
     driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
-    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
     driver.take(terminated=True)
-    assert driver.told(0)["state"] == "break"
-    assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+    assert driver.state_seen_by(0)["state"] == "break"
+    assert driver.state_seen_by(0)["people"] == {"left": "reads", "right": "reads"}
     taken = len(driver.taken)
     driver.say(0, command="start").wait(10)
-    assert driver.told(1)["people"] == {"left": "here", "right": "reads"}
-    assert driver.told(1)["heldFor"] == 60
+    assert driver.state_seen_by(1)["people"] == {"left": "here", "right": "reads"}
+    assert driver.state_seen_by(1)["heldFor"] == 60
     assert len(driver.taken) == taken
     driver.say(1, command="start").wait(0.2)
     assert len(driver.taken) > taken
@@ -365,20 +365,20 @@ def test_a_break_with_a_page_ends_when_all_who_are_here_have_gone_on():
 def test_a_page_between_episodes_holds_the_others_for_gather_seconds_at_most():
     driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
     driver.take(terminated=True).wait(600)
-    assert driver.told(0)["state"] == "break", "nobody waits yet"
+    assert driver.state_seen_by(0)["state"] == "break", "nobody waits yet"
     taken = len(driver.taken)
     driver.say(0, command="start").wait(59.9)
     assert len(driver.taken) == taken
     assert len(driver.wait(0.3).taken) > taken
 
 
-def test_who_leaves_in_a_break_does_not_end_it_for_the_others():
+def test_a_member_who_leaves_in_a_break_does_not_end_it_for_the_others():
     driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2).begin()
     driver.take(terminated=True).wait(5).go(1)
-    assert driver.told(0)["state"] == "break"
+    assert driver.state_seen_by(0)["state"] == "break"
     driver.wait(16)
     taken = len(driver.taken)
-    assert driver.told(0)["state"] == "paused"
+    assert driver.state_seen_by(0)["state"] == "paused"
     driver.come(1).wait(3.2)
     assert len(driver.taken) > taken
 
@@ -388,18 +388,18 @@ def test_who_leaves_in_a_break_does_not_end_it_for_the_others():
 
 def test_turn_by_turn_all_are_told_whose_turn_it_is():
     driver = SessionDriver(turns=("left", "right"), pace="turns", turnSeconds=20).begin()
-    assert [driver.told(number)["turnOf"] for number in (0, 1)] == [["left"], ["left"]]
-    assert [driver.told(number)["toAct"] for number in (0, 1)] == [True, False]
+    assert [driver.state_seen_by(number)["turnOf"] for number in (0, 1)] == [["left"], ["left"]]
+    assert [driver.state_seen_by(number)["toAct"] for number in (0, 1)] == [True, False]
     driver.say(1, action="up")
     assert driver.taken == [], "a press out of turn does nothing"
     driver.say(0, action="right").take()
-    assert [driver.told(number)["turnOf"] for number in (0, 1)] == [["right"], ["right"]]
-    assert driver.told(1)["turnEndsIn"] == 20
+    assert [driver.state_seen_by(number)["turnOf"] for number in (0, 1)] == [["right"], ["right"]]
+    assert driver.state_seen_by(1)["turnEndsIn"] == 20
     driver.say(0, command="pause")
-    assert "turnOf" not in driver.told(1), "while the game is held it is nobody's"
+    assert "turnOf" not in driver.state_seen_by(1), "while the game is held it is nobody's"
 
 
-def test_turn_by_turn_a_policy_chooses_for_who_stays_away():
+def test_turn_by_turn_a_policy_chooses_for_a_member_who_stays_away():
     driver = SessionDriver(turns=("left", "right"), pace="turns", **POLICY).begin()
     driver.say(0, action="up").take().go(1).wait(33.5)
     ask = driver.calls(AskPolicy)[-1]
@@ -411,20 +411,20 @@ def test_turn_by_turn_a_policy_chooses_for_who_stays_away():
 # ---- round trips
 
 
-def test_whose_round_trip_is_too_long_is_refused_before_the_game():
+def test_a_member_with_too_long_a_round_trip_is_refused_before_the_game():
     driver = SessionDriver(maxPing=100, pingSamples=3).come(0, 1)
     for seconds in (0.02, 0.5, 0.03):
-        driver.trip(0, seconds)
-    assert driver.told(1)["people"] == {"left": "here", "right": "awaited"}
+        driver.round_trip(0, seconds)
+    assert driver.state_seen_by(1)["people"] == {"left": "here", "right": "awaited"}
     for seconds in (0.3, 0.05, 0.101):
-        driver.trip(1, seconds)
+        driver.round_trip(1, seconds)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "ping"}
     assert (driver.errors(1), driver.errors(0)) == ([PING], [PARTNER_MISSING])
     assert driver.done(1).outcome == "ping"
 
 
-def test_with_a_substitute_the_others_play_without_the_refused_who_goes_on_at_once():
-    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.02).trip(1, 0.2)
+def test_with_a_substitute_a_refused_member_goes_on_at_once_and_the_others_play():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.2)
     assert driver.answers == [("P1", {**dict(driver.answers)["P1"], "outcome": "ping", "player": "right"})]
     assert (driver.errors(1), driver.errors(0)) == ([PING], [])
     assert driver.done(1) is None
@@ -454,128 +454,132 @@ def test_a_member_goes_on_when_their_own_answer_is_stored_and_hears_so_once():
     assert driver.count(SendDone) == told
 
 
-def test_a_round_trip_of_just_max_ping_is_short_enough():
-    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).trip(0, 0.1).trip(1, 0.1)
-    assert driver.told(0)["beginsIn"] == 3
+def test_a_round_trip_of_exactly_max_ping_is_short_enough():
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).round_trip(0, 0.1).round_trip(1, 0.1)
+    assert driver.state_seen_by(0)["beginsIn"] == 3
 
 
 def test_if_all_are_refused_no_policies_play_alone():
-    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.2).trip(1, 0.3).wait(10)
+    driver = (
+        SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.2).round_trip(1, 0.3).wait(10)
+    )
     assert driver.outcomes == {"P0": "ping", "P1": "ping"}
     assert driver.taken == []
     assert driver.trial.progress.over
 
 
-def test_who_is_refused_does_not_wait_for_the_others():
-    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.02).trip(1, 0.2).wait(4)
+def test_after_a_refusal_no_policy_replaces_the_only_other_member_while_they_are_away():
+    driver = (
+        SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.2).wait(4)
+    )
     driver.go(0).wait(3600)
     assert driver.presence()[-1] == ("left", "left"), "no policy has taken the place"
-    assert driver.come(0).told(0)["beginsIn"] == 3
+    assert driver.come(0).state_seen_by(0)["beginsIn"] == 3
 
 
 def test_policies_do_not_play_while_the_only_member_is_still_measured():
-    driver = SessionDriver(maxPing=100, pingSamples=2, gather=10, **POLICY).come(1).trip(1, 0.02).wait(19)
+    driver = SessionDriver(maxPing=100, pingSamples=2, gather=10, **POLICY).come(1).round_trip(1, 0.02).wait(19)
     assert driver.taken == []
-    assert driver.trip(1, 0.02).wait(3.2).taken
-    assert driver.told(1)["people"] == {"left": "policy", "right": "here"}
+    assert driver.round_trip(1, 0.02).wait(3.2).taken
+    assert driver.state_seen_by(1)["people"] == {"left": "policy", "right": "here"}
 
 
 @pytest.mark.parametrize("gather", [0, 0.05])
 def test_with_little_time_to_gather_each_member_is_measured_and_plays_from_then_on(gather):
     """A policy plays in the place of the second until they come, and never in that of the first."""
     driver = SessionDriver(maxPing=100, pingSamples=3, gather=gather, **POLICY).come(0).wait(0.1)
-    assert driver.told(0)["people"] == {"left": "awaited", "right": "policy"}
+    assert driver.state_seen_by(0)["people"] == {"left": "awaited", "right": "policy"}
     driver.come(1)
     for number in (0, 1) * 3:
-        driver.wait(0.2).trip(number, 0.05)
+        driver.wait(0.2).round_trip(number, 0.05)
     assert driver.wait(3.2).taken
-    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
     assert ("left", "replaced") not in driver.presence()
 
 
 @pytest.mark.parametrize("max_ping", [0, 100])
-def test_with_no_time_to_gather_the_game_is_over_for_the_first_who_comes_and_that_is_not_their_fault(max_ping):
-    """Who is not connected is not waited for at all; `make check` says so."""
+def test_with_no_time_to_gather_the_game_ends_for_the_first_member_without_their_fault(max_ping):
+    """The game does not wait at all for a member who is not connected; `make check` says so."""
     driver = SessionDriver(gather=0, maxPing=max_ping).come(0)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "left"}
     assert driver.errors(0) == [PARTNER_MISSING]
 
 
 def test_the_time_of_a_member_does_not_run_while_their_round_trip_is_measured():
-    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).trip(0, 0.02).trip(0, 0.02).wait(59.9)
-    driver.come(1).trip(1, 0.02).wait(10)
-    assert "heldFor" not in driver.told(0)
-    assert driver.told(0)["people"]["right"] == "awaited"
-    assert driver.trip(1, 0.02).wait(3.2).taken
+    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).round_trip(0, 0.02).round_trip(0, 0.02).wait(59.9)
+    driver.come(1).round_trip(1, 0.02).wait(10)
+    assert "heldFor" not in driver.state_seen_by(0)
+    assert driver.state_seen_by(0)["people"]["right"] == "awaited"
+    assert driver.round_trip(1, 0.02).wait(3.2).taken
 
 
-def test_it_runs_on_if_they_go_meanwhile():
-    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).trip(0, 0.02).trip(0, 0.02).wait(30)
-    driver.come(1).trip(1, 0.02).wait(19).go(1)
-    assert driver.told(0)["heldFor"] == 30
+def test_the_time_of_a_member_runs_on_if_they_leave_while_they_are_measured():
+    driver = SessionDriver(maxPing=100, pingSamples=2).come(0).round_trip(0, 0.02).round_trip(0, 0.02).wait(30)
+    driver.come(1).round_trip(1, 0.02).wait(19).go(1)
+    assert driver.state_seen_by(0)["heldFor"] == 30
     assert driver.wait(30).outcomes == {"P0": "partnerLeft", "P1": "left"}
 
 
 @pytest.mark.parametrize("section", [{}, {"absent": 0}, {"gather": 3}], ids=str)
-def test_who_reconnects_and_is_never_measured_does_not_hold_the_others_for_ever(section):
-    driver = SessionDriver(maxPing=100, pingSamples=2, **section).come(0).trip(0, 0.02).trip(0, 0.02)
+def test_a_member_who_reconnects_and_is_never_measured_does_not_hold_the_others_for_ever(section):
+    driver = SessionDriver(maxPing=100, pingSamples=2, **section).come(0).round_trip(0, 0.02).round_trip(0, 0.02)
     for _ in range(30):
         driver.come(1).wait(9).go(1)
     assert driver.trial.progress.over
 
 
 @pytest.mark.parametrize(("samples", "until"), [(1, 1), (2, 2), (3, 2), (5, 3), (100, 51)])
-def test_who_never_answers_is_refused_as_soon_as_that_is_certain(samples, until):
+def test_a_member_who_answers_no_ping_is_refused_as_soon_as_the_median_is_certain(samples, until):
     driver = SessionDriver(maxPing=100, pingSamples=samples, **POLICY).come(0, 1)
     for number in range(samples):
-        driver.trip(0, 0.02)
+        driver.round_trip(0, 0.02)
         if number < until:
-            assert driver.told(1)["people"]["right"] == "awaited"
-            driver.trip(1, 10.0)
-    assert driver.told(0)["people"]["right"] == "policy"
+            assert driver.state_seen_by(1)["people"]["right"] == "awaited"
+            driver.round_trip(1, 10.0)
+    assert driver.state_seen_by(0)["people"]["right"] == "policy"
     assert driver.errors(1) == [PING]
 
 
 @pytest.mark.parametrize("samples", [5, 100])
-def test_who_answers_no_ping_holds_the_others_for_twenty_seconds_however_many_samples_are_wanted(samples):
+def test_a_member_who_answers_no_ping_holds_the_others_for_twenty_seconds_whatever_the_samples(samples):
     driver = SessionDriver(maxPing=100, pingSamples=samples, **POLICY).come(0)
     for _ in range(samples):
-        driver.trip(0, 0.02)
-    driver.come(1).wait(10).trip(1, 10.0).wait(9.9)
-    assert (driver.told(0)["people"]["right"], driver.errors(1)) == ("awaited", [])
+        driver.round_trip(0, 0.02)
+    driver.come(1).wait(10).round_trip(1, 10.0).wait(9.9)
+    assert (driver.state_seen_by(0)["people"]["right"], driver.errors(1)) == ("awaited", [])
     driver.wait(0.1)
-    assert (driver.told(0)["people"]["right"], driver.errors(1)) == ("policy", [PING])
+    assert (driver.state_seen_by(0)["people"]["right"], driver.errors(1)) == ("policy", [PING])
 
 
-def test_the_twenty_seconds_go_on_when_they_connect_again_and_stand_while_they_are_away():
+def test_the_twenty_seconds_count_over_all_connections_of_a_member_but_not_their_absences():
     driver = SessionDriver(maxPing=100, pingSamples=5, **POLICY).come(0)
     for _ in range(5):
-        driver.trip(0, 0.02)
+        driver.round_trip(0, 0.02)
     driver.come(1).wait(9).go(1).wait(5).come(1).wait(9).go(1).wait(5).come(1).wait(1.9)
-    assert driver.told(0)["people"]["right"] == "awaited"
-    assert driver.wait(0.1).told(0)["people"]["right"] == "policy"
+    assert driver.state_seen_by(0)["people"]["right"] == "awaited"
+    assert driver.wait(0.1).state_seen_by(0)["people"]["right"] == "policy"
     assert driver.errors(1) == [PING]
 
 
 @pytest.mark.parametrize("trips", [(10.0, 0.02, 0.03), (0.02, 10.0, 0.05, 9.0), (0.02, 9.9, 0.02, 9.9)], ids=str)
-def test_a_phone_that_is_slow_once_plays_also_if_the_time_is_over_before_its_samples_are(trips):
-    """Nor does it count that half of the samples were slow."""
+def test_a_phone_that_is_slow_at_times_plays_also_if_the_twenty_seconds_end_before_its_samples(trips):
+    """It plays although half of its samples were slow."""
     driver = SessionDriver(maxPing=100, pingSamples=100, **POLICY).come(0)
     for _ in range(100):
-        driver.trip(0, 0.02)
+        driver.round_trip(0, 0.02)
     driver.come(1)
     began = driver.now
     for seconds in trips:
-        driver.wait(seconds).trip(1, seconds)
+        driver.wait(seconds).round_trip(1, seconds)
     driver.wait(began + 19.95 - driver.now)
-    assert driver.told(0)["people"]["right"] == "awaited"
+    assert driver.state_seen_by(0)["people"]["right"] == "awaited"
     driver.wait(0.1)
-    assert driver.told(0)["people"]["right"] == "here"
+    assert driver.state_seen_by(0)["people"]["right"] == "here"
     assert driver.wait(3.2).taken
 
 
 def test_a_round_trip_that_comes_after_the_end_changes_no_outcome():
-    driver = SessionDriver(maxPing=100, pingSamples=1).come(0).trip(0, 0.02).wait(59.9)
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0).round_trip(0, 0.02).wait(59.9)
     driver.say(0, command="good").now += 1
     driver.event("advance", driver.now)  # the agent hears the last feedback
     driver.event("round_trip", "P1", 9.0, driver.now)
@@ -583,34 +587,34 @@ def test_a_round_trip_that_comes_after_the_end_changes_no_outcome():
     assert driver.errors(1)[-1] == LEFT
 
 
-def test_who_takes_their_place_back_from_a_policy_plays_at_once_however_long_their_round_trip():
-    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0).trip(0, 0.02).wait(64)
+def test_a_member_who_takes_their_place_back_from_a_policy_plays_at_once_at_any_round_trip():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0).round_trip(0, 0.02).wait(64)
     driver.come(1)
-    assert (driver.told(0)["state"], driver.told(0)["people"]["right"]) == ("playing", "here")
-    driver.trip(1, 9.0).wait(0.2)
-    assert driver.told(0)["people"]["right"] == "here"
+    assert (driver.state_seen_by(0)["state"], driver.state_seen_by(0)["people"]["right"]) == ("playing", "here")
+    driver.round_trip(1, 9.0).wait(0.2)
+    assert driver.state_seen_by(0)["people"]["right"] == "here"
 
 
 @pytest.mark.parametrize("trips", [(0.01, 0.03, 0.02), (0.3, 0.01, 0.03, 0.0)])
 def test_the_median_of_the_round_trips_is_recorded_when_the_game_begins(trips):
     driver = SessionDriver(pingSamples=len(trips)).come(0, 1)
     for seconds in trips:
-        driver.trip(1, seconds)
+        driver.round_trip(1, seconds)
     driver.wait(3.2)
     assert driver.lines("ping")[0]["roundTrip"] == {"right": 20}
 
 
 def test_in_the_game_each_round_trip_is_recorded_in_milliseconds():
-    driver = SessionDriver().begin().wait(1).trip(0, 0.6).wait(0.2)
+    driver = SessionDriver().begin().wait(1).round_trip(0, 0.6).wait(0.2)
     (line,) = driver.lines("ping")
     assert line["roundTrip"] == {"left": 600}
     assert line["step"] > 0
     assert driver.presence() == [("left", "joined"), ("right", "joined")], "it moves no one"
 
 
-def test_an_episode_begins_with_the_latest_round_trips_and_who_is_replaced():
-    driver = SessionDriver(maxEpisodes=2, pingSamples=1, **POLICY).come(0, 1).trip(0, 0.6).wait(3.2)
-    driver.trip(0, 0.9).trip(1, 0.05).go(1).wait(34)
+def test_an_episode_begins_with_the_latest_round_trips_and_the_replaced_players():
+    driver = SessionDriver(maxEpisodes=2, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.6).wait(3.2)
+    driver.round_trip(0, 0.9).round_trip(1, 0.05).go(1).wait(34)
     driver.trial.progress.stepped({}, True, False)
     driver.wait(0.2)
     first, second = driver.calls(ResetCall)
@@ -619,8 +623,8 @@ def test_an_episode_begins_with_the_latest_round_trips_and_who_is_replaced():
 
 
 @pytest.mark.parametrize(("why", "goes"), [
-    ("their round trip is too long", lambda driver: driver.trip(0, 0.02).trip(1, 0.2)),
-    ("they stay away", lambda driver: driver.trip(0, 0.02).go(1).wait(60)),
+    ("their round trip is too long", lambda driver: driver.round_trip(0, 0.02).round_trip(1, 0.2)),
+    ("they stay away", lambda driver: driver.round_trip(0, 0.02).go(1).wait(60)),
 ], ids=["ping", "away"])  # fmt: skip
 def test_the_log_says_why_the_game_ends_for_all(why, goes):
     driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1)
@@ -629,8 +633,8 @@ def test_the_log_says_why_the_game_ends_for_all(why, goes):
 
 
 def test_a_long_round_trip_during_the_game_changes_nothing():
-    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).trip(0, 0.02).trip(1, 0.02).wait(3.5)
-    driver.trip(1, 9.0).wait(0.2)
+    driver = SessionDriver(maxPing=100, pingSamples=1).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.02).wait(3.5)
+    driver.round_trip(1, 9.0).wait(0.2)
     assert not driver.trial.progress.over
 
 
@@ -638,7 +642,7 @@ def test_a_long_round_trip_during_the_game_changes_nothing():
 
 
 def recorded_of(driver, *, ended=True):
-    """What the next server reads of what this one has recorded; the agent's own lines are made up."""
+    """The trial that the next server reads from this one's lines; the agent's own lines are made up."""
     lines = [{"kind": "reset", "episode": 1, "seed": 7}]
     part = {"action": 0, "reward": 1.0}
     for number in range(1, driver.steps + 1):
@@ -651,27 +655,27 @@ def recorded_of(driver, *, ended=True):
     return found
 
 
-def test_on_the_next_server_all_are_waited_for_again_and_nobody_reads_again():
+def test_the_next_server_waits_for_all_members_again_without_the_instructions():
     first = SessionDriver(instructions="rules.html").come(0, 1)
     first.say(0, command="start").say(1, command="start").wait(5)
     second = SessionDriver(instructions="rules.html", recorded=recorded_of(first, ended=False)).come(0)
     assert second.trial.progress.steps == first.steps
-    assert second.told(0)["people"] == {"left": "here", "right": "awaited"}
+    assert second.state_seen_by(0)["people"] == {"left": "here", "right": "awaited"}
     second.come(1)
-    assert second.told(1)["beginsIn"] == 3
+    assert second.state_seen_by(1)["beginsIn"] == 3
     assert second.wait(3.1).taken[0].fields["step"] == first.steps + 1
 
 
 def test_a_game_that_had_not_begun_begins_on_the_next_server_as_on_the_first():
     """Members gather, read and are measured there. A server that waits for them has begun an episode, without a step."""
     section = {"instructions": "rules.html", "maxPing": 100, "pingSamples": 1, "absent": 5, "gather": 60}
-    first = SessionDriver(**section).come(0).trip(0, 0.02).wait(50)
-    second = SessionDriver(**section, recorded=recorded_of(first, ended=False)).come(0).trip(0, 0.02)
-    assert second.told(0)["heldFor"] == 60
-    assert second.told(0)["people"] == {"left": "reads", "right": "awaited"}
+    first = SessionDriver(**section).come(0).round_trip(0, 0.02).wait(50)
+    second = SessionDriver(**section, recorded=recorded_of(first, ended=False)).come(0).round_trip(0, 0.02)
+    assert second.state_seen_by(0)["heldFor"] == 60
+    assert second.state_seen_by(0)["people"] == {"left": "reads", "right": "awaited"}
     second.wait(30).come(1)
-    assert second.told(1)["people"] == {"left": "reads", "right": "awaited"}, "who is measured"
-    second.trip(1, 0.2)
+    assert second.state_seen_by(1)["people"] == {"left": "reads", "right": "awaited"}, "who is measured"
+    second.round_trip(1, 0.2)
     assert second.outcomes == {"P0": "partnerLeft", "P1": "ping"}
     assert second.errors(0) == [PARTNER_MISSING]
 
@@ -693,9 +697,9 @@ def test_a_game_that_has_ended_in_a_break_is_over_on_the_next_server_too():
     assert second.outcomes == {"P0": "partnerLeft", "P1": "left"}
 
 
-def test_who_was_refused_is_refused_on_the_next_server_too():
+def test_a_refused_member_is_refused_on_the_next_server_too():
     section = {"maxPing": 100, "pingSamples": 1, **POLICY}
-    first = SessionDriver(**section).come(0, 1).trip(0, 0.02).trip(1, 0.2).wait(4)
+    first = SessionDriver(**section).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.2).wait(4)
     second = SessionDriver(**section, recorded=recorded_of(first, ended=False)).come(0)
     second.wait(3.2)
     assert second.taken, "the others do not wait for them"
@@ -704,9 +708,11 @@ def test_who_was_refused_is_refused_on_the_next_server_too():
     assert (second.errors(1), second.done(1).outcome) == ([PING], "ping")
 
 
-def test_who_was_refused_in_an_earlier_game_is_out_of_this_one_too():
+def test_a_member_who_was_refused_in_an_earlier_game_is_refused_in_this_one_too():
     answered = {"P1": {"outcome": "ping", "player": "right"}}
-    driver = SessionDriver(maxPing=100, pingSamples=1, answered=answered, **POLICY).come(0).trip(0, 0.02).wait(3.2)
+    driver = (
+        SessionDriver(maxPing=100, pingSamples=1, answered=answered, **POLICY).come(0).round_trip(0, 0.02).wait(3.2)
+    )
     assert driver.taken, "the others do not wait for them"
     driver.come(1)
     assert (driver.errors(1), driver.done(1).outcome) == ([PING], "ping")
@@ -715,10 +721,10 @@ def test_who_was_refused_in_an_earlier_game_is_out_of_this_one_too():
     assert ("right", "refused") in driver.presence()
 
 
-def test_an_answer_of_a_member_who_was_not_refused_keeps_nobody_out():
+def test_a_member_with_an_answer_that_is_no_refusal_plays():
     driver = SessionDriver(answered={"P1": {"outcome": "finished"}}, **POLICY).begin().wait(0.2)
     assert driver.taken
-    assert driver.told(0)["people"] == {"left": "here", "right": "here"}
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
 
 
 def test_the_next_server_knows_whose_feedback_the_agent_has_not_heard():
@@ -734,11 +740,11 @@ def test_the_next_server_knows_whose_feedback_the_agent_has_not_heard():
 
 @pytest.mark.parametrize("seconds", [0, 70])
 def test_each_page_between_episodes_waits_for_all_anew(seconds):
-    """Also after an episode that is longer than all wait for each other at a page."""
+    """Also after an episode that takes longer than `gather`."""
     driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=3).begin()
     for _ in range(2):
         driver.take(terminated=True)
-        assert driver.told(0)["people"] == {"left": "reads", "right": "reads"}
+        assert driver.state_seen_by(0)["people"] == {"left": "reads", "right": "reads"}
         taken = len(driver.taken)
         driver.say(0, command="start").wait(5)
         assert len(driver.taken) == taken
@@ -751,13 +757,13 @@ def test_each_page_between_episodes_waits_for_all_anew(seconds):
 
 def test_a_pause_in_the_countdown_is_told_at_once():
     driver = SessionDriver().come(0, 1).say(0, command="pause")
-    assert "beginsIn" not in driver.told(1)
+    assert "beginsIn" not in driver.state_seen_by(1)
 
 
-def test_a_break_that_all_who_are_here_have_ended_leads_to_no_step_without_the_missing():
+def test_after_a_break_no_step_is_taken_without_a_missing_member():
     driver = SessionDriver(betweenEpisodes="between.html", maxEpisodes=2).begin()
     driver.take(terminated=True).go(1)
     taken = len(driver.taken)
     driver.say(0, command="start").wait(20)
     assert len(driver.taken) == taken
-    assert driver.told(0)["state"] == "paused"
+    assert driver.state_seen_by(0)["state"] == "paused"

@@ -1,4 +1,4 @@
-"""A member whose page is hidden by another: the others do not begin without them, and do not wait for ever."""
+"""A member who looks at another page: the others do not begin without them, and do not wait for ever."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ON = {"afterAbsent": "policy", "substitute": "random"}
 
 
 def people(driver: SessionDriver, number: int) -> dict[str, str]:
-    return driver.told(number)["people"]
+    return driver.state_seen_by(number)["people"]
 
 
 def test_the_game_does_not_begin_while_a_member_looks_at_another_page() -> None:
@@ -22,7 +22,7 @@ def test_the_game_does_not_begin_while_a_member_looks_at_another_page() -> None:
     driver.say(1, hidden=True).wait(30)
     assert not driver.taken
     assert people(driver, 0) == {"left": "here", "right": "away"}
-    assert driver.told(0)["heldFor"] == pytest.approx(57), "who comes after the first has used three seconds"
+    assert driver.state_seen_by(0)["heldFor"] == pytest.approx(57), "who comes after the first has used three seconds"
     driver.say(1, hidden=False).wait(2.9)
     assert not driver.taken, "the countdown begins anew"
     driver.wait(0.2)
@@ -44,7 +44,7 @@ def test_a_policy_gives_the_place_back_to_a_member_who_looks_again() -> None:
 
 
 def test_a_browser_that_answers_pings_for_a_hidden_page_does_not_take_the_place_back() -> None:
-    driver = SessionDriver(gather=60, **ON).come(0).come(1).say(1, hidden=True).wait(65).trip(1, 0.02)
+    driver = SessionDriver(gather=60, **ON).come(0).come(1).say(1, hidden=True).wait(65).round_trip(1, 0.02)
     assert people(driver, 0)["right"] == "policy"
     assert driver.presence()[-1] == ("right", "replaced")
 
@@ -53,14 +53,14 @@ def test_in_the_game_a_hidden_member_is_away_and_lets_go_of_their_keys() -> None
     driver = SessionDriver(absent=30).begin().wait(2)
     driver.say(0, action="up", held=True).wait(0.2).say(0, hidden=True).wait(0.2)
     taken = len(driver.taken)
-    assert driver.told(1)["heldFor"] == pytest.approx(30, abs=0.3)
+    assert driver.state_seen_by(1)["heldFor"] == pytest.approx(30, abs=0.3)
     driver.wait(10)
     assert len(driver.taken) == taken
     driver.say(0, hidden=False).wait(4)
     assert driver.taken[-1].actions["left"].name == "noop"
 
 
-def test_only_a_message_that_says_so_shows_a_hidden_page_again() -> None:
+def test_a_hidden_page_stays_hidden_until_it_says_that_it_is_seen_again() -> None:
     driver = SessionDriver().come(0).come(1).say(1, hidden=True)
     driver.say(1, command="requestUI").say(1, hidden=True).wait(5)
     assert people(driver, 0)["right"] == "away"
@@ -78,12 +78,12 @@ def test_a_hidden_page_that_stops_answering_and_answers_again_is_still_hidden() 
     assert driver.presence()[-1] == ("right", "left")
 
 
-def test_a_page_that_is_opened_anew_is_seen_until_it_says_otherwise() -> None:
+def test_a_page_that_connects_anew_is_not_hidden() -> None:
     driver = SessionDriver(countdown=3).come(0).come(1).say(1, hidden=True).wait(5).come(1).wait(3.1)
     assert driver.taken
 
 
-def test_in_a_game_of_one_it_is_no_message() -> None:
+def test_a_game_of_one_participant_refuses_the_message_hidden() -> None:
     driver = Driver()
     driver.begin()
     driver.connect()

@@ -62,17 +62,17 @@ class Machine(RuleBasedStateMachine):
         return self.driver.trial.progress.over
 
     def missing(self) -> list[int]:
-        """Those for whom the others wait now."""
+        """The members for whom the others wait now."""
         if self.over or not self.here:
             return []
         return [number for number in self.missed if number not in self.here and number not in self.replaced]
 
-    def passes(self, seconds: float) -> None:
-        """Let time pass, from one thing that happens to the next, and look at each."""
+    def let_time_pass(self, seconds: float) -> None:
+        """Let time pass, from one event to the next, and check the effects of each."""
         driver, until = self.driver, self.driver.now + seconds
-        self.look()
+        self.check_effects()
         driver.take()
-        self.look()
+        self.check_effects()
         for _ in range(1000):
             missing = self.missing()
             waits = [self.allowed[number] - self.missed[number] for number in missing]
@@ -82,39 +82,39 @@ class Machine(RuleBasedStateMachine):
                 self.missed[number] += step
             driver.now += step
             driver.event("advance", driver.now)
-            driver.works()
-            self.look()
-            self.told_who_is_replaced()
+            driver.answer_calls()
+            self.check_effects()
+            self.check_who_is_replaced()
             driver.take()
-            self.look()
+            self.check_effects()
             if driver.now >= until - NEARLY:
                 return
         raise AssertionError("it wakes for nothing")
 
-    def look(self) -> None:
-        """Check what has happened since this was called last."""
+    def check_effects(self) -> None:
+        """Check the effects since the last call."""
         for number in self.missing():
             if self.missed[number] >= self.allowed[number] - NEARLY and self.after == "policy":
                 self.replaced.add(number)
         for effect in self.driver.all[self.seen :]:
             if isinstance(effect, StepCall):
-                self.step(effect)
+                self.check_step(effect)
             elif isinstance(effect, AskPolicy):
                 asked = {self.player(number) for number in self.here}
                 assert effect.player not in asked, "no policy plays for who is here"
         self.seen = len(self.driver.all)
         on_break = self.driver.trial.progress.on_break
         if on_break and not self.on_break:
-            self.keys.clear()  # they were meant for the episode that is over
+            self.keys.clear()  # these keys were held in the episode that is over
         self.on_break = on_break
 
-    def told_who_is_replaced(self) -> None:
+    def check_who_is_replaced(self) -> None:
         for number in self.here if not self.over else ():
-            people = self.driver.told(number)["people"]
+            people = self.driver.state_seen_by(number)["people"]
             found = {each for each in self.missed if people[self.player(each)] == "policy"}
             assert found == self.replaced - self.here, "a policy plays as soon as the time is over, and no sooner"
 
-    def step(self, call: StepCall) -> None:
+    def check_step(self, call: StepCall) -> None:
         assert self.here, "no step for nobody"
         assert not self.missing(), "no step while the others wait"
         for number in self.here:
@@ -130,10 +130,10 @@ class Machine(RuleBasedStateMachine):
         number %= self.members
         self.is_back(number)
         self.driver.come(number)
-        assert self.over or self.driver.told(number)["you"] == self.player(number)
+        assert self.over or self.driver.state_seen_by(number)["you"] == self.player(number)
 
     def is_back(self, number: int) -> None:
-        self.look()
+        self.check_effects()
         self.here.add(number)
         self.hidden.discard(number)
         self.keys.pop(number, None)
@@ -159,7 +159,7 @@ class Machine(RuleBasedStateMachine):
             self.driver.say(number, hidden=False)
 
     def is_away(self, number: int, how: Callable[[int], object]) -> None:
-        self.look()
+        self.check_effects()
         left = number in self.here
         self.here.discard(number)
         self.hidden.discard(number)
@@ -173,7 +173,7 @@ class Machine(RuleBasedStateMachine):
     def holds_a_key(self, number: int, key: str) -> None:
         number %= self.members
         if number in self.here and number not in self.keys and not self.over:
-            self.look()
+            self.check_effects()
             self.keys[number] = key
             self.driver.say(number, action=key, held=True)
 
@@ -181,35 +181,35 @@ class Machine(RuleBasedStateMachine):
     def says(self, number: int, command: str) -> None:
         number %= self.members
         if number in self.here and not self.over:
-            self.look()
+            self.check_effects()
             self.driver.say(number, command=command)
 
     @rule()
     def an_episode_ends(self) -> None:
-        self.look()
+        self.check_effects()
         self.driver.take(terminated=True)
 
     @rule(seconds=TIMES)
     def time_passes(self, seconds: float) -> None:
-        self.passes(seconds)
+        self.let_time_pass(seconds)
 
     @rule()
     def all_are_here_and_go_on(self) -> None:
         for number in range(self.members):
             if number not in self.here:
                 self.comes(number)
-        self.passes(0.2)
+        self.let_time_pass(0.2)
         for number in range(self.members):
             self.says(number, "start")
         before = sum(isinstance(effect, StepCall) for effect in self.driver.all)
-        self.passes(COUNTDOWN + 0.3)
+        self.let_time_pass(COUNTDOWN + 0.3)
         now = sum(isinstance(effect, StepCall) for effect in self.driver.all)
         assert self.over or now > before, "the game goes on when nobody is waited for"
 
     @invariant()
     def nobody_is_waited_for_too_long(self) -> None:
         if hasattr(self, "driver"):
-            self.look()
+            self.check_effects()
             late = [number for number in self.missing() if self.missed[number] > self.allowed[number] + NEARLY]
             assert not late
 
@@ -229,12 +229,12 @@ class Machine(RuleBasedStateMachine):
             self.all_are_here_and_go_on()
             if not self.over:
                 self.driver.say(0, command="stop").take()
-            self.driver.works()
+            self.driver.answer_calls()
             assert self.driver.trial.finished
             self.an_ended_trial_has_one_answer_for_each()
             for number in self.here:
                 assert self.driver.done(number).outcome == self.driver.outcomes[f"P{number}"]
 
 
-def test_whatever_members_do_a_session_holds_ends_and_answers_as_it_says() -> None:
+def test_whatever_members_do_a_session_keeps_its_rules() -> None:
     run_state_machine_as_test(Machine, settings=settings(max_examples=examples(30), stateful_step_count=30))

@@ -1,4 +1,4 @@
-"""The core with several players, event by event: turns and their clock, late policies, masks, and what stays true in
+"""The core with several players, event by event: turns and their clock, late policies, masks, and legal actions in
 any order of events."""
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Game:
         return self.event("receive", "tab", messages.parse(json.dumps(message)), self.now)
 
     def wait(self, seconds: float) -> list[Any]:
-        """Let time pass, as the shell does: it wakes the core when it asked for it."""
+        """Let time pass as the event loop does: it wakes the core when the core asked for it."""
         until, done = self.now + seconds, []
         while self.trial.wake_at is not None and self.trial.wake_at <= until:
             self.now = max(self.now, self.trial.wake_at)
@@ -109,7 +109,7 @@ class Game:
 
     @property
     def actions(self) -> dict[str, tuple[int, str]]:
-        """What the open step takes of those who act: the action and who chose it."""
+        """The actions of the open step by player: each with who chose it."""
         assert isinstance(self.open_call, StepCall)
         return {name: (one.index, one.by) for name, one in self.open_call.actions.items() if one.acts}
 
@@ -121,11 +121,11 @@ class Game:
         return sent(self.all, SendState)
 
 
-def seen(*to_act: str, masks: dict[str, Any] | None = None) -> View:
+def view_for(*to_act: str, masks: dict[str, Any] | None = None) -> View:
     return View(frozenset(to_act), dict.fromkeys(to_act, "o"), {name: {} for name in to_act}, masks or {})
 
 
-def in_turns(**section: Any) -> Game:
+def game_in_turns(**section: Any) -> Game:
     return Game(pace="turns", **section)
 
 
@@ -133,7 +133,7 @@ def in_turns(**section: Any) -> Game:
 
 
 def test_nothing_happens_in_a_turn_until_the_human_chooses() -> None:
-    game = in_turns().playing(seen("me"))
+    game = game_in_turns().playing(view_for("me"))
     assert game.trial.wake_at is None
     game.wait(3600)
     assert game.open_call is None
@@ -141,8 +141,8 @@ def test_nothing_happens_in_a_turn_until_the_human_chooses() -> None:
     assert game.actions == {"me": (1, "human")}
 
 
-def test_a_choice_is_final() -> None:
-    game = in_turns().playing(seen("me", "it"))
+def test_the_first_choice_in_a_turn_counts() -> None:
+    game = game_in_turns().playing(view_for("me", "it"))
     game.say(action="up")
     game.say(action="right")
     game.acts(2)
@@ -150,13 +150,13 @@ def test_a_choice_is_final() -> None:
 
 
 def test_a_press_out_of_turn_does_nothing_and_is_recorded() -> None:
-    game = in_turns().playing(seen("it"))
+    game = game_in_turns().playing(view_for("it"))
     game.say(action="up")
     game.say(action="right", held=True)
     game.acts(2)
     said = game.open_call.fields["messages"]  # type: ignore[union-attr]
     assert [one["action"] for one in said if "action" in one] == ["up", "right"]
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     game.wait(5)
     assert game.open_call is None, "neither the press nor the key that is still held is the next turn's"
     game.say(action="right", held=False)
@@ -165,10 +165,10 @@ def test_a_press_out_of_turn_does_nothing_and_is_recorded() -> None:
 
 
 def test_the_projects_own_keys_choose_too() -> None:
-    game = in_turns(keys={"a": "up", "ArrowRight": "right"}).playing(seen("me"))
+    game = game_in_turns(keys={"a": "up", "ArrowRight": "right"}).playing(view_for("me"))
     game.say(key="ArrowRight", held=True)
     assert game.actions == {"me": (2, "human")}
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     game.wait(5)
     assert game.open_call is None
     game.say(key="ArrowRight", held=False)
@@ -177,7 +177,7 @@ def test_the_projects_own_keys_choose_too() -> None:
 
 
 def test_a_move_that_the_mask_forbids_is_refused_with_a_sentence() -> None:
-    game = in_turns().playing(seen("me", masks={"me": [True, False, True]}))
+    game = game_in_turns().playing(view_for("me", masks={"me": [True, False, True]}))
     said = sent(game.say(action="up"), SendMessage)
     assert said == [{"error": "that move is not possible now"}]
     assert game.open_call is None
@@ -186,9 +186,9 @@ def test_a_move_that_the_mask_forbids_is_refused_with_a_sentence() -> None:
 
 
 def test_a_policys_move_comes_no_sooner_than_a_frame_after_the_humans() -> None:
-    game = in_turns().playing(seen("me"))
+    game = game_in_turns().playing(view_for("me"))
     game.say(action="up")
-    game.stepped(seen("it"))
+    game.stepped(view_for("it"))
     game.acts(1)
     assert game.open_call is None
     assert game.trial.wake_at == pytest.approx(game.now + 0.1)
@@ -197,18 +197,20 @@ def test_a_policys_move_comes_no_sooner_than_a_frame_after_the_humans() -> None:
 
 
 @pytest.mark.parametrize(("ends", "expected"), [("idle", (0, "none")), ("random", (1, "random"))])
-def test_a_turns_time_is_over(ends: str, expected: tuple[int, str]) -> None:
-    game = in_turns(turnSeconds=5, turnEnds=ends).playing(seen("me", masks={"me": [ends == "idle", True, False]}))
+def test_when_turn_seconds_are_over_the_action_of_turn_ends_is_taken(ends: str, expected: tuple[int, str]) -> None:
+    game = game_in_turns(turnSeconds=5, turnEnds=ends).playing(
+        view_for("me", masks={"me": [ends == "idle", True, False]})
+    )
     game.wait(4.9)
     assert game.open_call is None
     game.wait(0.2)
     assert game.actions == {"me": expected}
 
 
-def test_a_turns_time_that_is_over_may_end_the_episode() -> None:
-    game = in_turns(turnSeconds=5, turnEnds="episode", maxEpisodes=1).playing(seen("me"))
+def test_when_turn_seconds_are_over_the_episode_may_end() -> None:
+    game = game_in_turns(turnSeconds=5, turnEnds="episode", maxEpisodes=1).playing(view_for("me"))
     game.say(action="up")
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     game.wait(5.1)
     (end,) = [one.fields for one in game.all if isinstance(one, RecordLine) and one.kind == "end"]
     assert (end["why"], end["scores"]) == ("turnSeconds", {"me": 1, "it": 2})
@@ -217,7 +219,7 @@ def test_a_turns_time_that_is_over_may_end_the_episode() -> None:
 
 
 def test_a_pause_stops_the_clock_of_the_turn() -> None:
-    game = in_turns(turnSeconds=5).playing(seen("me"))
+    game = game_in_turns(turnSeconds=5).playing(view_for("me"))
     game.wait(3)
     game.say(command="pause")
     game.wait(60)
@@ -230,21 +232,21 @@ def test_a_pause_stops_the_clock_of_the_turn() -> None:
 
 
 def test_the_clock_of_a_turn_does_not_run_while_a_policy_thinks() -> None:
-    game = in_turns(turnSeconds=5, policySeconds=60).playing(seen("it"))
+    game = game_in_turns(turnSeconds=5, policySeconds=60).playing(view_for("it"))
     game.wait(30)
     assert game.open_call is None
     game.acts(1)
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     assert game.states[-1]["toAct"] is True
     assert game.states[-1]["turnEndsIn"] == pytest.approx(5)
 
 
 def test_a_policy_that_thinks_too_long_takes_the_idle_action() -> None:
-    game = in_turns(policySeconds=2).playing(seen("it"))
+    game = game_in_turns(policySeconds=2).playing(view_for("it"))
     late = game.asks[-1]
     game.wait(2.1)
     assert game.actions == {"it": (0, "late")}
-    game.stepped(seen("it"))
+    game.stepped(view_for("it"))
     game.acts(2, late)
     game.wait(0.2)
     assert game.open_call is None, "the answer to an earlier question changes nothing"
@@ -254,17 +256,17 @@ def test_a_policy_that_thinks_too_long_takes_the_idle_action() -> None:
 
 
 def test_clients_are_told_whose_turn_it_is() -> None:
-    game = in_turns().playing(seen("it"))
+    game = game_in_turns().playing(view_for("it"))
     assert (sent(game.all, SendMessage)[0]["pace"], game.states[-1]["toAct"]) == ("turns", False)
     game.acts(1)
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     assert game.states[-1]["toAct"] is True
     game.say(action="up")
     assert game.states[-1]["toAct"] is False
 
 
 def test_advice_counts_when_the_turns_time_is_over_and_not_before() -> None:
-    game = in_turns(turnSeconds=5, gym="advise").playing(seen("me"))
+    game = game_in_turns(turnSeconds=5, gym="advise").playing(view_for("me"))
     game.event("advise", 2, None, game.now)
     game.wait(1)
     assert game.open_call is None
@@ -272,10 +274,10 @@ def test_advice_counts_when_the_turns_time_is_over_and_not_before() -> None:
     assert game.actions == {"me": (2, "advice")}
 
 
-def test_the_turn_of_nobody_is_taken_at_the_frame_rate() -> None:
-    game = in_turns().playing(seen())
+def test_a_step_in_which_no_player_acts_is_taken_at_the_frame_rate() -> None:
+    game = game_in_turns().playing(view_for())
     assert isinstance(game.open_call, StepCall)
-    game.stepped(seen())
+    game.stepped(view_for())
     game.wait(0.05)
     assert game.open_call is None
     game.wait(0.1)
@@ -285,53 +287,53 @@ def test_the_turn_of_nobody_is_taken_at_the_frame_rate() -> None:
 # ---- in real time
 
 
-def test_what_comes_late_is_used_at_the_step_after() -> None:
-    game = Game().playing(seen("me", "it"))
+def test_a_late_action_of_a_policy_is_taken_at_the_next_step() -> None:
+    game = Game().playing(view_for("me", "it"))
     assert game.actions == {"me": (0, "none"), "it": (0, "late")}
     game.acts(2)
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     assert len(game.asks) == 1, "what came late is taken first"
     game.wait(0.1)
     assert game.actions["it"] == (2, "policy")
     observed = game.open_call.actions["it"].observed  # type: ignore[union-attr]
     assert observed == 0, "what it looked at"
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     assert len(game.asks) == 2
 
 
-def test_between_two_choices_the_last_action_goes_on_or_is_not_taken_again() -> None:
+def test_between_two_choices_a_policys_action_is_held_or_single_as_input_says() -> None:
     for how, expected in (("held", (2, "policy")), ("single", (0, "none"))):
         game = Game(frameSkip=2, input=how)
         spaces = dict.fromkeys(PLAYS, SPACE)
         game.event("start", who_plays(game.settings.trial, spaces, None), None, game.now)
-        game.returns(Begun(b"reset", FRAME, seen("me", "it")))
+        game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
         game.acts(2)
         game.event("connect", "P1", "tab", Window(), game.now)
         game.say(command="start")
         assert game.actions["it"] == (2, "policy")
-        game.stepped(seen("me", "it"))
+        game.stepped(view_for("me", "it"))
         game.wait(0.1)
         assert (len(game.asks), game.actions["it"]) == (1, expected)
-        game.stepped(seen("me", "it"))
+        game.stepped(view_for("me", "it"))
         assert len(game.asks) == 2
 
 
-def test_a_policy_that_is_not_to_act_when_it_would_be_asked_is_asked_as_soon_as_it_is() -> None:
+def test_a_policy_that_is_not_to_act_when_it_is_due_is_asked_as_soon_as_it_is_to_act() -> None:
     """Otherwise one that acts at odd steps would never be asked with frameSkip: 2."""
-    game = Game(frameSkip=2).playing(seen("me"))
+    game = Game(frameSkip=2).playing(view_for("me"))
     acted = []
     for to_act in ("it", "me") * 3:
         if game.open_call is None:
             game.wait(0.1)
         acted.append(game.actions)
-        game.stepped(seen(to_act))
+        game.stepped(view_for(to_act))
         if to_act == "it":
             game.acts(2)
     assert acted == [{"me": (0, "none")}, {"it": (2, "policy")}] * 3
     assert len(game.asks) == 3
 
 
-def test_a_policys_last_action_goes_on_on_the_next_server() -> None:
+def test_the_next_server_goes_on_with_a_policys_last_action() -> None:
     game = Game(frameSkip=4)
     steps = [
         RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0), "it": RecordedAction(2, 2.0, observed)})
@@ -340,46 +342,46 @@ def test_a_policys_last_action_goes_on_on_the_next_server() -> None:
     recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))
     spaces = dict.fromkeys(PLAYS, SPACE)
     game.event("start", who_plays(game.settings.trial, spaces, None), recorded, game.now)
-    game.returns(Replayed(FRAME, seen("me", "it"), {}))
+    game.returns(Replayed(FRAME, view_for("me", "it"), {}))
     game.event("connect", "P1", "tab", Window(), game.now)
     game.say(command="start")
     assert (game.asks, game.actions["it"]) == ([], (2, "policy")), "it is asked after four steps"
 
 
-def resumed(*its: RecordedAction) -> Game:
-    """A game that goes on after these steps of the policy on an earlier server; each of the human's was idle."""
+def resumed_game(*its: RecordedAction) -> Game:
+    """A game that goes on after these actions of the policy on an earlier server; the human's actions were idle."""
     game = Game()
     steps = [RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0, None, "none"), "it": it}) for it in its]
     recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))
     game.event("start", who_plays(game.settings.trial, dict.fromkeys(PLAYS, SPACE), None), recorded, game.now)
-    game.returns(Replayed(FRAME, seen("me", "it"), {}))
+    game.returns(Replayed(FRAME, view_for("me", "it"), {}))
     game.event("connect", "P1", "tab", Window(), game.now)
     game.say(command="start")
     return game
 
 
-def failed(*looked_at: int) -> list[RecordedAction]:
+def failed_steps(*looked_at: int) -> list[RecordedAction]:
     return [RecordedAction(0, 0.0, step, "none") for step in looked_at]
 
 
 IDLED = RecordedAction(0, 0.0, None, "none")
 
 
-def test_a_policy_that_idled_for_the_episode_does_so_on_the_next_server() -> None:
-    game = resumed(*failed(0, 1, 2), IDLED)
+def test_a_policy_that_idles_for_the_episode_idles_on_the_next_server_too() -> None:
+    game = resumed_game(*failed_steps(0, 1, 2), IDLED)
     assert (game.asks, game.actions["it"]) == ([], (0, "none"))
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.wait(0.1)
     assert game.asks == []
-    game.stepped(seen(), over=True)
-    game.returns(Begun(b"reset", FRAME, seen("me", "it")))
+    game.stepped(view_for(), over=True)
+    game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
     assert len(game.asks) == 1, "it is asked again in the next episode"
 
 
-def test_a_policys_failures_are_counted_on_by_the_next_server() -> None:
-    game = resumed(*failed(0, 1, 2))
+def test_the_next_server_goes_on_counting_a_policys_failures() -> None:
+    game = resumed_game(*failed_steps(0, 1, 2))
     game.event("policy_failed", "it", game.asks[-1].ask_id, ValueError("no idea"), game.now)
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.wait(0.1)
     assert len(game.asks) == 1, "that was its third failure in a row"
 
@@ -392,69 +394,71 @@ def test_a_policys_failures_are_counted_on_by_the_next_server() -> None:
         [RecordedAction(1, 0.0, None, "policy"), RecordedAction(2, 0.0, 4, "policy"), IDLED],
     ],
 )
-def test_a_policy_that_chose_again_is_asked_by_the_next_server(after: list[RecordedAction]) -> None:
-    game = resumed(*failed(0, 1, 2), *after)
+def test_the_next_server_counts_only_failures_since_the_last_choice(after: list[RecordedAction]) -> None:
+    game = resumed_game(*failed_steps(0, 1, 2), *after)
     for _ in range(2):
         game.event("policy_failed", "it", game.asks[-1].ask_id, ValueError("no idea"), game.now)
-        game.stepped(seen("me", "it"))
+        game.stepped(view_for("me", "it"))
         game.wait(0.1)
     assert len(game.asks) == 3
 
 
-def test_whoever_left_the_game_is_not_asked_and_does_not_act() -> None:
-    game = Game().playing(seen("me", "it"))
+def test_a_policy_whose_player_left_the_game_is_not_asked_and_does_not_act() -> None:
+    game = Game().playing(view_for("me", "it"))
     game.acts(1)
-    game.stepped(seen("me"))
+    game.stepped(view_for("me"))
     assert len(game.asks) == 1
     game.wait(0.1)
     assert set(game.actions) == {"me"}
 
 
 def test_a_human_who_left_the_game_watches_until_it_is_over() -> None:
-    game = Game().playing(seen("me", "it"))
-    game.stepped(seen("it"))
+    game = Game().playing(view_for("me", "it"))
+    game.stepped(view_for("it"))
     game.say(action="up", held=True)
     game.wait(0.1)
     assert set(game.actions) == {"it"}
-    game.stepped(seen(), over=True)
+    game.stepped(view_for(), over=True)
     assert game.trial.progress.episode == 2
 
 
-def test_three_failures_in_a_row_and_it_idles_for_the_episode() -> None:
-    game = Game(maxEpisodes=2).playing(seen("me", "it"))
+def test_a_policy_idles_for_the_episode_after_three_failures_in_a_row() -> None:
+    game = Game(maxEpisodes=2).playing(view_for("me", "it"))
     for _ in range(3):
         ask = game.asks[-1]
         game.event("policy_failed", "it", ask.ask_id, ValueError("no idea"), game.now)
-        game.stepped(seen("me", "it"))
+        game.stepped(view_for("me", "it"))
         game.wait(0.1)
         assert game.actions["it"] == (0, "none")
     asked = len(game.asks)
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.wait(0.1)
     assert len(game.asks) == asked == 3
     told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert sum("no idea" in text for text in told) == 1
-    game.stepped(seen(), over=True)
-    game.returns(Begun(b"reset", FRAME, seen("me", "it")))
+    game.stepped(view_for(), over=True)
+    game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
     assert len(game.asks) == 4, "it is asked again in the next episode"
 
 
-def test_a_policys_seed_follows_from_the_episodes_seed_and_its_name() -> None:
-    first, second = Game().playing(seen("me", "it")), Game(seed=8).playing(seen("me", "it"))
+def test_a_policys_seed_follows_from_the_episodes_seed() -> None:
+    first, second = Game().playing(view_for("me", "it")), Game(seed=8).playing(view_for("me", "it"))
     seeds = [[one.seed for one in game.all if isinstance(one, ResetPolicy)] for game in (first, second)]
     assert seeds[0] != seeds[1]
-    assert seeds[0] == [one.seed for one in Game(seed=7).playing(seen("me", "it")).all if isinstance(one, ResetPolicy)]
+    assert seeds[0] == [
+        one.seed for one in Game(seed=7).playing(view_for("me", "it")).all if isinstance(one, ResetPolicy)
+    ]
 
 
-def test_a_program_plays_a_player_of_gym() -> None:
-    game = Game(plays={"me": "human", "it": "gym://learner"}, gym="advise").playing(seen("me", "it"))
+def test_the_advice_of_a_program_plays_a_player_of_gym() -> None:
+    game = Game(plays={"me": "human", "it": "gym://learner"}, gym="advise").playing(view_for("me", "it"))
     assert game.asks == []
     assert game.actions["it"] == (0, "none")
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.event("advise", 2, None, game.now)
     game.wait(0.1)
     assert game.actions == {"me": (0, "none"), "it": (2, "advice")}
-    game.stepped(seen("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.wait(0.1)
     assert game.actions["it"] == (2, "late")
     for player in ("nobody", "me"):
@@ -463,11 +467,11 @@ def test_a_program_plays_a_player_of_gym() -> None:
 
 
 def test_the_log_says_how_often_a_policy_was_late_in_an_episode() -> None:
-    game = Game().playing(seen("me", "it"))
-    game.stepped(seen("me", "it"))
+    game = Game().playing(view_for("me", "it"))
+    game.stepped(view_for("me", "it"))
     game.acts(1)
     game.wait(0.1)
-    game.stepped(seen(), over=True)
+    game.stepped(view_for(), over=True)
     told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert "the policy of it was late at 1 of 2 steps" in told
 
@@ -490,12 +494,12 @@ def players(section: dict[str, Any], *names: str) -> tuple[Player, ...]:
         ({"players": {"a": "human", "b": "idle"}, "idleAction": {"c": "up"}}, 'idleAction names "c"'),
     ],
 )
-def test_what_does_not_fit_the_environment_is_named(section: dict[str, Any], words: str) -> None:
+def test_players_that_do_not_fit_the_environment_are_named(section: dict[str, Any], words: str) -> None:
     with pytest.raises(PlayersError, match=words.replace("(", r"\(")):
         players(section, "a", "b")
 
 
-def test_the_players_are_in_the_environments_order_and_those_of_the_group() -> None:
+def test_the_players_are_those_of_the_group_in_the_environments_order() -> None:
     by_group = {"0": {"b": "human", "a": "idle"}, "1": {"b": "random", "a": "human"}}
     found = players({"players": by_group, "idleAction": {"b": "UP"}}, "a", "b")
     assert [(one.name, one.plays, one.idle) for one in found] == [("a", "human", 0), ("b", "random", 1)]
@@ -541,7 +545,7 @@ def test_whatever_happens_steps_take_legal_actions_of_those_whose_turn_it_is(
     section: dict[str, Any], events: list[tuple[str, Any]], first: tuple[str, ...], mask: list[bool] | None
 ) -> None:
     masks = {} if mask is None else {"me": mask, "it": mask}
-    view = seen(*first, masks=masks)
+    view = view_for(*first, masks=masks)
     game = Game(**section).playing(view)
     pressed = 0
     for kind, what in events:
@@ -568,14 +572,14 @@ def test_whatever_happens_steps_take_legal_actions_of_those_whose_turn_it_is(
 
 
 def _answer(game: Game, view: View, to_act: tuple[str, ...], masks: dict[str, Any], *, over: bool) -> View:
-    """Let the agent's call come back."""
+    """Let the agent's open call return."""
     if isinstance(game.open_call, StepCall):
-        view = seen(*(() if over else to_act), masks=masks)
+        view = view_for(*(() if over else to_act), masks=masks)
         game.stepped(view, over=over)
     elif isinstance(game.open_call, FeedbackCall):
         game.returns()
     if isinstance(game.open_call, ResetCall):
-        view = seen("me", "it", masks=masks)
+        view = view_for("me", "it", masks=masks)
         game.returns(Begun(b"reset", FRAME, view))
     return view
 

@@ -1,4 +1,4 @@
-"""Each message of docs/wire.md, and each that is refused, one by one."""
+"""Each message of docs/wire.md, each reason to refuse one, frames, keys and the watchdog, case by case."""
 
 import base64
 import io
@@ -19,7 +19,7 @@ from trial.server.watchdog import Watchdog
 
 
 @pytest.mark.parametrize("data", [b'{"command": "start"}', "", "{", "[1]", "3", "null", '"start"'])
-def test_what_is_not_a_json_object_is_no_message(data):
+def test_data_that_are_no_json_object_are_refused(data):
     for parse in (messages.parse, messages.parse_hello):
         with pytest.raises(messages.NotAMessage):
             parse(data)
@@ -53,7 +53,7 @@ def test_what_is_not_a_json_object_is_no_message(data):
         ({"ack": "1"}, "ack must be the id of a frame"),
     ],
 )
-def test_a_message_that_means_nothing_is_refused_with_the_reason(fields, words):
+def test_a_wrong_message_is_refused_with_the_reason(fields, words):
     with pytest.raises(messages.BadMessage) as refused:
         messages.parse(json.dumps(fields))
     assert str(refused.value) == words
@@ -87,7 +87,7 @@ def test_a_message_is_read_and_recorded(fields, message, recorded):
         assert isinstance(found.frame_rate, float)
 
 
-def test_feedback_and_commands_are_those_of_the_wire():
+def test_feedback_and_commands_are_those_of_docs_wire():
     assert sorted(messages.FEEDBACK) == ["bad", "good", "trainOffline", "trainOnline"]
     assert sorted(messages.PLAIN_COMMANDS) == ["pause", "requestUI", "reset", "start", "stop"]
     assert sorted(commands.ALWAYS_ALLOWED) == ["requestUI", "start"]
@@ -126,7 +126,7 @@ def test_a_hello_with_a_wrong_field_is_refused_with_the_reason(fields, words):
 
 
 @pytest.mark.parametrize("next_in", [None, 1.23456])
-def test_what_the_server_says_is_json_with_the_names_of_the_wire(next_in):
+def test_the_servers_messages_are_json_with_the_names_of_docs_wire(next_in):
     left = {} if next_in is None else {"nextIn": 1.235}
     said = messages.controls(
         ui=("start", "good"),
@@ -193,14 +193,14 @@ def test_what_the_server_says_is_json_with_the_names_of_the_wire(next_in):
         ({"command": "stop", "action": "left"}, ["stop"], "left"),
     ],
 )
-def test_what_the_projects_ui_leaves_out_is_not_offered(said, ui, missing):
+def test_a_message_whose_control_is_missing_in_ui_is_not_offered(said, ui, missing):
     assert commands.not_offered(messages.Message(**said), ui) == missing
 
 
 @pytest.mark.parametrize(
     ("score", "shown"), [(340.0, "340"), (1 / 3, "0.333333"), (-0.5, "-0.5"), (float("inf"), "0"), (float("nan"), "0")]
 )
-def test_a_score_is_shown_as_people_write_it(score, shown):
+def test_a_score_is_written_with_few_digits(score, shown):
     assert json.dumps(messages.tidy(score)) == shown
 
 
@@ -287,7 +287,7 @@ def test_a_key_that_the_keyboard_repeats_does_not_become_the_newest():
     assert controls.take() == (2, True)
 
 
-def test_four_keys_are_looked_at_together_and_not_five():
+def test_at_most_four_held_keys_are_combined():
     controls = Controls(("noop", "abcd", "e"), 1)
     for name in "eabcd":
         controls.hold(name)
@@ -297,7 +297,7 @@ def test_four_keys_are_looked_at_together_and_not_five():
     assert controls.take() == (0, False), "the fifth key does not count"
 
 
-def test_a_released_key_acts_once_and_what_was_cleared_not_at_all():
+def test_a_released_key_acts_once_and_a_cleared_key_not_at_all():
     controls = Controls(("noop", "up", "down"), 3)
     controls.hold("up")
     controls.release("up")
@@ -317,7 +317,7 @@ def test_a_released_key_acts_once_and_what_was_cleared_not_at_all():
 # ---- the watchdog
 
 
-def test_a_server_whose_participant_is_not_known_yet_waits_up_to_its_deadline():
+def test_the_watchdog_of_a_server_without_a_participant_waits_up_to_the_deadline():
     dog = Watchdog(now=None, idle=10, grace=0, deadline=1000)
     assert dog.expires() == 1000
     assert dog.verdict(999) is None
@@ -325,7 +325,7 @@ def test_a_server_whose_participant_is_not_known_yet_waits_up_to_its_deadline():
     assert (dog.expires(), dog.verdict(59), dog.verdict(60)) == (60, None, "idle")
 
 
-def test_who_was_here_is_waited_for_as_long_as_the_longer_of_the_two_times():
+def test_the_watchdog_waits_for_a_participant_who_left_for_the_longer_of_idle_and_grace():
     for idle, grace, until in ((10, 60, 160), (60, 10, 160), (0, 0, 100)):
         dog = Watchdog(now=0, idle=idle, grace=grace, deadline=None)
         dog.came()
@@ -335,7 +335,7 @@ def test_who_was_here_is_waited_for_as_long_as_the_longer_of_the_two_times():
     assert dog.verdict(5) == "idle", "nobody was here"
 
 
-def test_pixels_are_packed_unless_that_takes_more_bytes_than_they_may():
+def test_pixels_are_packed_unless_that_takes_more_bytes_than_allowed():
     noise = np.random.default_rng(1).integers(0, 256, (300, 100, 3), dtype=np.uint8)
     whole = frames.packed(noise)
     assert zlib.decompress(whole, wbits=-15) == noise.tobytes()
@@ -349,7 +349,7 @@ def test_pixels_are_packed_unless_that_takes_more_bytes_than_they_may():
     assert zlib.decompress(chunked, wbits=-15) == np.bitwise_xor(noise, base).tobytes()
 
 
-def test_bytes_after_a_frame_or_too_few_rows_make_it_none():
+def test_a_frame_of_the_wrong_length_is_refused():
     def key(pixels, more=b""):
         return struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(pixels, wbits=-15) + more
 
@@ -381,7 +381,7 @@ def test_a_picture_becomes_exact_by_rows_in_their_order():
 @pytest.mark.parametrize(
     "head", [(0, 1, 0, 3, 3), (0, 1, 2, 0, 3), (0, 1, 2, 3, 2), (0, 1, 4097, 4096, 1), (0, 1, 65535, 65535, 3)]
 )
-def test_a_frame_of_no_possible_size_is_refused(head):
+def test_a_frame_of_an_impossible_size_is_refused(head):
     with pytest.raises(frames.FrameError, match="no such picture"):
         frames.Decoder().decode(struct.pack("!BIHHB", *head))
 

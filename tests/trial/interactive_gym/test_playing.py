@@ -45,7 +45,7 @@ def play(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> An
     server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
 
     play_to_the_end(server, open_client)
-    assert server.wait() == 0, server.said()
+    assert server.wait() == 0, server.log_text()
     return server
 
 
@@ -106,7 +106,7 @@ def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client:
             await asyncio.gather(*(each.until(lambda each=each: each.done) for each in (anna, bert)))
 
     asyncio.run(journey())
-    assert server.wait() == 0, server.said()
+    assert server.wait() == 0, server.log_text()
     assert [answer(server.store, name)["answers"]["outcome"] for name in ("anna", "bert")] == ["finished"] * 2
     (found,) = recordings(server.store).values()
     steps = [line for line in found if line["kind"] == "step"]

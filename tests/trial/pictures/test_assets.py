@@ -1,4 +1,4 @@
-"""The images of a project: which files count, what their atlases say, and what is said of files that cannot be used."""
+"""The images of a project: which files count, what their atlases say, and the sentences about files that cannot be used."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def image(width: int = 4, height: int = 2, color: str = "red", form: str = "PNG"
     return out.getvalue()
 
 
-def loaded(tmp_path: Path, **files: bytes | str | dict[str, Any]) -> Assets:
+def load_files(tmp_path: Path, **files: bytes | str | dict[str, Any]) -> Assets:
     for name, content in files.items():
         path = tmp_path / "assets" / name.replace("__", "/").replace("_", ".")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,14 +37,14 @@ def loaded(tmp_path: Path, **files: bytes | str | dict[str, Any]) -> Assets:
 
 
 def problem(tmp_path: Path, **files: bytes | str | dict[str, Any]) -> str:
-    found = loaded(tmp_path, **files)
+    found = load_files(tmp_path, **files)
     assert not found.by_name
     (sentence,) = found.problems
     return sentence
 
 
 def test_images_are_called_by_their_path_without_its_extension(tmp_path: Path) -> None:
-    found = loaded(tmp_path, ball_png=image(), cooks__red_webp=image(form="WEBP"), sky_jpg=image(form="JPEG"))
+    found = load_files(tmp_path, ball_png=image(), cooks__red_webp=image(form="WEBP"), sky_jpg=image(form="JPEG"))
     assert list(found.by_name) == ["ball", "cooks/red", "sky"]
     assert found.by_name["ball"].size == (4, 2)
     assert not found.problems
@@ -55,7 +55,7 @@ def test_a_project_without_the_folder_has_no_images(tmp_path: Path) -> None:
 
 
 def test_the_same_bytes_have_the_same_hash(tmp_path: Path) -> None:
-    found = loaded(tmp_path, a_png=image(), b_png=image(), c_png=image(color="blue"))
+    found = load_files(tmp_path, a_png=image(), b_png=image(), c_png=image(color="blue"))
     a, b, c = found.table()
     assert a["hash"] == b["hash"] != c["hash"]
     assert a["bytes"] == len(found.by_name["a"].packed)
@@ -73,13 +73,13 @@ FRAME = {"frame": {"x": 1, "y": 0, "w": 2, "h": 2}}
     ],
 )
 def test_an_atlas_of_texturepacker_or_phaser_names_frames(tmp_path: Path, atlas: dict[str, Any]) -> None:
-    found = loaded(tmp_path, cook_png=image(), cook_json=atlas)
+    found = load_files(tmp_path, cook_png=image(), cook_json=atlas)
     assert found.by_name["cook"].frames == {"EAST.png": (1, 0, 2, 2)}
 
 
 def test_frames_of_one_size_are_counted_row_by_row(tmp_path: Path) -> None:
     sheet = {"frameWidth": 2, "frameHeight": 1, "animations": {"walk": {"frames": [0, 3], "frameRate": 4}}}
-    cook = loaded(tmp_path, cook_png=image(), cook_json=sheet).by_name["cook"]
+    cook = load_files(tmp_path, cook_png=image(), cook_json=sheet).by_name["cook"]
     assert cook.frames == {"0": (0, 0, 2, 1), "1": (2, 0, 2, 1), "2": (0, 1, 2, 1), "3": (2, 1, 2, 1)}
     assert cook.animations["walk"].frames == ("0", "3")
 
@@ -128,7 +128,7 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
 
 def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assets, "MOST_ASSETS", 2)
-    found = loaded(tmp_path, a_png=image(), b_png=image(), c_png=image())
+    found = load_files(tmp_path, a_png=image(), b_png=image(), c_png=image())
     assert list(found.by_name) == ["a", "b"]
     assert found.problems == (
         "assets: more than 2 images, 20 MB or 64 megapixels; assets/c.png and all after it are not shown",
@@ -137,13 +137,13 @@ def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_pixels_of_all_images_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assets, "MOST_PIXELS_IN_ALL", 8)
-    assert list(loaded(tmp_path, a_png=image(), b_png=image()).by_name) == ["a"]
+    assert list(load_files(tmp_path, a_png=image(), b_png=image()).by_name) == ["a"]
 
 
 # ---- drawn on the server
 
 
-def raster(found: Assets = Assets()) -> Raster:  # noqa: B008 - it never changes
+def raster_of(found: Assets = Assets()) -> Raster:  # noqa: B008 - it never changes
     return Raster(SceneSection(width=100, height=50, pixel_art=True), found)
 
 
@@ -152,7 +152,7 @@ def pixel(picture: Any, x: int, y: int) -> str:
 
 
 def test_the_server_draws_every_type_of_object() -> None:
-    picture = raster().draw(
+    picture = raster_of().draw(
         as_scene(
             [
                 {"id": 1, "type": "circle", "x": 0.1, "y": 0.2, "radius": 4, "color": "#ff0000"},
@@ -179,8 +179,8 @@ def test_the_server_draws_every_type_of_object() -> None:
 def test_depth_decides_what_covers_what_then_the_order() -> None:
     box = {"type": "rectangle", "x": 0, "y": 0, "width": 10, "height": 10}
     low, high = box | {"id": 1, "depth": 2, "color": "#ff0000"}, box | {"id": 2, "depth": 1, "color": "#00ff00"}
-    assert pixel(raster().draw(as_scene([low, high])), 5, 5) == "#ff0000"
-    assert pixel(raster().draw(as_scene([low | {"depth": 1}, high])), 5, 5) == "#00ff00"
+    assert pixel(raster_of().draw(as_scene([low, high])), 5, 5) == "#ff0000"
+    assert pixel(raster_of().draw(as_scene([low | {"depth": 1}, high])), 5, 5) == "#00ff00"
 
 
 def test_the_server_draws_frames_of_an_atlas(tmp_path: Path) -> None:
@@ -188,23 +188,23 @@ def test_the_server_draws_frames_of_an_atlas(tmp_path: Path) -> None:
     sheet[:, 2:] = (0, 0, 255)
     out = io.BytesIO()
     Image.fromarray(sheet).save(out, "PNG")
-    found = loaded(tmp_path, cook_png=out.getvalue(), cook_json={"frameWidth": 2})
+    found = load_files(tmp_path, cook_png=out.getvalue(), cook_json={"frameWidth": 2})
     sprite = {"id": 1, "type": "sprite", "image": "cook.png", "frame": 1, "x": 0, "y": 0, "width": 20, "height": 20}
-    picture = raster(found).draw(as_scene([sprite]))
+    picture = raster_of(found).draw(as_scene([sprite]))
     assert (pixel(picture, 10, 10), pixel(picture, 21, 10)) == ("#0000ff", "#ffffff")
     middle = sprite | {"origin": (0.5, 0.5), "x": 0.5, "y": 0.5, "angle": 45, "alpha": 0.5}
-    assert pixel(raster(found).draw(as_scene([middle])), 50, 25) in ("#7f7fff", "#8080ff")
+    assert pixel(raster_of(found).draw(as_scene([middle])), 50, 25) in ("#7f7fff", "#8080ff")
 
 
-def test_a_sprite_that_is_shown_through_leaves_the_image_of_others_as_it_is(tmp_path: Path) -> None:
-    found = loaded(tmp_path, cook_png=image())
+def test_a_transparent_sprite_does_not_change_the_image_for_other_sprites(tmp_path: Path) -> None:
+    found = load_files(tmp_path, cook_png=image())
     sprite = {"id": 1, "type": "sprite", "image": "cook.png", "x": 0, "y": 0}
-    plain = raster(found).draw(as_scene([sprite]))
-    faint = raster(found).draw(as_scene([sprite | {"alpha": 0.5}]))
+    plain = raster_of(found).draw(as_scene([sprite]))
+    faint = raster_of(found).draw(as_scene([sprite | {"alpha": 0.5}]))
     assert pixel(plain, 0, 0) != pixel(faint, 0, 0)
-    assert pixel(raster(found).draw(as_scene([sprite])), 0, 0) == pixel(plain, 0, 0)
+    assert pixel(raster_of(found).draw(as_scene([sprite])), 0, 0) == pixel(plain, 0, 0)
 
 
 def test_a_missing_image_is_a_grey_box() -> None:
     sprite = {"id": 1, "type": "sprite", "image": "../../etc/passwd", "x": 0, "y": 0, "width": 10, "height": 10}
-    assert pixel(raster().draw(as_scene([sprite])), 5, 5) == "#c0c0c0"
+    assert pixel(raster_of().draw(as_scene([sprite])), 5, 5) == "#c0c0c0"

@@ -1,4 +1,4 @@
-"""Pictures on the wire: exact where that is promised, never dear, and near enough where something is lost."""
+"""Pictures on the wire: exact where that is promised, small, and close to the original where something is lost."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_any_sequence_of_frames_arrives_unchanged(sequence, first):
     encoder, last = Encoder(), None
     for number, frame in enumerate(sequence):
         data = encoder.encode(frame, first + number)
-        # What a browser does, written out once more: not by our own decoder.
+        # A browser's decoding, written a second time: independent of our own decoder.
         kind = data[0]
         assert int.from_bytes(data[1:5], "big") == (first + number) % 2**32
         width, height = int.from_bytes(data[5:7], "big"), int.from_bytes(data[7:9], "big")
@@ -73,12 +73,12 @@ def test_decoder_undoes_encoder(sequence):
 
 
 @given(st.binary(max_size=60))
-def test_decoder_refuses_other_bytes(data):
+def test_the_decoder_reads_or_refuses_any_bytes(data):
     with contextlib.suppress(frames.FrameError):
         frames.Decoder().decode(data)
 
 
-def test_what_render_may_return():
+def test_render_may_return_images_of_bytes_and_nothing_else():
     assert frames.as_frame(np.zeros((4, 5), np.uint8)).shape == (4, 5, 1)
     assert frames.as_frame(np.zeros((4, 5, 4), np.uint8)).shape == (4, 5, 3)
     assert frames.as_frame(np.zeros((5, 4, 3), np.uint8).transpose(1, 0, 2)).flags.c_contiguous
@@ -127,13 +127,13 @@ def with_figure(background: Frame, number: int) -> Frame:
     return frame
 
 
-def theirs(frame: Frame) -> Frame:
-    """What HIPPO's browsers are shown."""
+def hippos_picture(frame: Frame) -> Frame:
+    """The picture that HIPPO's browsers would show."""
     data = base64.b64decode(json.loads(jpeg_message(frame, 0))["frame"])
     return np.asarray(Image.open(io.BytesIO(data))).reshape(frame.shape)
 
 
-def error(shown: Frame, frame: Frame) -> float:
+def mean_error(shown: Frame, frame: Frame) -> float:
     return float(np.abs(shown.astype(int) - frame).mean())
 
 
@@ -165,10 +165,10 @@ def lively_pictures(draw: Any) -> list[Frame]:
 
 @settings(max_examples=examples(40))
 @given(lively_pictures(), st.integers(0, 59))
-def test_what_is_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], joins: int) -> None:
+def test_each_frame_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], joins: int) -> None:
     encoder, decoder = Encoder(lossy=True), Decoder()
     for number, frame in enumerate(sequence):
-        if number == joins:  # a client that comes later knows nothing of what was before
+        if number == joins:  # a client that connects later has none of the frames before
             encoder, decoder = Encoder(lossy=True), Decoder()
         data = encoder.encode(frame, number)
         found, shown = decoder.decode(data)
@@ -176,7 +176,7 @@ def test_what_is_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], join
         assert encoder.exact == np.array_equal(shown, frame) or data[0] in (JPEG, ROWS)
         if data[0] in EXACT:
             assert np.array_equal(shown, frame)
-        assert error(shown, frame) <= error(theirs(frame), frame) + 0.5
+        assert mean_error(shown, frame) <= mean_error(hippos_picture(frame), frame) + 0.5
         if encoder.exact:
             assert np.array_equal(shown, frame)
     while not encoder.exact:
@@ -188,7 +188,7 @@ def test_what_is_shown_is_exact_or_as_good_as_a_jpeg(sequence: list[Frame], join
 
 @settings(max_examples=examples(25))
 @given(lively_pictures())
-def test_no_sequence_costs_more_than_hippos(sequence: list[Frame]) -> None:
+def test_no_sequence_takes_a_fifth_more_bytes_than_hippos(sequence: list[Frame]) -> None:
     encoder = Encoder(lossy=True)
     ours = sum(len(encoder.encode(frame, number)) for number, frame in enumerate(sequence))
     hippos = sum(len(jpeg_message(frame, number)) for number, frame in enumerate(sequence))
@@ -229,7 +229,7 @@ def test_a_flash_costs_no_second_whole_picture() -> None:
         frame = with_figure(texture(120, 200, seed=9) if number in (5, 6) else background, number)
         data = encoder.encode(frame, number)
         kinds.append(data[0])
-        assert error(decoder.decode(data)[1], frame) < 20
+        assert mean_error(decoder.decode(data)[1], frame) < 20
     assert kinds.count(KEY) == kinds.count(ROWS) == 0
     assert kinds[:4] == [DIFFERENCE] * 4
     assert JPEG in kinds[4:6]
@@ -271,7 +271,7 @@ def test_a_picture_too_long_for_a_jpeg_is_exact() -> None:
     assert np.array_equal(Decoder().decode(data)[1], frame)
 
 
-def test_the_decoder_refuses_frames_that_belong_to_nothing() -> None:
+def test_the_decoder_refuses_broken_frames_and_changes_of_frames_that_it_does_not_have() -> None:
     frame = texture(48, 40)
     encoder = Encoder(lossy=True)
     first = encoder.encode(frame, 1)
@@ -306,8 +306,8 @@ def test_the_decoder_refuses_frames_that_belong_to_nothing() -> None:
 # ---- a client's connection
 
 
-class Paper:
-    """A websocket that writes down what it is sent."""
+class SentMessages:
+    """A websocket that keeps the messages that it is given to send."""
 
     def __init__(self, subprotocol: str) -> None:
         self.subprotocol = subprotocol
@@ -321,14 +321,16 @@ class Paper:
         self.sent.append(data)
 
 
-def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Frame]:
+def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[int], Frame]:
     """The kinds of frames that a scrolling texture is sent as, and what is shown once it has stopped."""
     sequence = scrolling(10)
 
     async def talk(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-        monkeypatch.setattr(connections, "REST_SECONDS", 3600.0)  # however slow the machine, they follow each other
-        paper = Paper(subprotocol)
-        connection = Connection(paper, lossless=lossless)  # type: ignore[arg-type]
+        monkeypatch.setattr(
+            connections, "REST_SECONDS", 3600.0
+        )  # so that all pictures follow each other, however slow the machine is
+        websocket = SentMessages(subprotocol)
+        connection = Connection(websocket, lossless=lossless)  # type: ignore[arg-type]
         running = asyncio.create_task(connection.run())
         for number, frame in enumerate(sequence):
             if number == len(sequence) - 1:
@@ -336,16 +338,16 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
             connection.put_picture(frame, number)
             connection.send_now()
             async with asyncio.timeout(10):
-                while len(paper.sent) <= number:
+                while len(websocket.sent) <= number:
                     await asyncio.sleep(0.001)
-        if paper.sent[-1][0] == JPEG:
+        if websocket.sent[-1][0] == JPEG:
             async with asyncio.timeout(10):
                 decoder = Decoder()
-                while not any(np.array_equal(decoder.decode(data)[1], sequence[-1]) for data in paper.sent):
+                while not any(np.array_equal(decoder.decode(data)[1], sequence[-1]) for data in websocket.sent):
                     await asyncio.sleep(0.01)
                     decoder = Decoder()
         running.cancel()
-        return paper.sent
+        return websocket.sent
 
     decoder = Decoder()
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -357,14 +359,14 @@ def shown_by_a_link(subprotocol: str, *, lossless: bool) -> tuple[list[int], Fra
 
 
 def test_a_connection_makes_a_picture_exact_that_no_other_follows() -> None:
-    kinds, _ = shown_by_a_link(SUBPROTOCOLS[0], lossless=False)
+    kinds, _ = sent_over_a_connection(SUBPROTOCOLS[0], lossless=False)
     assert kinds[:10] == [JPEG] * 10
     assert set(kinds[10:]) == {ROWS}
 
 
 @pytest.mark.parametrize(("subprotocol", "lossless"), [(SUBPROTOCOLS[0], True), (SUBPROTOCOLS[2], False)])
-def test_a_connection_sends_no_jpeg_where_it_must_not(subprotocol: str, lossless: bool) -> None:
-    kinds, _ = shown_by_a_link(subprotocol, lossless=lossless)
+def test_a_lossless_connection_and_one_of_the_oldest_subprotocol_send_no_jpeg(subprotocol: str, lossless: bool) -> None:
+    kinds, _ = sent_over_a_connection(subprotocol, lossless=lossless)
     assert kinds == [KEY] + [DIFFERENCE] * 9
 
 

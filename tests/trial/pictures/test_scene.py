@@ -1,4 +1,4 @@
-"""What `render()` may return as objects, and what is said of objects that cannot be drawn."""
+"""What `render()` may return as objects, and the sentences about objects that cannot be drawn."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_map_also_has_a_text_for_the_hud() -> None:
 
 @dataclasses.dataclass
 class Sprite:
-    """In the words of Interactive Gym."""
+    """A sprite with Interactive Gym's names of fields."""
 
     uuid: str
     x: float
@@ -119,7 +119,7 @@ def test_permanent_objects_do_not_pile_up_without_end() -> None:
     assert as_scene([{"id": "0-0", "remove": True}, BALL], scene).objects.keys() >= {"ball"}, "there is room again"
 
 
-def test_an_object_for_which_there_was_no_room_is_drawn_once_there_is() -> None:
+def test_an_object_that_found_no_room_is_drawn_when_there_is_room() -> None:
     drops = [BALL | {"id": str(index), "permanent": True} for index in range(MOST_OBJECTS - 1)]
     full = as_scene([*drops, BALL])
     crowded = as_scene([BALL | {"id": "last", "permanent": True}, BALL], full)
@@ -183,7 +183,7 @@ def test_a_permanent_object_that_comes_again_unchanged_can_become_an_ordinary_on
     assert as_scene([wall | {"permanent": False}], again).permanent == frozenset()
 
 
-def test_what_came_last_of_an_id_is_what_counts_in_the_next_scene_too() -> None:
+def test_the_last_entry_of_an_id_counts_in_the_next_scene_too() -> None:
     first = as_scene([BALL, BALL | {"x": 0.9, "origin": 3}])
     assert as_scene([BALL], first).objects["ball"]["x"] == 0.5
     removed = as_scene([BALL, {"id": "ball", "remove": True}], first)
@@ -278,7 +278,7 @@ def test_a_field_that_the_type_does_not_have_is_remarked() -> None:
     assert scene.problems == ("the object 'ball' has a field 'colour', which a circle does not have",)
 
 
-def test_text_is_text_and_control_characters_are_dropped() -> None:
+def test_text_keeps_its_markup_and_loses_control_characters() -> None:
     words = {"id": "words", "type": "text", "x": 0, "y": 0, "text": "<b>3 & 4</b>\n\x00\x1bend"}
     assert as_scene([words]).objects["words"]["text"] == "<b>3 & 4</b>\nend"
 
@@ -290,7 +290,7 @@ def test_all_points_of_a_scene_are_bounded() -> None:
     assert scene.problems == ("the scene has more than 20000 points; some objects are left out",)
 
 
-def texts(count: int, letter: str = "x", length: int = 1_000, **more: Any) -> list[dict[str, Any]]:
+def text_objects(count: int, letter: str = "x", length: int = 1_000, **more: Any) -> list[dict[str, Any]]:
     return [{"id": f"t{n}", "type": "text", "x": 0.5, "y": 0.5, "text": letter * length, **more} for n in range(count)]
 
 
@@ -299,35 +299,35 @@ TOO_MUCH_TEXT = ("the scene's texts have more than 100000 characters; some are l
 
 def test_a_scene_has_so_many_characters_in_all_and_goes_on_without_the_others() -> None:
     most = MOST_TEXT_IN_ALL // 1_000
-    scene = as_scene([*texts(2_000 - 1), BALL])
+    scene = as_scene([*text_objects(2_000 - 1), BALL])
     assert list(scene.objects) == [*(f"t{n}" for n in range(most)), "ball"]
     assert scene.problems == TOO_MUCH_TEXT
-    again = as_scene([*texts(2_000 - 1), BALL], scene)
+    again = as_scene([*text_objects(2_000 - 1), BALL], scene)
     assert (again.objects, again.problems) == (scene.objects, TOO_MUCH_TEXT)
-    other = as_scene([*texts(2_000 - 1, "y"), BALL], again)
+    other = as_scene([*text_objects(2_000 - 1, "y"), BALL], again)
     assert list(other.objects) == list(scene.objects)
     assert other.objects["t0"]["text"] == "y" * 1_000
 
 
 def test_texts_that_change_all_the_time_are_not_too_many() -> None:
-    scene = as_scene(texts(90))
+    scene = as_scene(text_objects(90))
     for letter in "yzabcdefgh":
-        scene = as_scene(texts(90, letter), scene)
+        scene = as_scene(text_objects(90, letter), scene)
         assert (len(scene.objects), scene.problems) == (90, ())
-    fewer = as_scene(texts(10), scene)
-    assert as_scene([*texts(100), BALL], fewer).problems == ()
+    fewer = as_scene(text_objects(10), scene)
+    assert as_scene([*text_objects(100), BALL], fewer).problems == ()
 
 
 def test_texts_that_grow_are_too_many_at_last() -> None:
-    scene = as_scene(texts(150, length=10))
+    scene = as_scene(text_objects(150, length=10))
     assert scene.problems == ()
-    grown = as_scene(texts(150, "y"), scene)
+    grown = as_scene(text_objects(150, "y"), scene)
     assert (len(grown.objects), grown.problems) == (100, TOO_MUCH_TEXT)
 
 
 def test_texts_that_stay_count_too() -> None:
-    scene = as_scene(texts(90, permanent=True))
-    shown = as_scene([{**each, "id": f"more {each['id']}"} for each in texts(20)], scene)
+    scene = as_scene(text_objects(90, permanent=True))
+    shown = as_scene([{**each, "id": f"more {each['id']}"} for each in text_objects(20)], scene)
     assert len(shown.objects) == 100
     assert shown.permanent == scene.permanent
     assert shown.problems == TOO_MUCH_TEXT
@@ -342,7 +342,7 @@ def test_texts_that_stay_count_too() -> None:
         ({"objects": 3}, "render() must return a list of objects, not int"),
     ],
 )
-def test_what_is_no_scene_at_all_is_refused_with_a_sentence(value: Any, said: str) -> None:
+def test_a_value_that_is_no_scene_is_refused_with_a_sentence(value: Any, said: str) -> None:
     with pytest.raises(SceneError) as refused:
         as_scene(value)
     assert str(refused.value) == said

@@ -82,11 +82,11 @@ _VALUES = {
 
 def test_without_permanent_objects_the_scene_before_makes_no_difference() -> None:
     for seed in range(examples(200)):
-        _play(random.Random(seed))
+        _check_changes(random.Random(seed))
 
 
-def _play(chance: random.Random) -> None:
-    """Show three objects, of which one field after the other gets another value."""
+def _check_changes(chance: random.Random) -> None:
+    """Show three objects while their fields change; each scene must be the same as without the scene before it."""
     kinds = (_SPRITE, _CIRCLE, _TEXT, _ODDER)
     objects: list[dict[str, Any]] = [{"id": name, **chance.choice(kinds)} for name in "abc"]
     before = None
@@ -97,7 +97,7 @@ def _play(chance: random.Random) -> None:
         changed[key] = chance.choice(_VALUES[key])
         picture = [changed if each["id"] == changed["id"] else dict(each) for each in objects]
         scene, alone = as_scene(picture, before), as_scene(picture)
-        assert _written(scene.objects) == _written(alone.objects)
+        assert _as_json(scene.objects) == _as_json(alone.objects)
         assert (sorted(scene.problems), images_of(scene)) == (sorted(alone.problems), images_of(alone))
         decoder.decode(encoder.encode(scene, number))
         assert decoder.objects == scene.objects
@@ -107,6 +107,6 @@ def _play(chance: random.Random) -> None:
             objects = picture
 
 
-def _written(objects: Any) -> str:
-    """Also the order of the objects and of their fields is what it is."""
+def _as_json(objects: Any) -> str:
+    """As JSON, which keeps the order of the objects and of their fields."""
     return json.dumps({name: dict(each) for name, each in objects.items()})

@@ -44,7 +44,7 @@ def test_the_order_is_sent_if_it_changed() -> None:
     assert changes(first, as_scene([WALL, BALL], first)) == {"order": ["wall", "ball"]}
 
 
-def test_a_forgetful_encoder_begins_anew() -> None:
+def test_an_encoder_that_forgets_sends_the_scene_whole_again() -> None:
     encoder, scene = SceneEncoder(), as_scene([BALL])
     whole = encoder.encode(scene, 1)
     assert json.loads(encoder.encode(scene, 2)[HEADER.size :]) == {}
@@ -88,16 +88,16 @@ def test_a_client_has_each_scene_after_its_message(given_scenes: list[tuple[list
         before = scene
 
 
-def test_two_who_are_shown_the_same_get_the_same_bytes_and_one_who_was_shown_something_else_gets_others(
+def test_clients_with_the_same_scene_get_the_same_bytes_and_a_later_client_gets_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     packed: list[Scene] = []
 
-    def counted(before: Scene | None, scene: Scene) -> dict[str, Any]:
+    def count_changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
         packed.append(scene)
         return changes(before, scene)
 
-    monkeypatch.setattr(scene_encoder, "changes", counted)
+    monkeypatch.setattr(scene_encoder, "changes", count_changes)
     one, other, late = SceneEncoder(), SceneEncoder(), SceneEncoder()
     first, second = as_scene([BALL]), as_scene([{**BALL, "x": 0.25}])
     assert one.encode(first, 1) == other.encode(first, 1)

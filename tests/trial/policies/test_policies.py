@@ -1,4 +1,4 @@
-"""Policies: players that are no humans. The files are real ONNX files, run by onnxruntime."""
+"""Policies, the players that are no humans. The files are real ONNX files, run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ TWO = Box(-1, 1, (2,), np.float32)
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def module(**classes: type) -> types.ModuleType:
+def agent_module(**classes: type) -> types.ModuleType:
     made = types.ModuleType("agent")
     vars(made).update(classes)
     return made
 
 
-def made(spec: str, folder: Path, count: int = 3, space: Any = TWO, **more: Any) -> Any:
+def load_policy(spec: str, folder: Path, count: int = 3, space: Any = TWO, **more: Any) -> Any:
     return load(spec, folder, None, count, space, **more)
 
 
 def refusal(spec: str, folder: Path, count: int = 3, space: Any = TWO) -> str:
     with pytest.raises(PolicyError) as refused:
-        made(spec, folder, count, space)
+        load_policy(spec, folder, count, space)
     return str(refused.value)
 
 
@@ -46,7 +46,7 @@ def refusal(spec: str, folder: Path, count: int = 3, space: Any = TWO) -> str:
 
 
 def test_random_takes_every_legal_action_and_no_other(tmp_path: Path) -> None:
-    policy = made("random", tmp_path, 4)
+    policy = load_policy("random", tmp_path, 4)
     policy.reset(1)
     taken = Counter(policy.act(None, {}, (True, False, True, True)) for _ in range(900))
     assert sorted(taken) == [0, 2, 3]
@@ -54,7 +54,7 @@ def test_random_takes_every_legal_action_and_no_other(tmp_path: Path) -> None:
 
 
 def test_random_repeats_itself_after_the_same_seed(tmp_path: Path) -> None:
-    policy, runs = made("random", tmp_path, 50), []
+    policy, runs = load_policy("random", tmp_path, 50), []
     for seed in (7, 7, 8):
         policy.reset(seed)
         runs.append([policy.act(None, {}, None) for _ in range(20)])
@@ -62,7 +62,7 @@ def test_random_repeats_itself_after_the_same_seed(tmp_path: Path) -> None:
 
 
 def test_idle_takes_the_idle_action_unless_it_is_forbidden(tmp_path: Path) -> None:
-    policy = made("idle", tmp_path, 3, idle=2)
+    policy = load_policy("idle", tmp_path, 3, idle=2)
     assert policy.act(None, {}, None) == 2
     assert policy.act(None, {}, (False, True, False)) == 1
 
@@ -78,7 +78,7 @@ def test_a_class_of_agent_py_plays(tmp_path: Path) -> None:
         def reset(self, seed: int) -> None:
             self.seed = seed
 
-    policy = load("agent:Partner", tmp_path, module(Partner=Partner), 5, player="player_3")
+    policy = load("agent:Partner", tmp_path, agent_module(Partner=Partner), 5, player="player_3")
     policy.reset(12)
     assert policy.act(1, {"more": 3}, None) == 4
     assert policy.description() == {"kind": "policy", "policy": "agent:Partner"}
@@ -93,7 +93,7 @@ def test_a_class_of_agent_py_may_take_the_mask_and_need_nothing_else(tmp_path: P
         def act(self, _observation: Any, _info: Any, mask: Any) -> int:
             return list(mask).index(True)
 
-    policy = load("agent:Partner", tmp_path, module(Partner=Partner), 3)
+    policy = load("agent:Partner", tmp_path, agent_module(Partner=Partner), 3)
     policy.reset(1)
     policy.close()
     assert policy.act(None, {}, (False, True, True)) == 1
@@ -116,13 +116,13 @@ def test_a_class_that_returns_no_legal_action_is_refused(tmp_path: Path, action:
         def act(self, _observation: Any, _info: Any) -> Any:
             return action
 
-    policy = load("agent:Partner", tmp_path, module(Partner=Partner), 3)
+    policy = load("agent:Partner", tmp_path, agent_module(Partner=Partner), 3)
     with pytest.raises(PolicyError, match="act") as refused:
         policy.act(None, {}, (True, False, True))
     assert str(refused.value) == said
 
 
-def test_a_class_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
+def test_the_error_about_a_missing_class_names_those_that_there_are(tmp_path: Path) -> None:
     class Helper:
         def act(self) -> None: ...
 
@@ -131,7 +131,7 @@ def test_a_class_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
     class Few:
         def act(self, observation: Any) -> int: ...
 
-    agent = module(Helper=Helper, Other=Other, Few=Few)
+    agent = agent_module(Helper=Helper, Other=Other, Few=Few)
     for spec, where, said in (
         ("agent:Partner", agent, "there is no class Partner in agent.py; classes with act() there: Helper, Few"),
         ("agent:Other", agent, "class Other in agent.py has no act(observation, info)"),
@@ -143,7 +143,7 @@ def test_a_class_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) 
         assert str(refused.value) == said
 
 
-def test_what_is_no_player_is_refused(tmp_path: Path) -> None:
+def test_an_entry_that_is_no_player_is_refused(tmp_path: Path) -> None:
     assert refusal("robot", tmp_path).startswith("'robot' is no player; write human, random, idle, agent:Class")
 
 
@@ -155,18 +155,18 @@ WEIGHTS = [[1, 0, -1], [0, 2, 0]]
 
 def test_a_file_takes_the_action_with_the_highest_value(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "policies/p.onnx", WEIGHTS)
-    policy = made("policies/p.onnx", tmp_path)
+    policy = load_policy("policies/p.onnx", tmp_path)
     assert [policy.act(seen, {}, None) for seen in ([1, 0], [0, 1], [-1, 0], (2, 1.5))] == [0, 1, 2, 1]
 
 
 def test_a_mask_leaves_the_best_of_the_legal_actions(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
-    assert made("p.onnx", tmp_path).act([0, 1], {}, (True, False, True)) == 0
+    assert load_policy("p.onnx", tmp_path).act([0, 1], {}, (True, False, True)) == 0
 
 
 def test_sample_draws_by_the_softmax_and_repeats_itself_after_the_same_seed(tmp_path: Path) -> None:
     onnx_files.constant(tmp_path / "p.onnx", np.log(np.array([[0.7, 0.2, 0.1]], np.float32)))
-    policy, runs = made("sample:p.onnx", tmp_path), []
+    policy, runs = load_policy("sample:p.onnx", tmp_path), []
     for seed in (3, 3, 4):
         policy.reset(seed)
         runs.append([policy.act([0, 0], {}, None) for _ in range(2_000)])
@@ -180,7 +180,7 @@ def test_the_description_names_the_file_and_its_hash(tmp_path: Path) -> None:
     import hashlib
 
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-    assert made("p.onnx", tmp_path).description() == {"kind": "policy", "policy": "p.onnx", "sha256": sha256}
+    assert load_policy("p.onnx", tmp_path).description() == {"kind": "policy", "policy": "p.onnx", "sha256": sha256}
 
 
 @pytest.mark.parametrize(
@@ -202,14 +202,14 @@ def test_observations_become_the_numbers_that_the_file_takes(
     if seen is None:
         assert "the environment gives one number" in refusal("p.onnx", tmp_path, space=space)
     else:
-        assert made("p.onnx", tmp_path, space=space).act(seen, {}, None) == action
+        assert load_policy("p.onnx", tmp_path, space=space).act(seen, {}, None) == action
 
 
 def test_images_may_have_their_channels_first(tmp_path: Path) -> None:
     weights = np.zeros((2 * 3 * 4, 2), np.float32)
     weights[0, 0] = weights[12, 1] = 1  # of channel 0 and of channel 1, at the same place
     onnx_files.linear(tmp_path / "p.onnx", weights, shape=("batch", 2, 3, 4))
-    policy = made("p.onnx", tmp_path, 2, Box(0, 255, (3, 4, 2), np.uint8))
+    policy = load_policy("p.onnx", tmp_path, 2, Box(0, 255, (3, 4, 2), np.uint8))
     picture = np.zeros((3, 4, 2), np.uint8)
     picture[0, 0, 1] = 5
     assert policy.act(picture, {}, None) == 1
@@ -218,13 +218,13 @@ def test_images_may_have_their_channels_first(tmp_path: Path) -> None:
 def test_parts_of_an_observation_go_to_the_inputs_of_their_names(tmp_path: Path) -> None:
     nodes = [helper.make_node("Concat", ["left", "right"], ["output"], axis=1)]
     onnx_files.save(tmp_path / "p.onnx", nodes, [("left", (1, 1)), ("right", (1, 2))], [("output", (1, 3))])
-    policy = made("p.onnx", tmp_path, 3, Dict(right=Box(0, 9, (2,)), left=Box(0, 9, (1,))))
+    policy = load_policy("p.onnx", tmp_path, 3, Dict(right=Box(0, 9, (2,)), left=Box(0, 9, (1,))))
     assert policy.act({"left": [1], "right": [0, 4]}, {}, None) == 2
 
 
-def test_a_file_that_chooses_the_action_itself(tmp_path: Path) -> None:
+def test_a_file_may_choose_the_action_itself(tmp_path: Path) -> None:
     onnx_files.constant(tmp_path / "p.onnx", np.array([2], np.int64), dtype=TensorProto.INT64)
-    policy = made("p.onnx", tmp_path)
+    policy = load_policy("p.onnx", tmp_path)
     assert policy.act([0, 0], {}, None) == 2
     with pytest.raises(PolicyError, match="returned action 2, which action_mask forbids now"):
         policy.act([0, 0], {}, (True, True, False))
@@ -246,15 +246,15 @@ def test_a_file_that_chooses_the_action_itself(tmp_path: Path) -> None:
 def test_a_recurrent_file_remembers_until_the_next_episode(tmp_path: Path, state: Any, seq_lens: Any) -> None:
     """`state_in_0` and `state_ins` are RLlib's; an older one calls a second state `seq_lens`, and its output a number."""
     onnx_files.counter(tmp_path / "p.onnx", state=state, seq_lens=seq_lens)
-    policy = made("p.onnx", tmp_path)
+    policy = load_policy("p.onnx", tmp_path)
     policy.reset(1)
     first = [policy.act([0, 0], {}, None) for _ in range(4)]
     policy.reset(1)
     assert (first, policy.act([0, 0], {}, None)) == ([0, 1, 2, 2], 0)
 
 
-def test_what_rllib_exports_of_a_policy_without_state(tmp_path: Path) -> None:
-    """It has an input `state_ins` of one number that nothing depends on."""
+def test_a_policy_without_state_that_rllib_exported_plays(tmp_path: Path) -> None:
+    """It has an input `state_ins` of one number, on which the actions do not depend."""
     nodes = [
         helper.make_node("MatMul", ["obs", "w"], ["output"]),
         helper.make_node("Identity", ["state_ins"], ["state_outs"]),
@@ -266,19 +266,19 @@ def test_what_rllib_exports_of_a_policy_without_state(tmp_path: Path) -> None:
         [("output", ("batch_size", 3)), ("state_outs", ("batch_size",))],
         {"w": np.array(WEIGHTS, np.float32)},
     )
-    assert made("p.onnx", tmp_path).act([0, 1], {}, None) == 1
+    assert load_policy("p.onnx", tmp_path).act([0, 1], {}, None) == 1
 
 
 # ---- files that cannot be used
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     assert refusal("policies/x.onnx", tmp_path) == "there is no file policies/x.onnx"
     onnx_files.linear(tmp_path / "policies/p.onnx", WEIGHTS)
     assert refusal("policies/x.onnx", tmp_path) == "there is no file policies/x.onnx; there are policies/p.onnx"
 
 
-def test_a_file_elsewhere_is_not_read(tmp_path: Path) -> None:
+def test_a_file_outside_of_the_project_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     (tmp_path / "project").mkdir()
     (tmp_path / "project/link.onnx").symlink_to(tmp_path / "p.onnx")
@@ -287,12 +287,12 @@ def test_a_file_elsewhere_is_not_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"no ONNX", b"\x08\x07" * 40, b"\0" * 1000])
-def test_a_file_that_is_no_onnx(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "p.onnx").write_bytes(content)
     assert refusal("p.onnx", tmp_path).startswith("p.onnx is no ONNX file that onnxruntime can read: ")
 
 
-def test_observations_of_another_size(tmp_path: Path) -> None:
+def test_a_file_for_observations_of_another_size_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     assert refusal("p.onnx", tmp_path, space=Box(-1, 1, (16,))) == (
         "p.onnx takes observations of 2 numbers (its input 'obs'); the environment gives 16 numbers"
@@ -320,12 +320,12 @@ def test_several_discrete_numbers_are_one_hot_one_after_the_other(tmp_path: Path
     weights = np.zeros((1_000_003, 3))
     weights[999_999, 2] = weights[1_000_001, 1] = 1
     onnx_files.linear(tmp_path / "p.onnx", weights)
-    policy = made("p.onnx", tmp_path, space=MultiDiscrete([1_000_000, 3]))
+    policy = load_policy("p.onnx", tmp_path, space=MultiDiscrete([1_000_000, 3]))
     assert policy.act(np.array([999_999, 0]), {}, None) == 2
     assert policy.act(np.array([0, 1]), {}, None) == 1
 
 
-def test_an_observation_that_needs_more_memory_than_there_is(tmp_path: Path) -> None:
+def test_an_observation_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", np.ones((12, 3)))
     endless = types.SimpleNamespace(shape=(10**15,), dtype=np.float32)
     assert refusal("p.onnx", tmp_path, space=endless) == (
@@ -333,21 +333,21 @@ def test_an_observation_that_needs_more_memory_than_there_is(tmp_path: Path) -> 
     )
 
 
-def test_an_observation_that_holds_itself_is_a_sentence(tmp_path: Path) -> None:
+def test_an_observation_that_contains_itself_gets_a_sentence(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
     loop: dict[str, Any] = {}
     loop["in"] = loop
     with pytest.raises(PolicyError, match=r"^p\.onnx takes no observation that contains itself$"):
-        made("p.onnx", tmp_path).act(loop, {}, None)
+        load_policy("p.onnx", tmp_path).act(loop, {}, None)
 
 
-def test_an_observation_that_is_no_numbers_is_a_sentence(tmp_path: Path) -> None:
+def test_an_observation_without_numbers_gets_a_sentence(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
     around: list[Any] = []
     around.append(around)
     for seen in ({"in": around}, {"in": "left"}, {"in": object()}):
         with pytest.raises(PolicyError, match=r"^p\.onnx takes an observation of numbers, and this is none: "):
-            made("p.onnx", tmp_path).act(seen, {}, None)
+            load_policy("p.onnx", tmp_path).act(seen, {}, None)
 
 
 def test_a_file_of_a_fixed_batch_says_how_to_export_it(tmp_path: Path) -> None:
@@ -359,30 +359,30 @@ def test_a_file_of_a_fixed_batch_says_how_to_export_it(tmp_path: Path) -> None:
     assert "batch" not in refusal("p.onnx", tmp_path, space=Box(-1, 1, (16,)))
 
 
-def test_another_number_of_actions(tmp_path: Path) -> None:
+def test_a_file_for_another_number_of_actions_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     assert refusal("p.onnx", tmp_path, 6) == "p.onnx returns 3 numbers as 'output'; expected 6, one for each action"
 
 
-def test_an_action_that_there_is_not(tmp_path: Path) -> None:
+def test_an_action_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     onnx_files.constant(tmp_path / "p.onnx", np.array([7], np.int64), dtype=TensorProto.INT64)
     assert refusal("p.onnx", tmp_path) == "p.onnx returned action 7; there are 0 to 2"
 
 
-def test_values_that_are_no_numbers(tmp_path: Path) -> None:
+def test_values_of_nan_are_refused(tmp_path: Path) -> None:
     onnx_files.constant(tmp_path / "p.onnx", np.array([[0, np.nan, 1]], np.float32))
     assert refusal("p.onnx", tmp_path) == "p.onnx returned NaN instead of the actions' values"
 
 
-def test_values_of_infinity_are_drawn_from_too(tmp_path: Path) -> None:
+def test_actions_are_also_drawn_from_infinite_values(tmp_path: Path) -> None:
     """A policy that masks actions itself gives them minus infinity."""
     onnx_files.constant(tmp_path / "p.onnx", np.array([[-np.inf, -np.inf, 1]], np.float32))
-    policy = made("sample:p.onnx", tmp_path)
+    policy = load_policy("sample:p.onnx", tmp_path)
     assert {policy.act([0, 0], {}, mask) for mask in (None, (True, False, True))} == {2}
     assert policy.act([0, 0], {}, (True, True, False)) in (0, 1)
 
 
-def test_an_input_that_nothing_is_known_of(tmp_path: Path) -> None:
+def test_an_unknown_input_is_refused(tmp_path: Path) -> None:
     nodes = [helper.make_node("Add", ["obs", "speed"], ["output"])]
     onnx_files.save(tmp_path / "p.onnx", nodes, [("obs", (1, 3)), ("speed", (1, 3))], [("output", (1, 3))])
     assert refusal("p.onnx", tmp_path, space=Box(0, 1, (3,))) == (
@@ -390,7 +390,7 @@ def test_an_input_that_nothing_is_known_of(tmp_path: Path) -> None:
     )
 
 
-def test_without_onnxruntime_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_onnxruntime_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
     wanted = next(
@@ -405,8 +405,8 @@ def test_without_onnxruntime_it_says_what_to_install(tmp_path: Path, monkeypatch
 # ---- the thread
 
 
-class Scripted:
-    """A policy that does what each observation says."""
+class PolicyByObservation:
+    """A policy that takes the action that its observation names, or calls it."""
 
     def __init__(self) -> None:
         self.seeds: list[int] = []
@@ -431,9 +431,9 @@ class Scripted:
         return {}
 
 
-def played(script: Any) -> tuple[Scripted, list[Any]]:
+def run_script(script: Any) -> tuple[PolicyByObservation, list[Any]]:
     """Run `script(thread, answers)` on an event loop."""
-    policy, answers = Scripted(), []
+    policy, answers = PolicyByObservation(), []
 
     async def run() -> None:
         thread = PolicyThread(policy, lambda *answer: answers.append(answer), name="policy player_1")
@@ -462,7 +462,7 @@ def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() -> None:
             thread.ask(number, number, {}, None)
         await until(lambda: len(answers) == 3)
 
-    policy, answers = played(script)
+    policy, answers = run_script(script)
     assert answers == [(0, 0, None), (1, 1, None), (2, 2, None)]
     assert (policy.seeds, policy.threads, len(loops)) == ([5], {"policy player_1"}, 3)
     assert policy.closed.wait(10)
@@ -484,12 +484,12 @@ def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
         thread.ask(1, 1, {}, None)
         await until(lambda: told)
 
-    policy, answers = played(script)
+    policy, answers = run_script(script)
     assert policy.closed.wait(10)
     assert answers == []
 
 
-def test_a_policy_that_raises_or_ends_python_is_an_answer_too() -> None:
+def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
     def end() -> None:
         raise SystemExit(3)
 
@@ -499,7 +499,7 @@ def test_a_policy_that_raises_or_ends_python_is_an_answer_too() -> None:
         thread.ask(3, 7, {}, None)
         await until(lambda: len(answers) == 3)
 
-    _, answers = played(script)
+    _, answers = run_script(script)
     assert [(ask, action, repr(error)) for ask, action, error in answers] == [
         (1, None, "ZeroDivisionError('division by zero')"),
         (2, None, "RuntimeError('SystemExit(3)')"),
@@ -507,7 +507,7 @@ def test_a_policy_that_raises_or_ends_python_is_an_answer_too() -> None:
     ]
 
 
-def test_a_reset_that_fails_is_the_answer_until_the_next() -> None:
+def test_a_failed_reset_is_the_answer_until_the_next_reset() -> None:
     async def script(thread: PolicyThread, answers: list[Any]) -> None:
         thread.reset(-1)
         thread.ask(1, 1, {}, None)
@@ -515,7 +515,7 @@ def test_a_reset_that_fails_is_the_answer_until_the_next() -> None:
         thread.ask(2, 1, {}, None)
         await until(lambda: len(answers) == 2)
 
-    _, answers = played(script)
+    _, answers = run_script(script)
     assert [(ask, action, str(error)) for ask, action, error in answers] == [(1, None, "no such seed"), (2, 1, "None")]
 
 
@@ -533,7 +533,7 @@ def test_a_policy_that_hangs_holds_up_nothing_but_its_answers() -> None:
         await asyncio.to_thread(thread._thread.join, 10)
         await asyncio.sleep(0)
 
-    policy, answers = played(script)
+    policy, answers = run_script(script)
     assert answers == [], "nothing is told after close"
     assert policy.closed.is_set()
 

@@ -1,4 +1,4 @@
-"""What is written outlives a power cut, and nothing is lost when the system takes only a part of it."""
+"""Files outlive a power cut, and no bytes are lost when the system writes only a part of them."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from trial.recordings.store import FolderStore
 ROOT = Path(__file__).resolve().parents[3]
 
 
-class Stingy(io.FileIO):
-    """A file that takes as many bytes at once as `takes` says, then fails once, as a disk that is full for a moment."""
+class PartialFile(io.FileIO):
+    """A file that writes at once as many bytes as `takes` says; at 0 it fails, as a disk that is full for a moment."""
 
     takes: list[int]
 
@@ -41,19 +41,19 @@ def test_a_short_write_loses_nothing(takes: list[int], flushes: list[bool], tmp_
     path = tmp_path_factory.mktemp("recording") / "r.part"
     kept = Recording(path, "r")
     kept._file.close()
-    kept._file = Stingy(path, "w")  # type: ignore[assignment]
+    kept._file = PartialFile(path, "w")  # type: ignore[assignment]
     kept._file.takes = list(takes)
     for number, flush in enumerate(flushes):
         kept.add(line("step", step=number))
         if flush:
-            _again(kept.flush)
-    _again(kept.close)
+            _until_it_works(kept.flush)
+    _until_it_works(kept.close)
     lines = gzip.decompress(path.read_bytes()).splitlines()
     assert len(lines) == len(flushes)
 
 
-def _again(act: Any) -> None:
-    """As the trial does: until it works."""
+def _until_it_works(act: Any) -> None:
+    """Call it until it works, as the trial does."""
     while True:
         try:
             return act()
@@ -61,8 +61,8 @@ def _again(act: Any) -> None:
             continue
 
 
-def test_files_of_a_trial_are_its_owners_alone(tmp_path: Path) -> None:
-    """What the program does first, in a process of its own, and what the agent's programs write."""
+def test_only_their_owner_may_read_the_files_of_a_trial(tmp_path: Path) -> None:
+    """`main` sets the permissions first. They also hold for files that the agent's own programs write."""
     program = (
         "import os, subprocess, sys; from trial.__main__ import main; code = main()\n"
         "from trial.recordings.store import FolderStore; FolderStore(__import__('pathlib').Path(sys.argv[1])).create('a/b', b'')\n"
@@ -91,7 +91,7 @@ def spool(folder: Path, *, keep: bool) -> Spool:
 
 
 @pytest.mark.parametrize("keep", [True, False], ids=["kept in the spool", "stored in the same folder"])
-def test_a_recording_that_is_finished_keeps_its_name_to_itself(tmp_path: Path, keep: bool) -> None:
+def test_a_recording_never_takes_the_name_of_a_finished_one(tmp_path: Path, keep: bool) -> None:
     first = spool(tmp_path, keep=keep).open("p/3-trial.jsonl.gz")
     first.close()
     first.path.rename(first.path.with_suffix(""))
@@ -102,7 +102,7 @@ def test_a_recording_that_is_finished_keeps_its_name_to_itself(tmp_path: Path, k
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["3-trial-2.jsonl.gz", "3-trial.jsonl.gz"]
 
 
-def test_a_recording_that_is_on_is_synced_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_open_recording_is_synced_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
     clock = [0.0]
     fsync = os.fsync

@@ -64,7 +64,7 @@ def test_a_game_of_several_can_be_repeated_from_its_recording_alone(
 
 @settings(max_examples=examples(80))
 @given(section=SECTIONS, before=st.lists(DEEDS, min_size=10, max_size=40), after=st.lists(DEEDS, min_size=20))
-def test_so_can_one_that_another_server_went_on_with(
+def test_a_game_that_another_server_went_on_with_can_be_repeated_from_its_recording(
     tmp_path_factory: pytest.TempPathFactory, section: dict[str, Any], before: list[Any], after: list[Any]
 ) -> None:
     folder = tmp_path_factory.getbasetemp()

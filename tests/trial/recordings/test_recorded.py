@@ -1,4 +1,4 @@
-"""What is recalled of earlier servers, line by line, and what a recording makes of odd values; no server runs here."""
+"""How the lines of earlier servers are read, and how unusual values are recorded; no server runs here."""
 
 import gzip
 import json
@@ -29,14 +29,14 @@ def end(why="terminated", episode=1, **more):
     return {"kind": "end", "episode": episode, "why": why, **more}
 
 
-def folded(*lines, past=None):
+def recorded_trial(*lines, past=None):
     past = past or RecordedTrial()
     add_lines(past, lines)
     return past
 
 
 def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
-    past = folded(header(), reset(), step(1.5, human=3), step(None), step(2))
+    past = recorded_trial(header(), reset(), step(1.5, human=3), step(None), step(2))
     assert past == RecordedTrial(
         ended=[],
         unfinished=UnfinishedEpisode(
@@ -48,40 +48,40 @@ def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
 
 
 def test_episodes_that_ended_are_counted_and_the_next_one_goes_on():
-    past = folded(header(), reset(), step(), step(), end(), reset(2, 8), step(5.0, 2))
+    past = recorded_trial(header(), reset(), step(), step(), end(), reset(2, 8), step(5.0, 2))
     assert past.ended == [Episode(1, 2, 2.0, "terminated")]
     assert past.unfinished == UnfinishedEpisode(2, 8, [RecordedStep(None, 2, 5.0)])
 
 
 @pytest.mark.parametrize("rate", [0, "x", None])
 def test_a_header_without_a_frame_rate_counts_thirty_frames_a_second(rate):
-    assert folded(header(rate), reset(), step()).seconds == pytest.approx(1 / 30)
-    assert folded(reset(), step()).seconds == pytest.approx(1 / 30)
+    assert recorded_trial(header(rate), reset(), step()).seconds == pytest.approx(1 / 30)
+    assert recorded_trial(reset(), step()).seconds == pytest.approx(1 / 30)
 
 
 def test_a_server_that_was_shut_down_leaves_its_episode_unfinished():
-    past = folded(reset(), step(), end("shutdown"))
+    past = recorded_trial(reset(), step(), end("shutdown"))
     assert past.ended == []
     assert len(past.unfinished.steps) == 1
 
 
 def test_a_resume_drops_the_steps_that_were_not_played_again():
     lines = [reset(), step(1), step(2), step(3), {"kind": "resume", "episode": 1, "steps": 1}, step(9)]
-    assert [each.reward for each in folded(*lines).unfinished.steps] == [1, 9]
+    assert [each.reward for each in recorded_trial(*lines).unfinished.steps] == [1, 9]
     lines[4]["steps"] = -1
-    assert [each.reward for each in folded(*lines).unfinished.steps] == [9]
+    assert [each.reward for each in recorded_trial(*lines).unfinished.steps] == [9]
 
 
 def test_a_reset_begins_the_episode_anew():
-    assert folded(reset(), step(), reset(1, 9)).unfinished == UnfinishedEpisode(1, 9)
+    assert recorded_trial(reset(), step(), reset(1, 9)).unfinished == UnfinishedEpisode(1, 9)
 
 
 def test_feedback_is_kept_with_the_step_that_heard_it():
     said = [{"command": "good"}, {"command": "start"}, {"action": "up"}, {"command": "bad"}]
-    past = folded(reset(), step(messages=said), end("shutdown", messages=said[:1]))
+    past = recorded_trial(reset(), step(messages=said), end("shutdown", messages=said[:1]))
     assert past.unfinished.steps == [RecordedStep(None, 2, 1.0, (Word("good"), Word("bad")))]
     assert past.unfinished.unheard == [Word("good")]
-    assert folded(step(), past=past).unfinished.unheard == [], "the next step's agent has heard it"
+    assert recorded_trial(step(), past=past).unfinished.unheard == [], "the next step's agent has heard it"
 
 
 @pytest.mark.parametrize(
@@ -103,27 +103,29 @@ def test_feedback_is_kept_with_the_step_that_heard_it():
     ],
 )
 def test_a_line_that_makes_no_sense_changes_nothing(line):
-    assert folded(reset(), step(), line) == folded(reset(), step())
-    assert folded(line).ended == []
+    assert recorded_trial(reset(), step(), line) == recorded_trial(reset(), step())
+    assert recorded_trial(line).ended == []
 
 
 @pytest.mark.parametrize("why", ["terminated", "truncated"])
 def test_an_episode_is_over_with_its_last_step_even_if_its_end_was_not_written(why):
-    past = folded(reset(), step(), step(2.0, **{why: True}))
+    past = recorded_trial(reset(), step(), step(2.0, **{why: True}))
     assert (past.ended, past.unfinished) == ([Episode(1, 2, 3.0, why)], None)
-    assert folded(end(), past=past).ended == [Episode(1, 2, 3.0, why)], "its end, if it comes, is not a second one"
+    assert recorded_trial(end(), past=past).ended == [Episode(1, 2, 3.0, why)], (
+        "its end, if it comes, is not a second one"
+    )
 
 
 def test_a_stop_in_the_break_after_an_episode_ends_the_trial():
     def after_a_break(why, number=1):
-        return folded(reset(), step(), end(), {"kind": "break", "episode": number, "why": why}).ended[0].why
+        return recorded_trial(reset(), step(), end(), {"kind": "break", "episode": number, "why": why}).ended[0].why
 
     assert after_a_break("stop") == "stopped"
     assert after_a_break("over") == after_a_break("stop", number=2) == "terminated"
-    assert folded({"kind": "break", "episode": 1, "why": "stop"}).ended == []
+    assert recorded_trial({"kind": "break", "episode": 1, "why": "stop"}).ended == []
 
 
-class Kept:
+class MemoryStore:
     """A store in memory."""
 
     def __init__(self, **files):
@@ -139,7 +141,7 @@ class Kept:
 
 
 def test_the_recordings_of_all_servers_before_this_one_are_read_in_their_order():
-    store = Kept(
+    store = MemoryStore(
         **{
             "f/s-1/3-trial.jsonl.gz": [reset(), step(), end("shutdown")],
             "f/s-2/3-episode-0001.jsonl.gz": [{"kind": "resume", "episode": 1, "steps": 1}, step(2), end()],
@@ -162,7 +164,7 @@ def test_the_recordings_of_all_servers_before_this_one_are_read_in_their_order()
 
 
 def test_episodes_of_a_server_after_a_finished_one_begin_with_the_next_number():
-    store = Kept(
+    store = MemoryStore(
         **{
             "f/s-1/3-trial.jsonl.gz": [reset(), step(), end()],
             "f/s-2/3-episode-0002.jsonl.gz": [reset(2), step(4, 2)],
@@ -173,17 +175,17 @@ def test_episodes_of_a_server_after_a_finished_one_begin_with_the_next_number():
 
 @pytest.mark.parametrize("server", ["s-1", "s-2", "s", "s-", "s-1000", "-1", "local"])
 def test_without_an_earlier_recording_there_is_no_past(server):
-    assert load_recorded(Kept(), "f", server, "3") is None
+    assert load_recorded(MemoryStore(), "f", server, "3") is None
 
 
 def test_a_recording_without_lines_is_a_past_all_the_same():
-    assert load_recorded(Kept(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == RecordedTrial()
+    assert load_recorded(MemoryStore(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == RecordedTrial()
 
 
 # ---- values in recordings
 
 
-class Odd:
+class LongText:
     def __str__(self):
         return "o" * 2000
 
@@ -208,7 +210,7 @@ class Odd:
         ({1: {"a": (1, 2)}}, {"1": {"a": [1, 2]}}),
         (frozenset({1}), [1]),
         (b"\xff", "/w=="),
-        (Odd(), "o" * 1000),
+        (LongText(), "o" * 1000),
         (np.array(["x" * 2000]), f"['{'x' * 998}"),
     ],
 )
@@ -217,8 +219,8 @@ def test_a_value_is_kept_as_json_can_hold_it(value, kept):
     assert json.loads(recording.line("step", value=value)) == {"kind": "step", "value": kept}
 
 
-class Hostile(dict[str, int]):
-    """Raises whatever is asked of it."""
+class Raising(dict[str, int]):
+    """A dict that raises when its items or its text are read."""
 
     def items(self):
         raise RuntimeError("no items")
@@ -227,7 +229,7 @@ class Hostile(dict[str, int]):
         raise RuntimeError("no text")
 
 
-class Mute:
+class WithoutText:
     def __repr__(self):
         raise RuntimeError("no text")
 
@@ -235,9 +237,9 @@ class Mute:
 @pytest.mark.parametrize(
     ("value", "kept"),
     [
-        ({"a": Mute(), "b": 1}, {"a": "<Mute>", "b": 1}),
-        ({Mute(): 1}, {"<Mute>": 1}),
-        ([Hostile(a=1), 2], ["<Hostile>", 2]),
+        ({"a": WithoutText(), "b": 1}, {"a": "<WithoutText>", "b": 1}),
+        ({WithoutText(): 1}, {"<WithoutText>": 1}),
+        ([Raising(a=1), 2], ["<Raising>", 2]),
         ({"big": 2**20_000}, {"big": "<int of 20001 bits>"}),
         (np.array([1.5, float("nan")], np.float32), [1.5, None]),
         (np.longdouble("nan"), None),
@@ -267,7 +269,7 @@ def test_objects_that_lead_to_each_other_do_not_hold_up_a_step():
 
 
 @pytest.mark.timeout(60)
-def test_a_value_without_end_is_cut_off():
+def test_a_value_of_endless_length_is_replaced_by_its_size():
     many = [[]]
     for _ in range(18):
         many = [many] * 6  # 6 ** 18 values
@@ -325,7 +327,7 @@ def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_t
     assert recording.packages(tmp_path / "image") == names
 
 
-def test_the_versions_of_what_plays_are_told():
+def test_the_versions_include_the_trial_python_and_its_packages():
     assert {"trial", "python", "gymnasium", "numpy", "websockets"} <= recording.versions().keys()
 
 

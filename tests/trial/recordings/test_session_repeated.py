@@ -23,7 +23,7 @@ PLACES = {"P1": "me", "P2": "it"}
 
 
 class Game(repeated.Game):
-    """Two members play `me` and `it`; a policy plays for who is away for half a second."""
+    """Two members play `me` and `it`; a policy plays for a member who is away for half a second."""
 
     PLAYS: ClassVar[Mapping[str, str]] = {"me": "human", "it": "human", "dice": "random"}
     SECTION: ClassVar[Mapping[str, Any]] = {
@@ -31,7 +31,7 @@ class Game(repeated.Game):
         "absent": 0.5, "countdown": 0.2, "ui": dict.fromkeys(("start", "pause", "reset", "up", "right", "good"), True),
     }  # fmt: skip
 
-    def told(self, section: Mapping[str, Any]) -> TrialSettings:
+    def make_settings(self, section: Mapping[str, Any]) -> TrialSettings:
         members = tuple(Member(human, None, seat) for seat, human in enumerate(PLACES))
         return replace(repeated.settings_of(section, SESSION="s." + "0" * 20), members=members, players=2)
 

@@ -19,8 +19,8 @@ FOLDER = "study/users/P1"
 ANSWER = f"{FOLDER}/answers/3.json"
 
 
-class Opened(NamedTuple):
-    """A store, a recording's key, and what lies in the place itself: a server may not read what it has recorded."""
+class OpenedStore(NamedTuple):
+    """A store, a recording's key, and a function that reads stored bytes: a server may not read its own recordings."""
 
     store: Store
     recording: str
@@ -28,20 +28,20 @@ class Opened(NamedTuple):
 
 
 @pytest.fixture(params=["folder", "presigned"])
-def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Opened]:
+def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[OpenedStore]:
     with StrictS3().serving() as bucket:
         project, now = study(id="study"), bucket.now()
         record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="t", nonce="n")
         recording = f"{FOLDER}/trials/{record.name}/3-episode-0001.jsonl.gz"
         if request.param == "folder":
-            yield Opened(open_store(str(tmp_path)), recording, lambda key: (tmp_path / key).read_bytes())
+            yield OpenedStore(open_store(str(tmp_path)), recording, lambda key: (tmp_path / key).read_bytes())
             return
         told = bucket.variables(bucket.keep(record))
         store = open_store(told["STORE"], told["SERVER"], told["CREDENTIAL"])
-        yield Opened(store, recording, lambda key: bucket.documents.kept[key][0])
+        yield OpenedStore(store, recording, lambda key: bucket.documents.kept[key][0])
 
 
-def test_what_is_created_can_be_read(opened: Opened, tmp_path: Path) -> None:
+def test_what_is_created_can_be_read(opened: OpenedStore, tmp_path: Path) -> None:
     store = opened.store
     assert store.get(ANSWER) is None
     assert store.create(ANSWER, b"{}") is True
@@ -52,7 +52,7 @@ def test_what_is_created_can_be_read(opened: Opened, tmp_path: Path) -> None:
     assert gzip.decompress(opened.kept(opened.recording)) == b"lines"
 
 
-def test_nothing_is_overwritten(opened: Opened) -> None:
+def test_nothing_is_overwritten(opened: OpenedStore) -> None:
     assert opened.store.create(ANSWER, b"first") is True
     assert opened.store.create(ANSWER, b"second") is False
     assert opened.store.get(ANSWER) == b"first"

@@ -3,7 +3,7 @@
 from trial.server.watchdog import Watchdog
 
 
-def test_watchdog():
+def test_the_watchdog_ends_a_server_by_idle_time_grace_or_deadline():
     dog = Watchdog(now=0, idle=10, grace=60, deadline=1000)
     assert dog.verdict(9) is None
     assert dog.verdict(10) == "idle"

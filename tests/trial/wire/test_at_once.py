@@ -58,7 +58,7 @@ async def linked() -> AsyncIterator[tuple[Connection, Any]]:
         yield await made.get(), client
 
 
-def talked(talk: Callable[[Connection, Any], Coroutine[Any, Any, None]]) -> None:
+def talk_over_a_connection(talk: Callable[[Connection, Any], Coroutine[Any, Any, None]]) -> None:
     async def within() -> None:
         async with asyncio.timeout(20), linked() as (connection, client):
             await talk(connection, client)
@@ -73,7 +73,7 @@ def test_a_picture_is_written_before_the_event_that_shows_it_is_over() -> None:
         assert connection.window.newest == 1, "no task had to wake up"
         assert np.array_equal(Decoder().decode(await client.recv())[1], picture(7))
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def test_a_message_of_the_same_event_goes_first() -> None:
@@ -84,10 +84,10 @@ def test_a_message_of_the_same_event_goes_first() -> None:
         assert await client.recv() == "state"
         assert Decoder().decode(await client.recv())[0] == 1
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
-def test_of_pictures_for_a_socket_that_is_full_the_newest_is_sent() -> None:
+def test_after_a_full_socket_the_newest_picture_is_sent() -> None:
     async def talk(connection: Connection, client: Any) -> None:
         for end, option in ((connection.websocket, socket.SO_SNDBUF), (client, socket.SO_RCVBUF)):
             # The kernel's own limits differ: some machines take 50 MB before a socket is full.
@@ -106,7 +106,7 @@ def test_of_pictures_for_a_socket_that_is_full_the_newest_is_sent() -> None:
             if seen > sent:
                 assert seen == 199, "a picture that is old by now is dropped"
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def test_a_picture_that_cannot_be_packed_ends_its_connection_alone(caplog: pytest.LogCaptureFixture) -> None:
@@ -115,11 +115,11 @@ def test_a_picture_that_cannot_be_packed_ends_its_connection_alone(caplog: pytes
         connection.send_now()
         await client.wait_closed()
 
-    talked(talk)
+    talk_over_a_connection(talk)
     assert "a picture cannot be sent" in caplog.text
 
 
-def test_an_acknowledgement_is_heard_as_it_comes_and_the_rest_is_left() -> None:
+def test_an_acknowledgement_is_read_as_it_comes_and_other_messages_are_left_to_the_parser() -> None:
     async def talk(connection: Connection, client: Any) -> None:
         connection.hear_acknowledgements(Inbound(connection.window))
         connection.put_picture(picture(7), 1)
@@ -131,7 +131,7 @@ def test_an_acknowledgement_is_heard_as_it_comes_and_the_rest_is_left() -> None:
         assert left == others
         assert connection.window.acknowledging
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,7 +146,7 @@ def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest
         assert connection.window.acknowledging
         assert parsed == [of_no_frame]
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes:
@@ -154,7 +154,7 @@ def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes
     return RawFrame(opcode, said.encode(), fin=last).serialize(mask=True)
 
 
-def test_acknowledgements_are_heard_however_the_network_cuts_them() -> None:
+def test_acknowledgements_are_read_however_the_network_cuts_them() -> None:
     said = [text('{"ack": 1}'), text('{"ack": 2}'), text("other"), text('{"ack": 3}')]
     whole = b"".join(said)
 
@@ -174,7 +174,7 @@ def test_acknowledgements_are_heard_however_the_network_cuts_them() -> None:
             connection.websocket.data_received(part)
         assert (heard, await connection.websocket.recv()) == ([1, 2, 3], "other")
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_acknowledgements_are_heard_however_the_network_cuts_them() -> None:
     ],
     ids=["within a message of several parts", "after the close"],  # masks are random
 )
-def test_what_comes_where_no_message_may_come_is_not_heard(before: bytes, code: int) -> None:
+def test_an_acknowledgement_where_no_message_may_come_is_not_read(before: bytes, code: int) -> None:
     async def talk(connection: Connection, client: Any) -> None:
         heard: list[int] = []
         connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
@@ -197,10 +197,10 @@ def test_what_comes_where_no_message_may_come_is_not_heard(before: bytes, code: 
         await client.wait_closed()
         assert client.close_code == code
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
-def test_what_looks_like_an_acknowledgement_within_another_message_is_not_heard() -> None:
+def test_bytes_like_an_acknowledgement_within_another_message_are_not_read() -> None:
     inner = text('{"ack": 1}')
     header = bytes((0x82, 0x80 | len(inner), 0, 0, 0, 0))  # binary, masked by zeros
 
@@ -215,7 +215,7 @@ def test_what_looks_like_an_acknowledgement_within_another_message_is_not_heard(
                     connection.websocket.data_received(part)
             assert (heard, await connection.websocket.recv()) == ([], inner)
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def test_messages_of_all_lengths_are_sent() -> None:
@@ -229,7 +229,7 @@ def test_messages_of_all_lengths_are_sent() -> None:
             socket.send_now(data)
             assert await client.recv() == data
 
-    talked(talk)
+    talk_over_a_connection(talk)
 
 
 def test_acknowledgements_count_among_the_messages_of_a_second() -> None:

@@ -1,4 +1,4 @@
-"""What a connection keeps of what it is to send, and what ends it."""
+"""Which messages a connection keeps for sending, and what ends it."""
 
 import asyncio
 
@@ -9,8 +9,8 @@ from trial.pictures.frames import Decoder
 from trial.wire.connection import Connection
 
 
-class Paper:
-    """A websocket that writes down what it is sent."""
+class SentMessages:
+    """A websocket that keeps the messages that it is given to send."""
 
     subprotocol = "hippodrome.1"
 
@@ -29,10 +29,10 @@ class Paper:
 
 
 @pytest.mark.parametrize("code", [1000, 4409])
-def test_a_connection_keeps_little_but_never_loses_its_last_words(code):
+def test_a_connection_keeps_few_messages_but_never_loses_the_last_ones(code):
     async def talk():
-        paper = Paper()
-        connection = Connection(paper)
+        websocket = SentMessages()
+        connection = Connection(websocket)
         for number in range(10_000):
             connection.send(str(number))
             connection.send_state(f"state {number}")
@@ -41,7 +41,7 @@ def test_a_connection_keeps_little_but_never_loses_its_last_words(code):
         connection.close(code, "done")
         connection.close(4410, "too late")
         await connection.run()
-        return paper.sent
+        return websocket.sent
 
     sent = asyncio.run(talk())
     assert len(sent) < 100
@@ -54,21 +54,21 @@ def test_a_connection_keeps_little_but_never_loses_its_last_words(code):
 
 @pytest.mark.parametrize("subprotocol", [None, "hippodrome.2"])
 def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog):
-    """The page connects again; without this it would wait for pictures for ever."""
+    """The page connects again. If the connection stayed, the page would wait for pictures for ever."""
 
-    class Cut(Paper):
+    class Cut(SentMessages):
         def abort(self):
             self.sent.append("cut")
 
     async def talk():
-        paper = Cut()
-        paper.subprotocol = subprotocol
-        connection = Connection(paper)
+        websocket = Cut()
+        websocket.subprotocol = subprotocol
+        connection = Connection(websocket)
         width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
         connection.put_picture(np.zeros((2, width, depth), np.uint8), 1)
         connection.send_now()
         await asyncio.wait_for(connection.run(), 5)
-        return paper.sent
+        return websocket.sent
 
     assert asyncio.run(talk()) == ["cut"]
     assert "a picture cannot be sent" in caplog.text

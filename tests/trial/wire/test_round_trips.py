@@ -26,7 +26,7 @@ class Pinged(PlayerSocket):
 
 
 @contextlib.asynccontextmanager
-async def measured(samples, *, delay=None):
+async def measured_connection(samples, *, delay=None):
     """A connection that is measured; yields the client, the server's end, and the times and seconds that it reports."""
     reports, ends = [], []
 
@@ -53,9 +53,9 @@ async def until(true, seconds=10):
             await asyncio.sleep(0.01)
 
 
-def test_what_is_reported_is_the_way_there_and_back():
+def test_a_round_trip_is_the_time_there_and_back():
     async def run():
-        async with measured(3, delay=0.1) as (_, _, reports):
+        async with measured_connection(3, delay=0.1) as (_, _, reports):
             await until(lambda: len(reports) == 3)
         assert all(seconds >= 0.2 for _, seconds in reports)
         assert min(seconds for _, seconds in reports) < 2
@@ -63,11 +63,11 @@ def test_what_is_reported_is_the_way_there_and_back():
     asyncio.run(run())
 
 
-def test_the_samples_come_one_after_the_other_and_then_one_now_and_then(monkeypatch):
+def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeypatch):
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 3.0)
 
     async def run():
-        async with measured(4) as (_, end, reports):
+        async with measured_connection(4) as (_, end, reports):
             await until(lambda: len(reports) == 5)
             assert end.most == 1
         times = [when for when, _ in reports]
@@ -77,12 +77,12 @@ def test_the_samples_come_one_after_the_other_and_then_one_now_and_then(monkeypa
     asyncio.run(run())
 
 
-def test_a_client_that_does_not_answer_is_reported_as_slow_and_pinged_no_more_meanwhile(monkeypatch):
+def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_further_ping_meanwhile(monkeypatch):
     monkeypatch.setattr(round_trips, "LONGEST_SECONDS", 0.3)
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
 
     async def run():
-        async with measured(1) as (client, end, reports):
+        async with measured_connection(1) as (client, end, reports):
             await until(lambda: len(reports) >= 1)
             client.transport.pause_reading()
             await until(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
@@ -97,11 +97,11 @@ def test_a_client_that_does_not_answer_is_reported_as_slow_and_pinged_no_more_me
 
 
 def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
-    """A client that sends pongs ahead does not know the four bytes of the ping that they would have to answer."""
+    """A client that sends pongs ahead does not know the four bytes of the ping that they must repeat."""
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.3)
 
     async def run():
-        async with measured(1, delay=0.1) as (client, _, reports):
+        async with measured_connection(1, delay=0.1) as (client, _, reports):
             for _ in range(200):
                 await client.pong(b"1234")
             await until(lambda: len(reports) == 3)
@@ -113,7 +113,7 @@ def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
 @pytest.mark.parametrize("answers", [True, False])
 def test_measuring_ends_with_the_connection(answers):
     async def run():
-        async with measured(1) as (client, _, reports):
+        async with measured_connection(1) as (client, _, reports):
             await until(lambda: reports)
             if not answers:
                 client.transport.pause_reading()
@@ -125,7 +125,7 @@ def test_measuring_ends_with_the_connection(answers):
 
 
 def test_a_ping_costs_sixteen_bytes():
-    """What round_trips.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
+    """As round_trips.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
     from websockets.frames import Frame
 
     ping, pong = (Frame(opcode, b"1234") for opcode in (Opcode.PING, Opcode.PONG))

@@ -31,7 +31,7 @@ def test_a_short_text_is_read(length: int) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 1, 12, 125])
-def test_a_part_of_a_short_text_and_more_than_one_are_none(length: int) -> None:
+def test_a_part_of_a_short_text_or_more_than_one_is_no_short_text(length: int) -> None:
     data = Frame(Opcode.TEXT, b"x" * length).serialize(mask=True)
     assert [frames.short_text(part) for part in (data[:-1], data + b"x", data + data, b"")] == 4 * [None]
 
@@ -55,10 +55,10 @@ def test_every_other_frame_is_no_short_text(frame: Frame) -> None:
     assert frames.short_text(bytes(data)) is None
 
 
-def test_what_is_not_masked_is_no_short_text() -> None:
+def test_a_frame_without_a_mask_is_no_short_text() -> None:
     data = Frame(Opcode.TEXT, b"x" * 12).serialize(mask=False)
     assert frames.short_text(data) is None
 
 
-def test_a_length_that_the_data_do_not_have_is_no_short_text() -> None:
+def test_a_frame_of_another_length_than_it_says_is_no_short_text() -> None:
     assert frames.short_text(bytes((frames.TEXT, 0x80)) + bytes(4 + 128)) is None
