@@ -1,4 +1,4 @@
-"""Controls of the project's own in `ui`: a button on the page, and a word for the agent."""
+"""The project's own controls in `ui`: each is a button on the page, and a word for the agent."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_other_keys_of_ui_are_words_for_the_agent() -> None:
     assert set(found.ui.shown()) == {"start", "left", "reallyGood", "fire", "leftUp", "wait"}
 
 
-def test_a_control_that_is_called_like_an_action_is_no_word() -> None:
+def test_a_control_with_the_name_of_an_action_is_no_word() -> None:
     assert messages.words_of(config({"jump": True, "wait": True}, actionSpace=["noop", "Jump"])) == ("wait",)
 
 
@@ -63,11 +63,11 @@ def test_the_section_with_its_defaults_is_accepted_again() -> None:
         ),
     ],
 )
-def test_controls_that_cannot_be(ui: dict[str, Any], said: str) -> None:
+def test_wrong_controls_are_refused(ui: dict[str, Any], said: str) -> None:
     assert problems(ui) == [said]
 
 
-def test_a_control_that_is_left_empty_or_off_is_none() -> None:
+def test_an_empty_control_or_one_that_is_off_does_not_exist() -> None:
     assert messages.words_of(config({"wait": None, "toggle": False, "more": ""})) == ()
 
 
@@ -81,7 +81,7 @@ def test_only_the_words_of_this_project_are_commands() -> None:
             messages.parse(json.dumps({"command": said}), ("wait",))
 
 
-def test_a_client_of_hippos_says_them_too() -> None:
+def test_hippos_client_sends_words_too() -> None:
     assert plain.parse('{"command": "reallyGood", "frameId": 3}', ("reallyGood",)).command == "reallyGood"
     assert plain.parse('{"command": "ReallyGood"}', ("reallyGood",)).command == "reallyGood"
     assert plain.parse('{"command": "other"}', ("reallyGood",)).fields == {"command": "other"}

@@ -1,4 +1,4 @@
-"""Who gets into a session's game: each member with their own token, to their own place, and nobody else."""
+"""Who is let into a session's game: each member with their own token, to their own place, and no other client."""
 
 import asyncio
 import contextlib
@@ -57,7 +57,7 @@ def test_a_member_cannot_play_in_the_place_of_another(launch, open_client):
     asyncio.run(run())
 
 
-def test_who_is_no_member_gets_in_with_no_token(launch, open_client):
+def test_no_token_lets_in_a_participant_who_is_no_member(launch, open_client):
     server = launch_session(launch)
     form(server.store)
 
@@ -95,8 +95,8 @@ def test_a_participant_whose_data_were_erased_is_no_member_any_more(launch, open
     asyncio.run(run())
 
 
-def test_without_a_substitute_the_game_is_over_for_the_others_of_one_whose_data_were_erased(launch):
-    """As if that participant had left: nobody is kept at a game that cannot begin."""
+def test_without_a_substitute_the_game_ends_if_the_data_of_a_member_were_erased(launch):
+    """As if that participant had left: the others do not wait for a game that cannot begin."""
     server = launch_session(launch)
     form(server.store, document(("anna", "")))
 
@@ -110,7 +110,7 @@ def test_without_a_substitute_the_game_is_over_for_the_others_of_one_whose_data_
     assert answer(server.store, "anna")["answers"]["episodes"] == 0
 
 
-def test_what_was_played_with_one_whose_data_were_erased_counts_for_the_others(launch):
+def test_the_score_of_a_game_with_a_member_whose_data_were_erased_counts_for_the_others(launch):
     first = launch_session(launch)
     form(first.store)
 
@@ -175,8 +175,8 @@ def test_a_second_tab_replaces_the_members_own_and_no_other(launch):
     asyncio.run(run())
 
 
-def test_two_people_with_one_link_are_one_member(launch):
-    """Whoever opens it last plays; the other place stays the other member's."""
+def test_two_browsers_with_one_members_link_are_one_member(launch):
+    """The browser that opened it last plays; the other place stays the other member's."""
     server = launch_session(launch)
     form(server.store)
 

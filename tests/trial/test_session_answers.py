@@ -1,4 +1,4 @@
-"""What a session's server stores: each member's answers, the session's recordings, and what a lost server has left."""
+"""What a session's server stores: each member's answers, the session's recordings, and the recordings of a lost server."""
 
 import asyncio
 import json
@@ -52,8 +52,8 @@ def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client)
     assert all(answer(server.store, each, step)["answers"]["session"] == SID for each in MEMBERS for step in "35")
 
 
-def test_no_member_opens_a_later_game_step_before_their_own_answer_to_the_one_before(launch, open_client):
-    """Else a member whose client names another step would keep all the others out of theirs."""
+def test_a_member_cannot_open_a_later_game_step_before_their_answer_to_the_one_before(launch, open_client):
+    """Else a member whose client names another step could keep the others out of their own."""
     server = launch_session(launch, GAME_STEPS="3,5")
     form(server.store)
 
@@ -67,7 +67,7 @@ def test_no_member_opens_a_later_game_step_before_their_own_answer_to_the_one_be
     asyncio.run(run())
 
 
-def test_the_next_server_finds_who_has_answered_an_earlier_game_step(launch, open_client):
+def test_the_next_server_knows_which_members_have_answered_an_earlier_game_step(launch, open_client):
     server = launch_session(launch, GAME_STEPS="3,5", SERVER="pair-2")
     form(server.store)
     put(server.store, "study/users/anna/answers/3.json", b'{"answers": {}}')
@@ -102,8 +102,8 @@ def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launch):
     assert "user" not in lines[0]
 
 
-def test_no_members_id_stands_in_a_line_of_a_recording_or_of_the_log(launch):
-    """If the researcher's code knows an id and fails with it, the error's words are recorded without the id."""
+def test_recordings_and_log_hold_no_members_id(launch):
+    """If the researcher's code raises an error that contains an id, the error is recorded without the id."""
     members, said = ("Participant-One", "Participant-Two"), "no Participant-Two here"
     broken = two_players(act="pass").replace(
         "self.t += 1", f"self.t += 1\n        if self.t == 3: raise ValueError('{said}')", 1
@@ -133,7 +133,7 @@ def test_no_members_id_stands_in_a_line_of_a_recording_or_of_the_log(launch):
     assert f"KeyError: '{hidden}'" in written
 
 
-def test_nothing_lies_in_a_members_folder_but_the_answer(launch):
+def test_a_members_folder_holds_only_their_answer(launch):
     server = launch_session(launch)
     form(server.store)
     asyncio.run(both_play(server))
@@ -147,13 +147,13 @@ def test_nothing_lies_in_a_members_folder_but_the_answer(launch):
     }
 
 
-def test_a_step_that_all_have_answered_is_not_played_again(launch):
+def test_a_game_step_that_all_members_have_answered_is_not_played_again(launch):
     server = launch_session(launch)
     form(server.store)
     asyncio.run(both_play(server))
     assert server.wait() == 0
     kept = {each: answer(server.store, each) for each in MEMBERS}
-    again = launch_session(launch, SERVER="pair-2", LINGER_SECONDS="4")  # the second one comes by then
+    again = launch_session(launch, SERVER="pair-2", LINGER_SECONDS="4")  # the second member has come by then
 
     async def run():
         async with member(again, "anna") as anna, member(again, "bert") as bert:
@@ -169,7 +169,7 @@ def test_a_step_that_all_have_answered_is_not_played_again(launch):
 
 
 def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_next_one(launch):
-    """The server was lost between two answers: what is there stays, what is missing comes."""
+    """The server was lost between two answers: the stored answer stays, the missing one is stored."""
     server = launch_session(launch)
     form(server.store)
     asyncio.run(both_play(server))
@@ -216,7 +216,7 @@ def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
     assert {each: answer(tmp_path, each) for each in MEMBERS} == found
 
 
-def test_a_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
+def test_a_game_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
     recorder, _ = recorder_of(tmp_path, Member("anna", None, 0), Member("", None, 1), Member("bert", None, 2))
     assert asyncio.run(recorder.members_answers()) == {}
     bert = {"bert": {"score": 2, "session": SID}}
@@ -233,7 +233,7 @@ def steps(lines):
     return [line["step"] for line in lines if line["kind"] == "step"]
 
 
-def test_after_a_kill_the_next_server_goes_on_at_the_last_recorded_step_for_both(launch, tmp_path):
+def test_after_a_kill_the_game_goes_on_for_both_at_the_last_recorded_step(launch, tmp_path):
     """A process that is killed leaves its recording in the spool, and the next process of that server stores it."""
     first = launch_session(launch, trial={"seed": 3})
     form(first.store)
@@ -249,7 +249,7 @@ def test_after_a_kill_the_next_server_goes_on_at_the_last_recorded_step_for_both
     asyncio.run(killed())
     folder = first.store / f"study/sessions/{SID}/trials/pair-1"
     (left,) = folder.glob("*.part")
-    left.rename(left.with_suffix(""))  # what the control plane of one machine does, and the next process of this name
+    left.rename(left.with_suffix(""))  # as local mode does, and the next process with this server name
     (before,) = recordings(first.store).values()
     assert len(steps(before)) >= 10
     second = launch_session(launch, trial={"seed": 3}, SERVER="pair-2")

@@ -1,4 +1,4 @@
-"""Two members on a real server: a page that sleeps and wakes, acknowledgements that are forged, a policy in a place."""
+"""Two members on a real server: a page stops answering, a member forges acknowledgements, a policy takes a place."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ async def until_both_play(anna: Any, bert: Any) -> None:
         await client.until(lambda client=client: client.state.get("state") == "playing")
 
 
-def people(client: Any) -> dict[str, str]:
+def people_seen_by(client: Any) -> dict[str, str]:
     found: dict[str, str] = client.state.get("people", {})
     return found
 
 
-def test_a_page_that_sleeps_is_away_and_is_back_by_its_acknowledgement_alone(launch):
+def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledgement_alone(launch):
     server = launch_session(launch, trial={"startingFrameRate": 20})
     form(server.store)
 
@@ -31,13 +31,13 @@ def test_a_page_that_sleeps_is_away_and_is_back_by_its_acknowledgement_alone(lau
             await until_both_play(anna, bert)
             await anna.until(lambda: len(anna.frames) > 5)
             anna.acks = False
-            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "away"), 20)
+            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "away"), 20)
             assert bert.state["state"] == "paused"
             held = len(bert.frames)
-            await anna.until(lambda: people(anna).get("left") == "away")
+            await anna.until(lambda: people_seen_by(anna).get("left") == "away")
             await anna.say(ack=anna.frames[-1][1])
             anna.acks = True
-            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "here"), 20)
+            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "here"), 20)
             await bert.until(lambda: bert.state["state"] == "playing" and len(bert.frames) > held + 5)
 
     asyncio.run(run())
@@ -52,7 +52,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
         async with member(server, "bert") as bert:
             async with member(server, "anna") as anna:
                 await until_both_play(anna, bert)
-            await asyncio.wait_for(bert.until(lambda: people(bert).get("left") == "policy"), 20)
+            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "policy"), 20)
             await bert.until(lambda: bert.state["state"] == "playing")
             seen = len(bert.frames)
             await bert.until(lambda: len(bert.frames) > seen + 5)
@@ -60,7 +60,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
                 await anna.say(action="up", held=True)
                 seen = len(anna.frames)
                 await anna.until(lambda: len(anna.frames) > seen + 5)
-                assert people(anna) == {"left": "here", "right": "here"}
+                assert people_seen_by(anna) == {"left": "here", "right": "here"}
                 await anna.say(command="stop")
                 await anna.until(lambda: anna.done)
                 await bert.until(lambda: bert.done)
@@ -87,7 +87,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
 
 @pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
 def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
-    """Acknowledgements pace a member's own pictures alone."""
+    """Acknowledgements control the pace of a member's own pictures alone."""
     server = launch_session(launch, trial={"startingFrameRate": 20})
     form(server.store)
 
@@ -103,7 +103,7 @@ def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, fo
             tasks = [asyncio.create_task(forge(bert)), asyncio.create_task(bert.watch(60))]
             await anna.until(lambda: len(anna.frames) > 10)
             first = len(anna.frames)
-            while len(anna.frames) < first + 80:  # four seconds, after which a page that sleeps is away
+            while len(anna.frames) < first + 80:  # four seconds: after these, a page that does not answer is away
                 await anna.take()
                 assert anna.state["people"] == {"left": "here", "right": "here"}
             for task in tasks:

@@ -1,4 +1,4 @@
-"""What a real session's server records is what `data` and `erase` read: whose it is, and what is one member's alone."""
+"""`data` and `erase` read the recordings of a real session: whose each entry is, and what belongs to one member alone."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Agent(Agent):
 
 @pytest.fixture
 def store(launch: Any) -> Path:
-    """The data of a session of anna and bert, who have pressed keys and given feedback; bert has come back."""
+    """The data of a session in which anna and bert pressed keys and gave feedback, and bert left and came back."""
     server = launch_session(
         launch,
         agent=two_players() + CALLBACKS,
@@ -74,8 +74,8 @@ def data(store: Path, out: Path) -> dict[str, list[dict[str, str]]]:
     return found
 
 
-def of_one(store: Path, player: str) -> list[Any]:
-    """Everything in the session's recordings that is of one player alone."""
+def entries_of_one_player(store: Path, player: str) -> list[Any]:
+    """All entries of the session's recordings that belong to one player alone."""
     (lines,) = recordings(store).values()
     found: list[Any] = [m for line in lines for m in line.get("messages") or () if m.get("player") in (player, None)]
     for line in lines:
@@ -109,16 +109,16 @@ def test_a_real_session_becomes_tables_and_datasets(store: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("user", "mine", "other"), [("anna", "left", "right"), ("bert", "right", "left")])
-def test_what_is_one_members_alone_leaves_a_real_recording(
+def test_erasing_a_member_removes_from_a_real_recording_what_is_theirs_alone(
     store: Path, tmp_path: Path, user: str, mine: str, other: str
 ) -> None:
     (whole,) = recordings(store).values()
-    theirs, ours = of_one(store, other), of_one(store, mine)
+    theirs, ours = entries_of_one_player(store, other), entries_of_one_player(store, mine)
     assert {"presence", "callback"} <= {each["kind"] for each in ours if isinstance(each, dict) and "kind" in each}
     assert {"key", "command", "action"} & {name for each in ours if isinstance(each, dict) for name in each}
     assert main(["erase", user, "--project", "study", "--from", str(store), "--yes"]) == Exit.DONE
-    assert of_one(store, mine) == []
-    assert of_one(store, other) == theirs
+    assert entries_of_one_player(store, mine) == []
+    assert entries_of_one_player(store, other) == theirs
     (left,) = recordings(store).values()
     before, after = RecordedTrial(), RecordedTrial()
     add_lines(before, whole)

@@ -1,4 +1,4 @@
-"""The server of a session that is not formed yet: who has to wait, for how long, and what a warm one becomes."""
+"""The server of a session that is not formed yet: which clients wait, for how long, and what a warm server becomes."""
 
 import asyncio
 import contextlib
@@ -40,7 +40,7 @@ WARM = {"SESSION": "", "SPARE": "on", "SERVER": "warm-1"}
 # ---- before the session is formed
 
 
-def test_nobody_gets_in_before_the_session_is_formed(launch, open_client):
+def test_no_client_is_let_in_before_the_session_is_formed(launch, open_client):
     server = launch_session(launch)
 
     async def everybody():
@@ -85,7 +85,7 @@ def test_a_session_whose_members_never_come_ends_the_server(launch):
     assert "ending: idle" in server.log_text()
 
 
-def test_a_member_who_comes_while_the_server_still_looks_for_old_recordings_is_not_sent_away(
+def test_a_member_who_comes_while_the_server_reads_old_recordings_is_not_sent_away(
     tmp_path, open_client, monkeypatch, capsys
 ):
     (tmp_path / "agent.py").write_text(two_players())
@@ -137,7 +137,7 @@ Agent = Trio
 """
 
 
-def test_policies_of_each_group_are_there_before_the_group_is_known(launch):
+def test_the_policies_of_all_groups_are_loaded_before_the_group_is_known(launch):
     players = {"left": "human", "right": "human"}
     groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
     server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
@@ -168,13 +168,13 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_document_that_is_no_session_of_this_server_lets_nobody_in(name):
+def test_a_document_that_is_no_session_of_this_server_lets_no_client_in(name):
     settings = TrialSettings.from_env(ENV)
     with pytest.raises(ValueError, match="its document"):
         assignment._read(settings, BAD[name])
 
 
-def test_a_bad_document_is_said_once_and_a_good_one_is_taken_later(launch, open_client):
+def test_a_bad_document_is_logged_once_and_a_good_one_is_taken_later(launch, open_client):
     server = launch_session(launch)
     put(server.store, f"study/sessions/{SID}/session.json", BAD["one seat twice"])
 
@@ -193,7 +193,7 @@ def test_a_bad_document_is_said_once_and_a_good_one_is_taken_later(launch, open_
 # ---- warm servers
 
 
-def test_a_warm_server_that_is_handed_to_a_session_is_that_sessions(launch, open_client):
+def test_a_warm_server_that_is_handed_to_a_session_plays_that_session(launch, open_client):
     server = launch_session(launch, **WARM)
 
     async def run():
@@ -225,22 +225,22 @@ def test_a_warm_server_that_is_handed_to_a_participant_takes_no_member_token(lau
     asyncio.run(run())
 
 
-def test_an_idle_time_begins_when_the_session_is_formed_not_at_the_handover(launch):
+def test_the_idle_time_begins_when_the_session_is_formed_not_at_the_handover(launch):
     server = launch_session(launch, **WARM, IDLE_SECONDS="1", GRACE_SECONDS="1")
     time.sleep(0.5)
     put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
-    asyncio.run(ask(server))
+    asyncio.run(make_the_server_look(server))
     until(lambda: "assigned to a session now" in server.log_text(), 15)
     time.sleep(1.5)
     assert server.process.poll() is None
     form(server.store)
-    asyncio.run(ask(server))
+    asyncio.run(make_the_server_look(server))
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 
 
-async def ask(server):
-    """Make the server look, as a member whose page shows their token."""
+async def make_the_server_look(server):
+    """Make the server look for its session, as a member's page with their token does."""
     async with connect(server.address, subprotocols=["hippodrome.3"], proxy=None) as websocket:
         await websocket.send(json.dumps(hello_of("anna")))
         with contextlib.suppress(Exception):
@@ -250,7 +250,7 @@ async def ask(server):
 # ---- how long it stays
 
 
-def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(launch):
+def test_the_server_stays_while_a_member_is_connected_and_ends_when_all_are_gone(launch):
     server = launch_session(launch, IDLE_SECONDS="1", GRACE_SECONDS="1")
 
     async def run():
@@ -265,7 +265,7 @@ def test_the_server_stays_while_one_member_is_there_and_ends_when_all_are_gone(l
     assert "ending: idle" in server.log_text()
 
 
-def test_a_server_whose_members_have_all_gone_before_the_game_does_not_wait_for_them_for_gather_seconds(launch):
+def test_a_server_does_not_wait_gather_seconds_for_members_who_all_left_before_the_game(launch):
     server = launch_session(launch, trial={"gather": 300}, IDLE_SECONDS="1", GRACE_SECONDS="1")
 
     async def run():
@@ -301,12 +301,12 @@ def test_a_handed_over_session_has_the_settings_of_a_session_that_was_started_fo
 
 
 @pytest.mark.parametrize("bad", ["s.", "s.0123456789ABCDEF0123", "anna", SID + "0", f"{SID}/.."])
-def test_a_session_that_is_none_is_refused(bad):
+def test_a_wrong_id_of_a_session_is_refused(bad):
     with pytest.raises(SettingsError, match="SESSION"):
         TrialSettings.from_env({**ENV, "SESSION": bad})
 
 
-def test_without_a_session_nothing_of_it_is_there():
+def test_a_server_without_a_session_has_the_settings_of_one_participant():
     settings = TrialSettings.from_env({**ENV, "SESSION": "", "USER_ID": "P1"})
     assert (settings.session, settings.members, settings.seats, settings.players) == ("", (), {}, 1)
     assert settings.assigned

@@ -13,7 +13,7 @@ ON = {"afterAbsent": "policy", "substitute": "random"}
 
 
 async def connects(server, open_client, user_id):
-    """The member connects, and goes as soon as they are let in; the code with which they were refused, or None."""
+    """Connect as the member, and leave as soon as they are let in; return the code of a refusal, or None."""
     async with open_client(server.address) as client:
         await client.hello(**hello_of(user_id))
         try:
@@ -23,7 +23,7 @@ async def connects(server, open_client, user_id):
     return None
 
 
-def test_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(launch, open_client):
+def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(launch, open_client):
     server = launch_session(launch, trial=ON)
     form(server.store)
 
@@ -50,7 +50,7 @@ def test_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(laun
     assert len([line for line in of_anna if line["what"] in ("joined", "returned")]) <= codes.count(None) + 1
 
 
-def test_what_one_member_does_is_not_counted_against_another(launch, open_client):
+def test_one_members_connections_are_not_counted_against_another(launch, open_client):
     server = launch_session(launch, trial=ON)
     form(server.store)
 

@@ -24,7 +24,7 @@ from tests.trial.sessions import (
 
 @contextlib.asynccontextmanager
 async def near_and_far(server, seconds):
-    """Both members; what bert says and hears takes so long on its way."""
+    """Connect both members; bert's messages take `seconds` each way."""
     async with (
         far_away(server.port, seconds) as slow,
         member(server, "anna") as anna,
@@ -33,7 +33,7 @@ async def near_and_far(server, seconds):
         yield anna, bert
 
 
-def test_round_trips_of_each_member_stand_in_the_recording(launch):
+def test_the_recording_holds_each_members_round_trips(launch):
     server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 5000})
     form(server.store)
 
@@ -55,7 +55,7 @@ def test_round_trips_of_each_member_stand_in_the_recording(launch):
     assert trips["left"] < trips["right"]
 
 
-def test_a_member_who_is_too_far_away_is_told_and_so_are_the_others(launch):
+def test_a_member_who_is_too_far_away_and_the_others_are_told_so(launch):
     server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700})
     form(server.store)
 
@@ -92,8 +92,8 @@ def test_the_others_play_on_without_a_member_who_is_too_far_away(launch):
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
 
-def test_who_is_too_far_away_is_out_of_the_later_games_too(launch):
-    """They come there before the others, who still play, and would be sent away again and again."""
+def test_a_member_who_is_too_far_away_is_refused_in_the_later_games_too(launch):
+    """They come to the next game before the others, who still play, and would be sent away again and again."""
     instead = {"substitute": "idle", "afterAbsent": "policy"}
     trial = {"pingSamples": 3, "maxPing": 150, "countdown": 0, **instead}
     server = launch_session(launch, trial=trial, GAME_STEPS="3,5,7")
@@ -123,7 +123,7 @@ class CountsPings(ClientConnection):
 
 
 def test_only_a_session_sends_pings_of_its_own(launch):
-    """A participant who plays alone gets no byte more."""
+    """A server of one participant sends no ping of its own."""
 
     async def pings(server, hello, most=math.inf, seconds=2):
         async with connect(

@@ -1,4 +1,4 @@
-"""Between two episodes is a break: the score is shown, no key acts, the agent is left alone."""
+"""The break between two episodes: the score is shown, no key acts, and the agent is not called."""
 
 import asyncio
 import time
@@ -45,7 +45,7 @@ def test_keys_held_when_an_episode_ends_do_nothing_in_the_next():
     assert not game.next_actions()[PLAYER].human
 
 
-def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_act():
+def test_keys_tapped_in_a_break_do_nothing_and_those_held_at_its_end_act():
     game = game_in_a_break()
     game.act("up", True)
     game.act("up", False)
@@ -59,7 +59,7 @@ def test_keys_that_come_and_go_in_a_break_do_nothing_and_those_held_at_its_end_a
     ("command", "state", "why"),
     [("start", PlayState.PLAYING, "start"), ("pause", PlayState.PAUSED, "pause"), ("leave", PlayState.PAUSED, "left")],
 )
-def test_what_ends_a_break_early(command, state, why):
+def test_start_pause_and_leaving_end_a_break_early(command, state, why):
     game = game_in_a_break()
     getattr(game, command)()
     assert (game.state, game.episode, game.needs_reset) == (state, 2, True)
@@ -80,7 +80,7 @@ def test_a_reset_in_a_break_changes_nothing():
     assert (game.state, game.episode) == (PlayState.BREAK, 1)
 
 
-def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero():
+def test_there_is_no_break_after_the_last_episode_in_a_held_game_or_of_zero_seconds():
     assert game_in_a_break(maxEpisodes=1).over
     assert game_in_a_break(betweenEpisodes=0).playing
     game = TrialProgress(trial_section({}), alone(SPACE))
@@ -92,7 +92,7 @@ def test_no_break_after_the_last_episode_nor_in_a_held_game_nor_where_it_is_zero
     assert (game.state, game.episode) == (PlayState.PAUSED, 2)
 
 
-def test_a_participants_own_reset_is_followed_by_a_break_too():
+def test_a_break_follows_a_participants_reset_too():
     game = TrialProgress(trial_section({}), alone(SPACE))
     game.start()
     game.began()
@@ -108,8 +108,8 @@ def kinds(lines):
     return [line["kind"] for line in lines if line["kind"] != "step"]
 
 
-async def to_the_break(client):
-    """Play until the first break; returns when the start was asked for (monotonic)."""
+async def play_until_the_break(client):
+    """Play until the first break; return when the start was sent (monotonic seconds)."""
     await client.hello()
     await client.until(lambda: client.frames)
     began = time.monotonic()
@@ -118,12 +118,12 @@ async def to_the_break(client):
     return began
 
 
-def test_a_break_is_told_and_kept(launch, open_client, grid):
+def test_a_client_is_told_of_a_break_that_lasts_its_time(launch, open_client, grid):
     server = launch(grid(8), {"maxEpisodes": 3, "startingFrameRate": 60, "betweenEpisodes": 0.5})
 
     async def play():
         async with open_client(server.address) as client:
-            began = await to_the_break(client)
+            began = await play_until_the_break(client)
             told = client.state
             await client.until(lambda: client.state["state"] == "playing")
             lasted = time.monotonic() - began
@@ -150,7 +150,9 @@ def test_a_break_is_told_and_kept(launch, open_client, grid):
     assert [lines[-1]["why"] for lines in recorded.values()] == ["over", "over", "terminated"]
 
 
-def test_nothing_moves_in_a_break_and_feedback_still_belongs_to_the_episode(launch, open_client, grid, tmp_path):
+def test_the_game_stands_still_in_a_break_and_feedback_belongs_to_the_episode_before(
+    launch, open_client, grid, tmp_path
+):
     calls = tmp_path / "calls.txt"
     spy = (
         f"\n_f = open({str(calls)!r}, 'a', buffering=1)\n"
@@ -164,7 +166,7 @@ def test_nothing_moves_in_a_break_and_feedback_still_belongs_to_the_episode(laun
 
     async def play():
         async with open_client(server.address) as client:
-            await to_the_break(client)
+            await play_until_the_break(client)
             await client.until(lambda: client.frame[8, 8, 0] == 255)  # the picture of the last step
             before, frames = calls.read_text(), len(client.frames)
             await client.say(action="left", held=True)
@@ -198,7 +200,7 @@ def test_after_leaving_in_a_break_the_next_episode_waits(launch, open_client, gr
 
     async def play():
         async with open_client(server.address) as client:
-            await to_the_break(client)
+            await play_until_the_break(client)
             if how == "pause":
                 await client.say(command="pause")
                 await client.until(lambda: client.state["state"] == "paused")
@@ -221,11 +223,13 @@ def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(la
 
     async def play():
         async with open_client(first.address) as client:
-            await to_the_break(client)
+            await play_until_the_break(client)
             await client.say(command="good")
             if kill:
                 (part,) = first.store.rglob("*.part")
-                while kinds(recording.read(part.read_bytes()))[-1:] != ["end"]:  # it is written every half second
+                while kinds(recording.read(part.read_bytes()))[-1:] != [
+                    "end"
+                ]:  # the recording is written every half second
                     await client.watch(0.05)
                 first.process.kill()
             else:
@@ -263,7 +267,7 @@ def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client,
     async def play(server, start):
         async with open_client(server.address) as client:
             if start:
-                await to_the_break(client)
+                await play_until_the_break(client)
                 await client.say(command="stop")
             else:
                 await client.hello()
@@ -272,7 +276,7 @@ def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client,
     asyncio.run(play(first, True))
     first.wait()
     assert first.answer()["answers"]["outcome"] == "stopped"
-    (first.store / "study/users/P1/answers/3.json").unlink()  # as if it was lost just before
+    (first.store / "study/users/P1/answers/3.json").unlink()  # as if the server had been lost just before
     second = launch(grid(8), LONG, SERVER="a-2")
     asyncio.run(play(second, False))
     assert second.answer()["answers"]["outcome"] == "stopped"
@@ -284,7 +288,7 @@ def test_the_deadline_ends_a_break(launch, open_client, grid):
 
     async def play():
         async with open_client(server.address) as client:
-            await to_the_break(client)
+            await play_until_the_break(client)
             assert await client.closed() == 1001
 
     asyncio.run(play())
@@ -292,7 +296,7 @@ def test_the_deadline_ends_a_break(launch, open_client, grid):
     assert not server.answered()
 
 
-def test_a_client_without_the_subprotocol_only_sees_the_picture_stand_still(launch, open_client, grid):
+def test_a_client_without_the_subprotocol_plays_through_a_break(launch, open_client, grid):
     server = launch(grid(8), {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 0.3})
 
     async def play():
@@ -305,7 +309,7 @@ def test_a_client_without_the_subprotocol_only_sees_the_picture_stand_still(laun
     assert asyncio.run(play()).done == "done"
 
 
-def test_an_episode_whose_last_step_is_recorded_is_over_without_its_end():
+def test_an_episode_is_over_if_its_last_step_is_recorded_but_not_its_end():
     past = RecordedTrial()
     add_lines(past, [{"kind": "reset", "episode": 1, "seed": 7}])
     step = {"kind": "step", "episode": 1, "human": None, "action": 0, "reward": 2.0}

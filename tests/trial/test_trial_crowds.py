@@ -1,4 +1,4 @@
-"""Crowds and giants: many connections to one trial, slow ones, and WebSocket frames nobody should send."""
+"""Many connections to one trial, slow connections, and WebSocket frames that are too large or wrong."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ from tests.trial.test_trial_tls import KEYS, put
 from trial.server.preauth_limit import MAX_UNAUTHENTICATED_SOCKETS
 
 SILENT = b""
-SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # and never the rest
+SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # the rest is never sent
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
@@ -28,7 +28,7 @@ def connect(port, first=SILENT):
 
 
 def masked(opcode, payload, *, fin=True, length=None, reserved=0):
-    """A client's frame; `length` is what its header says, if not the truth."""
+    """A client's frame; `length` is the length in its header, if that is to be wrong."""
     size = len(payload) if length is None else length
     head = bytes([(0x80 if fin else 0) | reserved | opcode])
     if size < 126:
@@ -40,8 +40,8 @@ def masked(opcode, payload, *, fin=True, length=None, reserved=0):
     return head + b"\0\0\0\0" + payload  # a mask of zeros leaves the payload as it is
 
 
-def speak(port, *frames, extra=b""):
-    """Shake hands, send frames, and read until the server closes; its close code, and whether it took an extension."""
+def send_frames(port, *frames, extra=b""):
+    """Shake hands, send frames, and read until the server closes; return its close code, and whether it took an extension."""
     with connect(port, UPGRADE + extra + b"\r\n") as connection:
         got = b""
         while b"\r\n\r\n" not in got:
@@ -62,21 +62,21 @@ def memory(server):
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def arrive(port, crowd, firsts):
+def open_crowd(port, crowd, firsts):
     for number in range(1000):
         try:
             crowd.append(connect(port, firsts[number % len(firsts)]))
-        except ConnectionError:  # cut off before it had said anything
+        except ConnectionError:  # the server closed it before it had sent anything
             crowd.append(None)
 
 
-async def comes_in_and_plays(server, open_client):
+async def connect_and_play(server, open_client):
     async with open_client(server.address) as client:
         await client.play(20)
 
 
 def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_client):
-    """Silent ones, slow ones and strangers who shake hands and say nothing: all at once, while somebody plays."""
+    """Silent and slow connections, and strangers who shake hands and say nothing: all at once, while the participant plays."""
     server = launch(HELLO_SECONDS="10")
     crowd = []
 
@@ -88,25 +88,25 @@ def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_cli
             limit = opened + MAX_UNAUTHENTICATED_SOCKETS + 200  # fewer than there are connections
             resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE, (limit, limit))
             arriving = asyncio.create_task(
-                asyncio.to_thread(arrive, server.port, crowd, (SILENT, SLOW, UPGRADE + b"\r\n"))
+                asyncio.to_thread(open_crowd, server.port, crowd, (SILENT, SLOW, UPGRADE + b"\r\n"))
             )
             await client.until(arriving.done, 60)
             assert len(crowd) == 1000
             seen = len(client.frames)
             await client.until(lambda: len(client.frames) > seen + 20)
             assert memory(server) - before < 100_000_000
-        await comes_in_and_plays(server, open_client)
+        await connect_and_play(server, open_client)
 
     try:
         asyncio.run(play())
     finally:
-        cut = end_of(crowd)
+        cut = close_all(crowd)
     assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
     assert "Traceback" not in server.log_text()
 
 
-def end_of(crowd):
-    """Close them all; how many had been closed by the server."""
+def close_all(crowd):
+    """Close all connections; return how many the server had closed."""
     cut = 0
     for connection in crowd:
         if connection is None:
@@ -136,7 +136,9 @@ def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client,
         async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
             await client.play()
             before = memory(server)
-            arriving = asyncio.create_task(asyncio.to_thread(arrive, server.port, crowd, (SILENT, b"\x16\x03\x01\x02")))
+            arriving = asyncio.create_task(
+                asyncio.to_thread(open_crowd, server.port, crowd, (SILENT, b"\x16\x03\x01\x02"))
+            )
             await client.until(arriving.done, 60)
             seen = len(client.frames)
             await client.until(lambda: len(client.frames) > seen + 20)
@@ -147,12 +149,12 @@ def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client,
     try:
         asyncio.run(play())
     finally:
-        cut = end_of(crowd)
+        cut = close_all(crowd)
     assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
     assert "Traceback" not in server.log_text()
 
 
-def test_who_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
+def test_a_connection_that_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
     chain = put(tmp_path / "store" / "ssl", 1)
     server = launch(HELLO_SECONDS="3", **KEYS)
     crowd = [
@@ -175,7 +177,7 @@ def test_who_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
 
 
 def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
-    """The size is believed from the header, so nothing of them is kept; in parts they are no better."""
+    """The server reads the size in the header, and keeps nothing of such a frame; in fragments they are refused, too."""
     server = launch()
     before = memory(server)
     for frames in (
@@ -184,13 +186,13 @@ def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
         [masked(1, b"x" * 2000, fin=False), masked(0, b"x" * 2000, fin=False), masked(0, b"x" * 2000)],
         [masked(2, b"x" * 4097)],
     ):
-        assert speak(server.port, *frames)[0] == 1009
+        assert send_frames(server.port, *frames)[0] == 1009
     assert memory(server) - before < 20_000_000
-    asyncio.run(comes_in_and_plays(server, open_client))
+    asyncio.run(connect_and_play(server, open_client))
     assert "Traceback" not in server.log_text()
 
 
-def test_frames_that_break_the_protocol_are_closed(launch, open_client):
+def test_frames_that_break_the_protocol_close_the_connection(launch, open_client):
     server = launch()
     for frame, code in (
         (masked(9, b"x" * 200), 1002),  # a ping of more than 125 bytes
@@ -201,27 +203,27 @@ def test_frames_that_break_the_protocol_are_closed(launch, open_client):
         (b"\x81\x02hi", 1002),  # not masked
         (masked(1, b"\xff\xfe"), 1007),
     ):
-        assert speak(server.port, frame)[0] == code, frame
-    asyncio.run(comes_in_and_plays(server, open_client))
+        assert send_frames(server.port, frame)[0] == code, frame
+    asyncio.run(connect_and_play(server, open_client))
 
 
 def test_compressed_frames_are_not_agreed_to(launch):
-    """So no small frame can unpack to a huge one."""
+    """So that no small frame can unpack to a huge one."""
     server = launch()
-    code, agreed = speak(server.port, masked(1, b"\xaa\x56\x2a\x00", reserved=0x40), extra=DEFLATE)
+    code, agreed = send_frames(server.port, masked(1, b"\xaa\x56\x2a\x00", reserved=0x40), extra=DEFLATE)
     assert not agreed
     assert code == 1002
 
 
-def test_a_flood_of_pings_and_tiny_pieces_ends(launch, open_client):
+def test_a_flood_of_pings_or_tiny_fragments_ends_the_connection(launch, open_client):
     server = launch(HELLO_SECONDS="2")
     before = memory(server)
-    code, _ = speak(
+    code, _ = send_frames(
         server.port, masked(9, b"x" * 100) * 20_000, masked(1, b"", fin=False), masked(0, b"", fin=False) * 50_000
     )
     assert code in (4408, 1009, 1006, None)
     assert memory(server) - before < 50_000_000
-    asyncio.run(comes_in_and_plays(server, open_client))
+    asyncio.run(connect_and_play(server, open_client))
     assert "Traceback" not in server.log_text()
 
 
@@ -233,5 +235,5 @@ def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):
             while connection.recv(65536):
                 pass
             connection.close()
-    asyncio.run(comes_in_and_plays(server, open_client))
+    asyncio.run(connect_and_play(server, open_client))
     assert "Traceback" not in server.log_text()

@@ -1,4 +1,4 @@
-"""How a trial server ends: asked to, killed, left alone, out of time; and what is kept."""
+"""How a trial server ends: by SIGTERM, killed, idle or at its deadline; and what it keeps."""
 
 import asyncio
 import time
@@ -13,7 +13,7 @@ def steps_of(lines):
     return [line for line in lines if line["kind"] == "step"]
 
 
-def test_sigterm_keeps_everything_and_says_goodbye(launch, open_client):
+def test_sigterm_keeps_the_whole_recording_and_closes_with_1001(launch, open_client):
     server = launch()
 
     async def play():
@@ -35,7 +35,7 @@ def test_sigterm_keeps_everything_and_says_goodbye(launch, open_client):
     assert not list(server.store.rglob("*.part"))
 
 
-def test_sigterm_while_the_agent_starts(launch, open_client, grid):
+def test_sigterm_ends_a_server_while_its_agent_starts(launch, open_client, grid):
     source = grid().replace("def start(self, game):", "def start(self, game):\n        import time; time.sleep(60)")
     server = launch(source)
 
@@ -53,7 +53,7 @@ def test_sigterm_while_the_agent_starts(launch, open_client, grid):
     assert not server.answered()
 
 
-def test_a_spool_that_cannot_be_written_ends_the_trial_in_words(launch, open_client, tmp_path):
+def test_a_spool_that_cannot_be_written_ends_the_trial_with_a_sentence(launch, open_client, tmp_path):
     (tmp_path / "file").write_text("")
     server = launch(SPOOL=str(tmp_path / "file" / "spool"))
 
@@ -68,7 +68,7 @@ def test_a_spool_that_cannot_be_written_ends_the_trial_in_words(launch, open_cli
     assert not server.answered()
 
 
-def test_sigterm_before_anyone_comes(launch):
+def test_sigterm_ends_a_server_before_its_participant_comes(launch):
     server = launch()
     time.sleep(0.3)
     server.terminate()
@@ -76,7 +76,7 @@ def test_sigterm_before_anyone_comes(launch):
     assert "Traceback" not in server.log_text()
 
 
-def test_kill_loses_a_second_at_most(launch, open_client):
+def test_a_killed_server_loses_a_second_at_most(launch, open_client):
     server = launch(trial={"startingFrameRate": 50})
 
     async def play():
@@ -90,7 +90,7 @@ def test_kill_loses_a_second_at_most(launch, open_client):
     (part,) = server.store.rglob("*.part")
     left = recording.read(part.read_bytes())
     assert last - steps_of(left)[-1]["frame"] <= 50
-    # The next process of this server stores what is left, and begins a file of its own.
+    # The next process of this server stores the recording that is left, and begins a file of its own.
     again = launch(trial={"startingFrameRate": 50, "ui": UI})
 
     async def play_again():
@@ -107,13 +107,13 @@ def test_kill_loses_a_second_at_most(launch, open_client):
     assert not list(server.store.rglob("*.part"))
 
 
-def test_nobody_comes(launch):
+def test_a_server_to_which_no_participant_comes_ends_as_idle(launch):
     server = launch(IDLE_SECONDS="1", GRACE_SECONDS="30")
     assert server.wait() == 0
     assert "idle" in server.log_text()
 
 
-def test_a_participant_who_leaves_is_waited_for(launch, open_client):
+def test_a_server_waits_for_a_participant_who_leaves(launch, open_client):
     server = launch(IDLE_SECONDS="3", GRACE_SECONDS="6")
 
     async def play():
@@ -136,7 +136,7 @@ def test_a_participant_who_leaves_is_waited_for(launch, open_client):
     assert lines[-1]["why"] == "shutdown"
 
 
-def test_deadline(launch, open_client):
+def test_a_server_ends_at_its_deadline(launch, open_client):
     server = launch(DEADLINE=str(time.time() + 8))
 
     async def play():
@@ -151,7 +151,7 @@ def test_deadline(launch, open_client):
     assert not server.answered()
 
 
-def test_recordings_stay_here_without_s3upload(launch, open_client, grid, tmp_path):
+def test_without_s3upload_recordings_stay_on_the_server(launch, open_client, grid, tmp_path):
     server = launch(
         grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool")
     )
@@ -193,7 +193,7 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
     assert "P1" not in server.log_text()
 
 
-def test_nobody_connected_costs_nothing(launch, open_client):
+def test_a_server_without_clients_uses_almost_no_processor_time(launch, open_client):
     server = launch()
 
     async def play():

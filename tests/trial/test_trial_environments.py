@@ -64,20 +64,20 @@ def url(server: Any, query: str = f"?token={TOKEN}") -> str:
     return f"{server.address}gym{query}"
 
 
-def processes(server: Any) -> list[int]:
+def processes_of(server: Any) -> list[int]:
     return [pid for pid in linux.descendants(server.process.pid) if linux.runs(pid)]
 
 
 @contextlib.contextmanager
-def served(server: Any, env_id: str = "CartPole-v1", **options: Any) -> Iterator[RemoteEnv]:
+def remote_env(server: Any, env_id: str = "CartPole-v1", **options: Any) -> Iterator[RemoteEnv]:
     with RemoteEnv(server.address, env_id, token=TOKEN, **options) as env:
         yield env
 
 
-def test_who_has_the_token_trains_on_environments(launch: Any) -> None:
+def test_a_program_with_the_token_trains_on_environments(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    assert processes(server) == []  # none before the first program
-    with served(server) as env:
+    assert processes_of(server) == []  # no process before the first program
+    with remote_env(server) as env:
         env.reset(seed=1)
         assert env.step(1)[1] == 1.0
         assert len(env.step_many([1, 0, 1])[1]) == 3
@@ -86,7 +86,7 @@ def test_who_has_the_token_trains_on_environments(launch: Any) -> None:
         assert envs.step([0, 1, 0])[1].tolist() == [1.0, 1.0, 1.0]
 
 
-def test_the_same_over_tls(launch: Any, tmp_path: Path) -> None:
+def test_a_program_trains_over_tls(launch: Any, tmp_path: Path) -> None:
     put(tmp_path / "store" / "ssl", 1)
     server = launch(agent(), SERVES, **KEYS)
     address, ca = f"wss://localhost:{server.port}/", str(tmp_path / "store/ssl/fullchain.pem")
@@ -120,7 +120,7 @@ def test_closes_pass_with_their_codes_and_words(launch: Any) -> None:
     assert closed.value.rcvd is not None
     assert closed.value.rcvd.code == 1003
     assert closed.value.rcvd.reason
-    with served(server, "Odd-v0") as env:
+    with remote_env(server, "Odd-v0") as env:
         env.reset()
         with pytest.raises(ConnectionLost, match=r"ended its process \(exit status 3\)"):
             env.step(2)
@@ -128,7 +128,7 @@ def test_closes_pass_with_their_codes_and_words(launch: Any) -> None:
 
 def test_a_request_that_is_too_large_ends_its_connection_alone(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with served(server) as env, connect(url(server), compression=None, proxy=None) as large:
+    with remote_env(server) as env, connect(url(server), compression=None, proxy=None) as large:
         large.send("x" * (LARGEST_REQUEST + 1))
         with pytest.raises(ConnectionClosed):
             large.recv(SECONDS)
@@ -136,43 +136,43 @@ def test_a_request_that_is_too_large_ends_its_connection_alone(launch: Any) -> N
         env.reset()
 
 
-def test_a_request_of_more_than_a_page_may_send_passes(launch: Any) -> None:
+def test_a_program_may_send_a_larger_request_than_a_page(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with served(server) as env:
+    with remote_env(server) as env:
         env.reset(seed=1)
         assert len(env.step_many([1] * 60_000)[1]) == 60_000
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=other", "?form=gymnasium"])
-def test_who_has_no_token_makes_nothing(launch: Any, query: str) -> None:
+def test_a_program_without_the_token_makes_no_environments(launch: Any, query: str) -> None:
     server = launch(agent(), SERVES)
     with pytest.raises(InvalidStatus) as refused:
         connect(url(server, query), proxy=None)
     assert refused.value.response.status_code == 401
-    assert processes(server) == []
+    assert processes_of(server) == []
 
 
 @pytest.mark.parametrize(("gym", "words"), [("none", "404"), ("watch", "does not speak"), ("advise", "does not speak")])
-def test_unless_the_project_says_so_there_are_none(launch: Any, gym: str, words: str) -> None:
+def test_a_server_makes_environments_only_if_the_project_says_so(launch: Any, gym: str, words: str) -> None:
     server = launch(agent(), {"gym": gym})
-    with pytest.raises(ConnectionLost, match=words), served(server):
+    with pytest.raises(ConnectionLost, match=words), remote_env(server):
         pass
-    assert processes(server) == []
+    assert processes_of(server) == []
 
 
-def test_programs_are_limited(launch: Any) -> None:
+def test_the_number_of_programs_is_limited(launch: Any) -> None:
     server = launch(agent(), SERVES)
     with contextlib.ExitStack() as stack:
         for _ in range(MAX_PROGRAMS):
-            stack.enter_context(served(server))
-        with pytest.raises(ConnectionLost, match=f"{MAX_PROGRAMS} programs"), served(server):
+            stack.enter_context(remote_env(server))
+        with pytest.raises(ConnectionLost, match=f"{MAX_PROGRAMS} programs"), remote_env(server):
             pass
-    until(lambda: len(processes(server)) == 2, SECONDS)  # who listens and who starts processes
-    with served(server) as env:
+    until(lambda: len(processes_of(server)) == 2, SECONDS)  # who listens and who starts processes
+    with remote_env(server) as env:
         env.reset()
 
 
-def test_requests_beyond_so_many_a_second_wait(launch: Any) -> None:
+def test_requests_above_the_limit_of_a_second_wait(launch: Any) -> None:
     server = launch(agent(), SERVES)
     count = REQUESTS_A_SECOND
     with connect(url(server) + "&form=gymnasium", compression=None, proxy=None) as program:
@@ -186,9 +186,9 @@ def test_requests_beyond_so_many_a_second_wait(launch: Any) -> None:
         assert time.monotonic() - since > 0.95
 
 
-def test_agents_environments_know_no_secret_and_let_the_game_go_first(launch: Any) -> None:
+def test_environments_know_no_secret_and_run_at_a_lower_priority_than_the_game(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with served(server, "Odd-v0") as env:
+    with remote_env(server, "Odd-v0") as env:
         _, info = env.reset()
         score = Path(f"/proc/{info['process']}/oom_score_adj").read_text()
     assert not {"TOKEN", "CREDENTIAL"} & info["environment"].keys()
@@ -200,11 +200,11 @@ def test_agents_environments_know_no_secret_and_let_the_game_go_first(launch: An
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_nothing_stays_behind_when_the_server_ends(launch: Any, number: signal.Signals) -> None:
     server = launch(agent(), SERVES, LINGER_SECONDS="0")
-    with served(server, "Odd-v0") as env:
+    with remote_env(server, "Odd-v0") as env:
         env.reset()
         threading.Thread(target=_hang, args=(env,), daemon=True).start()
-        until(lambda: len(processes(server)) == 3, SECONDS)
-        left = processes(server)
+        until(lambda: len(processes_of(server)) == 3, SECONDS)
+        left = processes_of(server)
         os.kill(server.process.pid, number)
         server.wait()
         until(lambda: not any(map(linux.runs, left)), SECONDS)
@@ -217,16 +217,16 @@ def _hang(env: RemoteEnv) -> None:
 
 def test_a_process_that_was_killed_is_started_again(launch: Any) -> None:
     server = launch(agent(), SERVES)
-    with served(server) as env:
+    with remote_env(server) as env:
         env.reset()
         (listens,) = linux.children(server.process.pid)
-        below = processes(server)
+        below = processes_of(server)
         os.kill(listens, signal.SIGKILL)
         until(lambda: not any(map(linux.runs, below)), SECONDS)  # an environment may answer until its own process ends
         with pytest.raises(ConnectionLost):
             env.step_many([1] * 10)
-    until(lambda: processes(server) == [], SECONDS)
-    with served(server) as env:
+    until(lambda: processes_of(server) == [], SECONDS)
+    with remote_env(server) as env:
         env.reset()
 
 
@@ -238,8 +238,8 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
         env.reset()
         return env
 
-    async def stalls(worst: list[float]) -> None:
-        """For how long this machine has let nobody run who wanted to."""
+    async def measure_stalls(worst: list[float]) -> None:
+        """Measure the longest time for which this machine did not run a task that was due."""
         while True:
             before = time.monotonic()
             await asyncio.sleep(0.02)
@@ -249,13 +249,13 @@ def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_
         async with open_client(server.address) as client:
             await client.play()
             beginning = asyncio.create_task(asyncio.to_thread(begin))
-            while not beginning.done():  # whoever takes no frames gets no more of them
+            while not beginning.done():  # a client that takes no frames gets no more of them
                 await client.watch(0.05)
             with beginning.result() as env:
                 hanging = threading.Thread(target=_hang, args=(env,), daemon=True)
                 hanging.start()
                 worst = [0.0]
-                watching = asyncio.create_task(stalls(worst))
+                watching = asyncio.create_task(measure_stalls(worst))
                 since = time.monotonic_ns()
                 await client.see(90)
                 ended = time.monotonic_ns()
@@ -279,7 +279,7 @@ def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(lau
     server = launch(agent(), SERVES, IDLE_SECONDS="5")
 
     def train() -> None:
-        with served(server) as env:
+        with remote_env(server) as env:
             env.reset()
             assert server.wait() == 0
             env.step(1)
@@ -293,18 +293,16 @@ def framed(request: Any) -> bytes:
     return Frame(Opcode.TEXT, json.dumps(request).encode()).serialize(mask=True)
 
 
-def test_before_a_warm_server_has_its_participant_it_makes_none(launch: Any) -> None:
+def test_a_warm_server_without_a_participant_makes_no_environments(launch: Any) -> None:
     server = launch(agent(), SERVES, SPARE="on")
     with connect(url(server), compression=None, proxy=None) as program:
         with pytest.raises(ConnectionClosed):
             program.recv(SECONDS)
         assert program.close_code == 1013
-    assert processes(server) == []
+    assert processes_of(server) == []
 
 
-def test_a_program_that_does_not_read_its_answers_keeps_no_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_that_does_not_read_its_answers_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(environments, "_SEND_SECONDS", 0.5)
     made = environments.Environments(tmp_path)
 

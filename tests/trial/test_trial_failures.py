@@ -1,4 +1,4 @@
-"""Researchers' code that fails, hangs or dawdles."""
+"""Researchers' code that fails, hangs or is slow, and who is recorded as having chosen an action."""
 
 import asyncio
 import re
@@ -30,11 +30,11 @@ UI = {"stop": True, "left": True}
 NAMES = {"actionSpace": ["noop", "left"], "startingFrameRate": 60, "ui": UI}
 
 
-def agent(**methods):
+def agent_source(**methods):
     return BASE + "".join(f"    def {name}:\n        {body}\n" for name, body in methods.items())
 
 
-def end_of(server, open_client):
+def failed_client(server, open_client):
     async def play():
         async with open_client(server.address) as client:
             await client.hello()
@@ -57,7 +57,7 @@ def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_cli
         "self.steps += 1", "self.steps += 1\n        if self.steps % 4 == 0: raise ValueError('boom')"
     )
     server = launch(source, NAMES)
-    client = end_of(server, open_client)
+    client = failed_client(server, open_client)
     assert client.done["episodes"] == 3
     assert len(client.errors) == 3
     answers = server.answer()["answers"]
@@ -78,7 +78,7 @@ def test_one_failure_among_good_episodes_does_not_fail_the_trial(launch, open_cl
         f"    def step(self, action):\n        {body}return None, 1.0, n % 3 == 0, {{}}\n"  # an old four-tuple
     )
     server = launch(source, {**NAMES, "maxEpisodes": 3})
-    end_of(server, open_client)
+    failed_client(server, open_client)
     assert server.answer()["answers"]["outcome"] == "finished"
 
 
@@ -111,7 +111,7 @@ BROKEN = {
 }
 
 
-def does_not_begin(server, open_client, user, status=NO_AGENT):
+def assert_does_not_begin(server, open_client, user, status=NO_AGENT):
     async def play():
         async with open_client(server.address) as client:
             await client.hello(userId=user)
@@ -132,39 +132,39 @@ def does_not_begin(server, open_client, user, status=NO_AGENT):
 def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
     source, last_line = BROKEN[name]
     server = launch(source, NAMES, USER_ID=f"P-{name}")
-    does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
+    assert_does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
     said = server.log_text().splitlines()
     assert said.count("Traceback (most recent call last):") == 1
     (begin,) = [n for n, line in enumerate(said) if line.startswith("Traceback")]
     assert " ERROR the agent " in said[begin - 1]
-    # What local mode shows: the first line after the frames.
+    # Local mode shows the first line after the frames of the traceback.
     assert re.fullmatch(last_line, next(line for line in said[begin + 1 :] if not line.startswith(" "))), said
 
 
-def test_no_names_of_actions_and_no_such_game(launch, open_client):
-    does_not_begin(launch(BASE, {"ui": UI}, USER_ID="P-names"), open_client, "P-names")
+def test_a_trial_does_not_begin_without_names_of_actions_or_with_an_unknown_game(launch, open_client):
+    assert_does_not_begin(launch(BASE, {"ui": UI}, USER_ID="P-names"), open_client, "P-names")
     server = launch("", {"game": "Nowhere-v1"}, USER_ID="P-none")
-    does_not_begin(server, open_client, "P-none")
+    assert_does_not_begin(server, open_client, "P-none")
     (server.log.parent / "agent" / "agent.py").unlink()
     server = launch(None, {"game": "Nowhere-v1"}, USER_ID="P-game")
-    does_not_begin(server, open_client, "P-game")
+    assert_does_not_begin(server, open_client, "P-game")
     assert "\ngymnasium.error.NameNotFound: " in server.log_text()
 
 
-def test_a_broken_helper_is_named(launch, open_client, tmp_path):
+def test_the_log_names_the_line_of_a_broken_helper(launch, open_client, tmp_path):
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent" / "my_helper.py").write_text("x = (\n")
     server = launch("import my_helper\n", NAMES, USER_ID="P-help")
-    does_not_begin(server, open_client, "P-help")
+    assert_does_not_begin(server, open_client, "P-help")
     assert "\nmy_helper.py:1: SyntaxError: '(' was never closed\n" in server.log_text()
 
 
-def test_a_start_that_never_returns(launch, open_client):
+def test_a_trial_whose_start_never_returns_does_not_begin(launch, open_client):
     server = launch(BASE.replace("self.steps = 0", "time.sleep(1000)"), NAMES, START_SECONDS="1", USER_ID="P-slow")
-    does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
+    assert_does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
 
 
-def test_a_broken_agent_nobody_waits_for_ends_the_server(launch):
+def test_a_broken_agent_ends_a_server_without_clients(launch):
     begun = time.monotonic()
     server = launch("import boom\n", NAMES)
     assert server.wait(10) == NO_AGENT
@@ -172,7 +172,7 @@ def test_a_broken_agent_nobody_waits_for_ends_the_server(launch):
     assert not server.answered()
 
 
-def test_a_step_already_answered_stays_done_with_a_broken_agent(launch, open_client):
+def test_an_answered_game_step_stays_done_with_a_broken_agent(launch, open_client):
     server = launch("import boom\n", NAMES)
     path = server.store / "study/users/P1/answers/3.json"
     path.parent.mkdir(parents=True)
@@ -188,26 +188,26 @@ def test_a_step_already_answered_stays_done_with_a_broken_agent(launch, open_cli
     assert server.wait() == 0
 
 
-def test_failing_in_the_middle_names_the_line_and_is_kept(launch, open_client):
+def test_a_failure_in_mid_episode_is_recorded_and_the_log_names_its_line(launch, open_client):
     source = BASE.replace("self.steps += 1", "self.steps += 1\n        if self.steps > 3: raise ValueError('boom')")
     server = launch(source, NAMES)
-    end_of(server, open_client)
+    failed_client(server, open_client)
     assert server.answer()["answers"]["outcome"] == "failed"
     assert "\nagent.py:11: ValueError: boom\n" in server.log_text()
     assert server.log_text().count("Traceback") == 1, "the same failure again needs no traceback again"
 
 
-def test_a_step_that_never_returns(launch, open_client):
+def test_a_step_that_never_returns_ends_the_trial(launch, open_client):
     source = BASE.replace("self.steps += 1", "self.steps += 1\n        while self.steps > 5: time.sleep(1)")
     server = launch(source, NAMES, STEP_SECONDS="1")
-    end_of(server, open_client)
+    failed_client(server, open_client)
     answers = server.answer()["answers"]
     assert (answers["outcome"], answers["frames"]) == ("failed", 5)
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     assert [line["kind"] for line in lines] == ["header", "reset"] + ["step"] * 5 + ["error", "end"]
 
 
-def test_a_stuck_step_does_not_hold_up_the_end(launch, open_client):
+def test_a_step_that_hangs_does_not_delay_the_end_of_the_server(launch, open_client):
     source = BASE.replace(
         "self.steps += 1",
         "self.steps += 1\n        while self.steps > 5:\n            open('stuck', 'w').close()\n            time.sleep(1)",
@@ -234,7 +234,7 @@ def test_a_stuck_step_does_not_hold_up_the_end(launch, open_client):
     assert not server.answered()
 
 
-def test_a_slow_step_leaves_the_connection_alive(launch, open_client, tmp_path):
+def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_path):
     under_way, go_on = tmp_path / "under_way", tmp_path / "go_on"
     source = BASE.replace(
         "        self.steps += 1\n",
@@ -262,7 +262,7 @@ def test_a_slow_step_leaves_the_connection_alive(launch, open_client, tmp_path):
 
 
 def steps_by(launch, open_client, source):
-    """What one episode's steps say of who chose; `left` is held in the later ones."""
+    """How the steps of an episode say who chose the action; `left` is held in the later steps."""
     waits = "self.steps += 1\n        while self.steps == 20 and not os.path.exists('go_on'): time.sleep(0.02)"
     server = launch("import os\n" + source.replace("self.steps += 1", waits), {**NAMES, "maxEpisodes": 1})
 
@@ -288,37 +288,37 @@ def steps_by(launch, open_client, source):
 FORTY = BASE.replace('"done": False', '"done": self.steps == 40')
 
 
-def test_an_agent_that_takes_an_action(launch, open_client):
-    """Whether or not it is the one that the human asked for."""
+def test_a_step_is_by_the_agent_if_it_names_its_action(launch, open_client):
+    """Whether or not it is the action that the human asked for."""
     source = FORTY.replace('"info": {}', '"info": {"action": 1}')
     assert steps_by(launch, open_client, source) == {(None, 1, "left", "agent"), (1, 1, "left", "agent")}
 
 
-def test_an_agent_that_overrides_the_human(launch, open_client):
+def test_a_step_is_by_the_agent_if_it_overrides_the_human(launch, open_client):
     source = FORTY.replace('"info": {}', '"info": {}, "action": 0')
     assert steps_by(launch, open_client, source) == {(None, 0, "noop", "agent"), (1, 0, "noop", "agent")}
 
 
-def test_an_agent_that_says_nothing(launch, open_client):
+def test_a_step_is_by_the_human_if_the_agent_names_no_action(launch, open_client):
     assert steps_by(launch, open_client, FORTY) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
 
 
-def test_an_environment_whose_info_has_an_action_of_its_own(launch, open_client):
-    """It says so at reset already: then only another action than the human's is the agent's."""
+def test_a_step_is_by_the_human_if_the_environments_info_repeats_their_action(launch, open_client):
+    """The info of reset has an action already: then only an action other than the human's is the agent's."""
     echo = FORTY.replace('"info": {}', '"info": {"action": action}').replace(
         "        pass\n    def step", '        return None, {"action": 0}\n    def step'
     )
     assert steps_by(launch, open_client, echo) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
 
 
-def test_an_agent_that_overrides_in_such_an_environment(launch, open_client):
+def test_a_step_is_by_the_agent_if_such_an_info_has_another_action(launch, open_client):
     other = FORTY.replace('"info": {}', '"info": {"action": 1 - action}').replace(
         "        pass\n    def step", '        return None, {"action": 0}\n    def step'
     )
     assert steps_by(launch, open_client, other) == {(None, 1, "left", "agent"), (1, 0, "noop", "agent")}
 
 
-def test_without_an_agent_nobody_but_the_human_chooses():
+def test_without_an_agent_only_the_human_chooses():
     class Echo:
         def step(self, action):
             return None, 0.0, False, False, {"action": 5}

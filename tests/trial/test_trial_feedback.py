@@ -1,4 +1,4 @@
-"""What the agent hears and what the recording says of it are the same step of the same episode."""
+"""The agent hears feedback at the same step of the same episode as the recording says."""
 
 import asyncio
 import json
@@ -58,27 +58,27 @@ TRIAL = {
 }
 
 
-def agent(length=0, fail_at=0):
+def agent_source(length=0, fail_at=0):
     return HISTORY.format(length=length, fail_at=fail_at)
 
 
-def words(line):
+def words_in(line):
     return [m["command"] for m in line.get("messages", []) if m.get("command") in ("good", "bad")]
 
 
-def heard_as_recorded(lines):
-    """Every word of the recording in order; each was heard at the step, or at the end, that the recording says."""
+def words_heard_as_recorded(lines):
+    """Return the words of the recording in order; assert that each was heard at the step, or the end, that has it."""
     said, at_the_end = [], []
     for line in lines:
         if line["kind"] == "reset":
             assert line["info"]["heard"] == at_the_end
             at_the_end = []
         elif line["kind"] == "step":
-            assert line["info"]["heard"] == words(line)
+            assert line["info"]["heard"] == words_in(line)
         elif line["kind"] in ("end", "break") and line.get("why") != "shutdown":
-            at_the_end += words(line)
-        if line.get("why") != "shutdown":  # not heard before the server ended: the next server repeats it
-            said += words(line)
+            at_the_end += words_in(line)
+        if line.get("why") != "shutdown":  # the agent has not heard it: the next server repeats it
+            said += words_in(line)
     return said
 
 
@@ -87,66 +87,66 @@ def all_lines(server, name="a-1"):
 
 
 def killed(server):
-    """Kill the server, and store its recordings as whoever started it does."""
+    """Kill the server, and store its recordings, as local mode does."""
     server.process.kill()
     server.wait()
     for part in server.store.rglob("*.part"):
         part.rename(part.with_suffix(""))
 
 
-async def held(client):
+async def pause(client):
     await client.say(command="pause")
     await client.until(lambda: client.state["state"] == "paused")
 
 
-async def more(client, frames):
+async def wait_for_frames(client, frames):
     seen = len(client.frames)
     await client.until(lambda: len(client.frames) >= seen + frames)
 
 
 async def reset_while_held(client):
-    """Pause, praise, begin again, go on."""
-    await held(client)
+    """Pause, say good, reset, and go on."""
+    await pause(client)
     await client.say(command="good")
     await client.say(command="reset")
     await client.until(lambda: client.state["episode"] == 2)
     await client.say(command="start")
-    await more(client, 5)
+    await wait_for_frames(client, 5)
 
 
 def test_feedback_between_a_pause_and_a_reset_belongs_to_the_episode_that_ends(launch, open_client):
-    server = launch(agent(), {**TRIAL, "dataFile": "trial"}, SERVER="a-1")
+    server = launch(agent_source(), {**TRIAL, "dataFile": "trial"}, SERVER="a-1")
 
     async def play():
         async with open_client(server.address) as client:
             await client.play(5)
             await reset_while_held(client)
             await client.say(command="bad")
-            await more(client, 5)
+            await wait_for_frames(client, 5)
             await client.say(command="stop")
             await client.closed()
 
     asyncio.run(play())
     assert server.wait() == 0
     lines = all_lines(server)
-    assert heard_as_recorded(lines) == ["good", "bad"]
+    assert words_heard_as_recorded(lines) == ["good", "bad"]
     (end,) = (line for line in lines if line["kind"] == "end" and line["episode"] == 1)
-    assert words(end) == ["good"]
+    assert words_in(end) == ["good"]
 
 
 def test_after_a_kill_the_game_goes_on_although_feedback_came_before_a_reset(launch, open_client):
-    first = launch(agent(), TRIAL, SERVER="a-1")
+    first = launch(agent_source(), TRIAL, SERVER="a-1")
 
     async def play():
         async with open_client(first.address) as client:
             await client.play(5)
             await reset_while_held(client)
             await client.say(command="bad")
-            await more(client, 50)
+            await wait_for_frames(client, 50)
 
     asyncio.run(play())
     killed(first)
-    second = launch(agent(), TRIAL, SERVER="a-2")
+    second = launch(agent_source(), TRIAL, SERVER="a-2")
 
     async def go_on():
         async with open_client(second.address) as client:
@@ -159,14 +159,14 @@ def test_after_a_kill_the_game_goes_on_although_feedback_came_before_a_reset(lau
     assert client.errors == []
     after = all_lines(second, "a-2")
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
-    assert heard_as_recorded(all_lines(first)) == ["good", "bad"]
+    assert words_heard_as_recorded(all_lines(first)) == ["good", "bad"]
     assert second.answer()["answers"]["frames"] == sum(line["kind"] == "step" for line in all_lines(first) + after)
 
 
 @pytest.mark.parametrize("fail_at", [0, 7])
-def test_every_word_is_heard_where_the_recording_has_it_whenever_it_is_said(launch, open_client, fail_at):
+def test_the_agent_hears_every_word_at_the_step_where_the_recording_has_it(launch, open_client, fail_at):
     trial = {**TRIAL, "dataFile": "trial", "maxEpisodes": 1000}
-    server = launch(agent(length=12, fail_at=fail_at), trial, SERVER="a-1")
+    server = launch(agent_source(length=12, fail_at=fail_at), trial, SERVER="a-1")
     said = []
 
     async def talk(client):
@@ -176,7 +176,7 @@ def test_every_word_is_heard_where_the_recording_has_it_whenever_it_is_said(laun
                 await client.say(command=word)
                 said.append(word)
                 await asyncio.sleep(0.01)
-            while len(client.frames) == seen:  # a server that stands still would take what waits for it for a flood
+            while len(client.frames) == seen:  # a server that stood still would take all waiting messages for a flood
                 await asyncio.sleep(0.01)
 
     async def play():
@@ -191,19 +191,19 @@ def test_every_word_is_heard_where_the_recording_has_it_whenever_it_is_said(laun
     asyncio.run(play())
     assert server.wait() == 0
     lines = all_lines(server)
-    assert len(heard_as_recorded(lines)) > 20
+    assert len(words_heard_as_recorded(lines)) > 20
     assert any(line["kind"] == "error" for line in lines) == bool(fail_at)
 
 
 @pytest.mark.parametrize("steps", [0, 5])
-def test_feedback_that_a_server_took_with_it_is_heard_on_the_next(launch, open_client, steps):
-    first = launch(agent(), TRIAL, SERVER="a-1")
+def test_the_next_server_gives_the_agent_the_feedback_that_it_has_not_heard(launch, open_client, steps):
+    first = launch(agent_source(), TRIAL, SERVER="a-1")
 
     async def play():
         async with open_client(first.address) as client:
             if steps:
                 await client.play(steps)
-                await held(client)
+                await pause(client)
             else:
                 await client.hello()
                 await client.until(lambda: client.frame is not None)
@@ -215,9 +215,9 @@ def test_feedback_that_a_server_took_with_it_is_heard_on_the_next(launch, open_c
 
     asyncio.run(play())
     assert first.wait() == 0
-    assert words(all_lines(first)[-1]) == ["good"]
+    assert words_in(all_lines(first)[-1]) == ["good"]
     for attempt in (2, 3):
-        server = launch(agent(), TRIAL, SERVER=f"a-{attempt}")
+        server = launch(agent_source(), TRIAL, SERVER=f"a-{attempt}")
 
         async def go_on(address=server.address):
             async with open_client(address) as client:
@@ -228,10 +228,10 @@ def test_feedback_that_a_server_took_with_it_is_heard_on_the_next(launch, open_c
         server.terminate()
         server.wait()
         assert client.errors == []
-        assert heard_as_recorded(all_lines(server, f"a-{attempt}")) == (["good"] if attempt == 2 else [])
+        assert words_heard_as_recorded(all_lines(server, f"a-{attempt}")) == (["good"] if attempt == 2 else [])
 
 
-def test_the_past_keeps_what_nobody_heard():
+def test_the_recorded_trial_keeps_words_until_a_step_has_heard_them():
     past = RecordedTrial()
 
     def happen(kind, **fields):

@@ -10,7 +10,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 
-def test_wrong_greetings_are_closed(launch, open_client):
+def test_a_wrong_hello_closes_the_connection(launch, open_client):
     server = launch()
 
     async def greet(expected, text=None, address="", **change):
@@ -44,7 +44,7 @@ def test_wrong_greetings_are_closed(launch, open_client):
             greet(4404, step=4),
             greet(4401, step={}),
         )
-        async with open_client(server.address) as client:  # and the participant still gets in
+        async with open_client(server.address) as client:  # the participant is still let in
             await client.play()
         async with open_client(server.address + "?token=the-secret-token") as client:
             await client.hello(token=None, step=3)
@@ -56,7 +56,7 @@ def test_wrong_greetings_are_closed(launch, open_client):
     assert "wrong" not in log
 
 
-def test_somebody_who_says_nothing_is_closed(launch, open_client):
+def test_a_client_that_says_nothing_is_closed(launch, open_client):
     server = launch(HELLO_SECONDS="1")
 
     async def wait():
@@ -66,7 +66,7 @@ def test_somebody_who_says_nothing_is_closed(launch, open_client):
     asyncio.run(wait())
 
 
-def test_nonsense_is_answered_in_words_and_the_third_time_closed(launch, open_client):
+def test_wrong_messages_get_a_sentence_and_the_third_without_json_closes_the_connection(launch, open_client):
     server = launch()
 
     async def play():
@@ -104,7 +104,7 @@ def test_nonsense_is_answered_in_words_and_the_third_time_closed(launch, open_cl
     assert "Traceback" not in server.log_text()
 
 
-def test_long_messages_are_1009(launch, open_client):
+def test_too_long_a_message_closes_with_1009(launch, open_client):
     server = launch()
 
     async def play():
@@ -119,7 +119,7 @@ def test_long_messages_are_1009(launch, open_client):
     asyncio.run(play())
 
 
-def test_floods_are_4429(launch, open_client):
+def test_a_flood_closes_with_4429(launch, open_client):
     server = launch()
 
     async def play():
@@ -156,7 +156,7 @@ def test_many_strangers_do_not_keep_the_participant_out(launch, open_client):
 
 
 @pytest.mark.parametrize(("path", "status"), [("healthz", 200), ("", 426), ("etc/passwd", 404)])
-def test_plain_http(launch, path, status):
+def test_a_plain_http_request_gets_its_status(launch, path, status):
     server = launch()
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/{path}", timeout=20) as answer:

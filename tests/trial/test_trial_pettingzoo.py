@@ -1,4 +1,4 @@
-"""PettingZoo's own games on a real server, without an agent.py: a participant against an ONNX file."""
+"""A game of PettingZoo on a real server, without an agent.py: a participant plays against an ONNX file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TICTACTOE = {
 
 
 def test_a_game_in_turns_against_a_file_with_legal_actions_alone(launch: Any, open_client: Any, tmp_path: Any) -> None:
-    """The file likes square 8 most, then 7 …; the participant takes the first row, and a square that is taken."""
+    """The file prefers square 8, then 7 …; the participant takes the first row, and tries a square that is taken."""
     agent = tmp_path / "agent"
     file = onnx_files.constant(agent / "policies/p.onnx", np.arange(9, dtype=np.float32)[None], size=18)
     server = launch(None, trial=TICTACTOE, SDL_VIDEODRIVER="dummy", AGENT_DIR=str(agent))
@@ -31,7 +31,7 @@ def test_a_game_in_turns_against_a_file_with_legal_actions_alone(launch: Any, op
             await client.hello()
             await client.until(lambda: client.controls)
             await client.say(command="start")
-            for press in ("0", "8", "1", "2"):  # 8 is the file's by then
+            for press in ("0", "8", "1", "2"):  # the file has taken square 8 by then
                 await client.until(lambda: client.state.get("toAct"))
                 await client.say(action=press)
                 refused = press == "8"

@@ -1,4 +1,4 @@
-"""HIPPO's React front end on a real trial server: what it sends word for word, and who may play without a token."""
+"""HIPPO's React front end on a real trial server: what it sends, word for word, and which pages need no token."""
 
 import asyncio
 import base64
@@ -51,7 +51,7 @@ def messages_in(server):
 # ---- what it sends
 
 
-def test_its_whole_session_is_played_and_recorded(launch, grid):
+def test_hippos_page_plays_a_whole_session_that_is_recorded(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
 
     async def play():
@@ -105,7 +105,7 @@ def test_its_whole_session_is_played_and_recorded(launch, grid):
     assert "P1" not in json.dumps(said), "who plays stands in the folder's name alone"
 
 
-def test_it_goes_on_where_it_was_when_its_page_connects_again(launch, grid):
+def test_the_game_goes_on_when_hippos_page_connects_again(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE, LINGER_SECONDS="60")
 
     async def play():
@@ -142,7 +142,7 @@ def test_two_pages_of_one_participant_are_one_player(launch, grid):
     asyncio.run(play())
 
 
-def test_an_action_that_the_game_does_not_have_lets_go_as_with_hippo(launch, grid):
+def test_an_unknown_action_ends_the_last_one_as_with_hippo(launch, grid):
     server = launch(grid(None), {**TRIAL, "ui": {**UI}}, PLAIN_ORIGINS=HERE)
 
     async def play():
@@ -164,7 +164,7 @@ def test_an_action_that_the_game_does_not_have_lets_go_as_with_hippo(launch, gri
     assert actions[-2:] == ["noop", "noop"]
 
 
-def test_our_own_protocol_stays_strict(launch, open_client):
+def test_a_client_of_our_own_protocol_gets_errors_for_hippos_forms(launch, open_client):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
 
     async def play():
@@ -207,7 +207,7 @@ def test_our_own_protocol_stays_strict(launch, open_client):
         ({"long": "x" * 3600, "b": 1}, messages.Message(fields_dropped=2)),
     ],
 )
-def test_what_it_says_is_read(fields, message):
+def test_hippos_messages_are_read(fields, message):
     assert plain.parse(json.dumps(fields)) == message
 
 
@@ -238,7 +238,7 @@ KNOWN = st.sampled_from(["command", "action", "held", "changeFrameRate", "ack", 
 
 @given(st.dictionaries(KNOWN | TEXTS, VALUES | st.sampled_from(["start", "left", "faster", "40"]), max_size=8))
 @settings(max_examples=examples(300))
-def test_whatever_it_says_is_read_or_gets_a_sentence_and_can_be_recorded(said):
+def test_any_message_is_read_or_gets_a_sentence_and_can_be_recorded(said):
     log = MessageLog()
     try:
         log.add(plain.parse(json.dumps(said)), 1)
@@ -287,7 +287,7 @@ def test_unknown_fields_that_wait_for_a_line_of_the_recording_are_bounded():
     assert "fields" in log.messages[0]
 
 
-def test_an_action_is_kept_until_the_next():
+def test_an_action_of_hippos_page_acts_until_the_next():
     controls = Controls(("noop", "left", "right"), 1)
     controls.keep("left")
     assert [controls.take() for _ in range(3)] == [(1, True)] * 3
@@ -313,8 +313,8 @@ def test_the_first_action_is_asked_for_where_no_action_is_called_noop():
 # ---- who may play without a token
 
 
-def play_once(server, **options):
-    """What a page is shown: its first frame, or the sentence that refuses it."""
+def first_answer(server, **options):
+    """Open a page; return the sentence that refuses it, or None if it gets a frame."""
 
     async def play():
         async with hippo_page(server.address, **options) as page:
@@ -345,11 +345,11 @@ def play_once(server, **options):
 )
 def test_the_id_and_the_origin_open_the_server_where_that_is_allowed(launch, origins, user_id, origin, words):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=origins)
-    assert play_once(server, user_id=user_id, origin=origin) == words
+    assert first_answer(server, user_id=user_id, origin=origin) == words
 
 
-def test_a_page_of_another_study_does_not_play_this_one(launch):
-    """The name of an id leads to one server, whatever studies it takes part in."""
+def test_a_page_of_another_study_cannot_play_this_one(launch):
+    """A participant's DNS name leads to one server, whatever studies they take part in."""
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
 
     async def come(project_id):
@@ -361,10 +361,10 @@ def test_a_page_of_another_study_does_not_play_this_one(launch):
     assert "actionSpace" in asyncio.run(come("study"))
 
 
-def test_two_origins_in_one_request_are_none(launch):
+def test_a_request_with_two_origins_is_refused(launch):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
     with pytest.raises(InvalidStatus) as refused:
-        play_once(server, headers={"Origin": "https://evil.example"})
+        first_answer(server, headers={"Origin": "https://evil.example"})
     assert refused.value.response.status_code == 400
 
 
@@ -418,7 +418,7 @@ def test_a_warm_server_lets_nobody_in_without_the_token():
     assert TrialSettings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
 
 
-def test_a_refused_page_shows_the_sentence_and_is_not_sent_round_in_circles(launch):
+def test_a_refused_page_shows_the_sentence_and_stays_connected(launch):
     server = launch(trial=TRIAL)
 
     async def play():

@@ -22,7 +22,7 @@ TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z")
 UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
 
 
-def test_plays_from_hello_to_answer(launch, open_client, grid):
+def test_a_participant_plays_from_the_hello_to_the_answer(launch, open_client, grid):
     server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI}, GROUP="1")
 
     async def play():
@@ -61,7 +61,7 @@ def test_plays_from_hello_to_answer(launch, open_client, grid):
     assert "P1" not in server.log_text()
 
 
-def test_recording_says_what_happened(launch, open_client, grid, tmp_path):
+def test_the_recording_says_what_happened(launch, open_client, grid, tmp_path):
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent/requirements.txt").write_text("pillow\n")
     server = launch(grid(None), {"ui": UI, "recordObservations": True, "startingFrameRate": 40})
@@ -115,7 +115,7 @@ def test_recording_says_what_happened(launch, open_client, grid, tmp_path):
     assert server.answer()["group"] is None
 
 
-def test_one_file_for_a_trial(launch, open_client, grid):
+def test_with_data_file_trial_a_trial_has_one_file(launch, open_client, grid):
     server = launch(grid(5), {"maxEpisodes": 3, "dataFile": "trial", "startingFrameRate": 60})
 
     play_to_the_end(server, open_client)
@@ -128,7 +128,7 @@ def test_one_file_for_a_trial(launch, open_client, grid):
     assert len(set(seeds)) == 3
 
 
-def test_pause_holds_and_start_goes_on(launch, open_client):
+def test_pause_holds_the_game_and_start_goes_on(launch, open_client):
     server = launch()
 
     async def play():
@@ -148,7 +148,7 @@ def test_pause_holds_and_start_goes_on(launch, open_client):
     asyncio.run(play())
 
 
-def test_frame_rate_stays_in_its_limits(launch, open_client):
+def test_the_frame_rate_stays_within_its_limits(launch, open_client):
     limits = {"minFrameRate": 5, "maxFrameRate": 40, "frameRateStepSize": 10, "allowFrameRateChange": True}
     controls = {"fpsUp": True, "fpsDown": True, "fpsSet": True}
     server = launch(trial={**limits, "startingFrameRate": 30, "ui": controls})
@@ -171,7 +171,7 @@ def test_frame_rate_stays_in_its_limits(launch, open_client):
     assert 1 / 16 < gap < 1 / 8, "a step that comes late changes no other"
 
 
-def test_fixed_frame_rate_is_refused_in_words(launch, open_client):
+def test_changing_a_fixed_frame_rate_is_refused_with_a_sentence(launch, open_client):
     server = launch()
 
     async def play():
@@ -195,7 +195,7 @@ def test_fixed_frame_rate_is_refused_in_words(launch, open_client):
     assert "actionSpace" in errors[3]
 
 
-def test_what_the_ui_leaves_out_is_refused_and_does_nothing(launch, open_client):
+def test_controls_that_are_missing_in_ui_are_refused_and_do_nothing(launch, open_client):
     server = launch(trial={"allowFrameRateChange": True, "startingFrameRate": 60, "ui": {"up": True, "pause": False}})
     off = [
         ("pause", {"command": "pause"}),
@@ -218,7 +218,7 @@ def test_what_the_ui_leaves_out_is_refused_and_does_nothing(launch, open_client)
             await client.until(lambda: len(client.frames) > seen + 5)
             assert (client.state["state"], client.state["episode"], client.state["frameRate"]) == ("playing", 1, 60)
             errors = client.errors
-        async with open_client(server.address) as client:  # who leaves holds the game in any case
+        async with open_client(server.address) as client:  # a client that leaves pauses the game in any case
             await client.hello()
             await client.until(lambda: client.controls)
             assert client.controls["state"] == "paused"
@@ -234,7 +234,7 @@ def test_what_the_ui_leaves_out_is_refused_and_does_nothing(launch, open_client)
     assert {line["actionName"] for line in lines if line["kind"] == "step"} == {"noop"}
 
 
-def test_reload_comes_back_to_the_same_trial(launch, open_client, grid):
+def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client, grid):
     server = launch(grid(None), {"ui": UI})
 
     async def play():
@@ -264,7 +264,7 @@ def test_reload_comes_back_to_the_same_trial(launch, open_client, grid):
     assert steps == list(range(1, len(steps) + 1))
 
 
-def test_second_tab_takes_over(launch, open_client):
+def test_a_second_tab_takes_over(launch, open_client):
     server = launch()
 
     async def play():
@@ -281,7 +281,7 @@ def test_second_tab_takes_over(launch, open_client):
     asyncio.run(play())
 
 
-def test_slow_client_gets_fewer_frames_never_late_ones(launch, open_client):
+def test_a_slow_client_gets_fewer_frames_and_no_late_ones(launch, open_client):
     server = launch(trial={"startingFrameRate": 60})
 
     async def play():
@@ -300,7 +300,7 @@ def test_slow_client_gets_fewer_frames_never_late_ones(launch, open_client):
     assert ids[-1] - ids[20] > len(ids[21:]), "the game went on at its own pace"
 
 
-def test_page_that_stops_answering_is_paused(launch, open_client):
+def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_client):
     server = launch()
 
     async def play():
@@ -312,7 +312,7 @@ def test_page_that_stops_answering_is_paused(launch, open_client):
     asyncio.run(play())
 
 
-def test_client_that_never_acknowledges_gets_frames(launch, open_client):
+def test_a_client_that_never_acknowledges_gets_frames(launch, open_client):
     server = launch(trial={"startingFrameRate": 60})
 
     async def play():
@@ -324,7 +324,7 @@ def test_client_that_never_acknowledges_gets_frames(launch, open_client):
     asyncio.run(play())
 
 
-def test_hippo_client(launch, open_client, grid):
+def test_a_client_without_a_subprotocol_gets_jpegs_in_json(launch, open_client, grid):
     """HIPPO's own pages: no subprotocol, JPEG in JSON, and the text `done`."""
     server = launch(grid(None), {"maxEpisodes": 1, "ui": UI})
 
@@ -398,7 +398,7 @@ def test_ms_pacman_with_the_example_agent(launch, open_client):
         assert info["lives"] == line["info"]["lives"]
 
 
-def test_default_agent_makes_any_gymnasium_game(launch, open_client):
+def test_without_agent_py_any_game_of_gymnasium_is_played(launch, open_client):
     server = launch(None, {"game": "ALE/Freeway-v5", "ui": UI})
 
     async def play():
@@ -409,7 +409,7 @@ def test_default_agent_makes_any_gymnasium_game(launch, open_client):
     asyncio.run(play())
 
 
-def test_a_step_already_answered_is_not_played_again(launch, open_client):
+def test_an_answered_game_step_is_not_played_again(launch, open_client):
     answer = {"schema": 1, "answers": {"episodes": 4, "score": 12}}
 
     server = launch()
@@ -428,7 +428,7 @@ def test_a_step_already_answered_is_not_played_again(launch, open_client):
     assert server.answer() == answer
 
 
-def test_two_game_steps_on_one_server(launch, open_client, grid):
+def test_one_server_plays_two_game_steps(launch, open_client, grid):
     server = launch(grid(5), {"maxEpisodes": 1, "startingFrameRate": 60}, GAME_STEPS="2,4")
 
     async def play(step):
@@ -446,7 +446,7 @@ def test_two_game_steps_on_one_server(launch, open_client, grid):
     assert list(server.recordings()) == ["2-episode-0001.jsonl.gz", "4-episode-0001.jsonl.gz"]
 
 
-def test_an_agent_that_was_changed_within_a_second_is_the_new_one(launch, grid, tmp_path):
+def test_a_change_of_agent_py_within_a_second_is_loaded(launch, grid, tmp_path):
     """Python takes stored bytecode for current if size and second of the source are the same (PEP 552)."""
     file = tmp_path / "agent" / "agent.py"
     file.parent.mkdir()

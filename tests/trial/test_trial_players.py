@@ -1,4 +1,4 @@
-"""A participant and a policy on a real server: who acts, what is shown, what is recorded, what goes wrong."""
+"""A participant and a policy on a real server: who acts, what is shown and recorded, and policies that fail."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from testing import onnx_files
 from tests.trial.two_players import TRIAL, two_players
 
 
-def played(server, open_client, *, frames=8, keys=(), stop=False):
-    """Play so many steps with these presses; the client."""
+def play_and_end(server, open_client, *, frames=8, keys=(), stop=False):
+    """Play until `frames` pictures have come, with these keys held; end the server; return the client."""
 
     async def run():
         async with open_client(server.address) as client:
@@ -42,7 +42,7 @@ def steps(server, name="a1"):
 
 def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
     server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 5})
-    client = played(server, open_client, frames=6, keys=["up"])
+    client = play_and_end(server, open_client, frames=6, keys=["up"])
     assert client.errors == [], server.log_text()
     assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
     lines = steps(server)
@@ -62,16 +62,16 @@ def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client)
 
 def test_the_head_of_a_recording_says_who_plays(launch, open_client):
     server = launch(two_players(), trial=TRIAL)
-    played(server, open_client, frames=2)
+    play_and_end(server, open_client, frames=2)
     head, reset = next(iter(server.recordings().values()))[:2]
     assert head["players"] == {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "agent:Partner"}}
     assert reset["toAct"] == ["left", "right"]
 
 
-def test_the_head_of_a_recording_says_by_which_rules_they_act(launch, open_client):
+def test_the_head_of_a_recording_says_by_which_rules_players_act(launch, open_client):
     rules = {"frameSkip": 3, "input": "single", "idleAction": {"right": "down"}, "seed": 4}
     server = launch(two_players(), trial=TRIAL | rules)
-    played(server, open_client, frames=2)
+    play_and_end(server, open_client, frames=2)
     head, reset = next(iter(server.recordings().values()))[:2]
     assert (head["frameSkip"], head["input"], head["pace"]) == (3, "single", "realtime")
     assert head["idleActions"] == {"left": 0, "right": 2}
@@ -103,7 +103,7 @@ def test_a_recording_with_several_players_ends_with_all_scores(launch, open_clie
 
 def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
     server = launch(two_players(act="time.sleep(0.2)"), trial=TRIAL | {"startingFrameRate": 20})
-    played(server, open_client, frames=30)
+    play_and_end(server, open_client, frames=30)
     lines = steps(server)
     parts = [line["players"]["right"] for line in lines]
     assert "late" in {part["by"] for part in parts}
@@ -126,9 +126,9 @@ def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
         ("return None", "None"),
     ],
 )
-def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_client, act, said):
+def test_a_policy_that_fails_is_logged_once_and_the_game_goes_on(launch, open_client, act, said):
     server = launch(two_players(act=act), trial=TRIAL | {"startingFrameRate": 10})
-    client = played(server, open_client, frames=8)
+    client = play_and_end(server, open_client, frames=8)
     assert client.errors == [], "the participant can do nothing about it"
     parts = [line["players"]["right"] for line in steps(server)]
     assert len(parts) >= 6
@@ -146,20 +146,20 @@ def test_a_policy_that_fails_is_told_once_and_the_game_goes_on(launch, open_clie
 
 def test_the_log_of_a_policy_that_fails_does_not_hold_the_participants_id(launch, open_client):
     server = launch(two_players(act="raise ValueError('not for ' + __import__('os').environ['USER_ID'])"), trial=TRIAL)
-    played(server, open_client)
+    play_and_end(server, open_client)
     assert "ValueError: not for (participant)" in server.log_text()
     assert "P1" not in server.log_text()
 
 
-def test_a_policy_that_hangs_holds_up_nothing(launch, open_client):
+def test_a_policy_that_hangs_delays_no_step(launch, open_client):
     server = launch(two_players(act="time.sleep(3600)"), trial=TRIAL | {"startingFrameRate": 30})
     began = time.monotonic()
-    played(server, open_client, frames=15)
+    play_and_end(server, open_client, frames=15)
     assert time.monotonic() - began < 12
     assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
 
 
-def test_a_file_that_takes_hours_does_not_make_the_server_fail_at_its_end(launch, open_client, tmp_path):
+def test_a_server_ends_well_although_a_policys_file_takes_hours(launch, open_client, tmp_path):
     onnx_files.endless(tmp_path / "agent/policies/p.onnx")
     players = {"left": "human", "right": "policies/p.onnx"}
     server = launch(two_players(length=5), trial=TRIAL | {"players": players, "maxEpisodes": 1})
@@ -183,7 +183,7 @@ def test_a_file_that_takes_hours_does_not_make_the_server_fail_at_its_end(launch
         ({"left": "human", "right": "policies/gone.onnx"}, "there is no file policies/gone.onnx"),
     ],
 )
-def test_players_that_do_not_fit_are_named_before_anybody_plays(launch, open_client, players, said):
+def test_players_that_do_not_fit_are_named_before_the_game(launch, open_client, players, said):
     server = launch(two_players(), trial={**TRIAL, "players": players})
 
     async def run():
@@ -221,13 +221,13 @@ def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_cl
 # ---- an interrupted game
 
 
-def test_an_interrupted_game_of_two_goes_on_where_it_was(launch, open_client):
+def test_an_interrupted_game_of_two_players_goes_on_where_it_was(launch, open_client):
     trial = TRIAL | {"startingFrameRate": 20, "frameSkip": 2}
     first = launch(two_players(), trial=trial, SERVER="a-1")
-    played(first, open_client, frames=9, keys=["down"])
+    play_and_end(first, open_client, frames=9, keys=["down"])
     before = steps(first, "a-1")
     second = launch(two_players(), trial=trial, SERVER="a-2")
-    played(second, open_client, frames=6)
+    play_and_end(second, open_client, frames=6)
     after = steps(second, "a-2")
     assert [line["step"] for line in before + after] == list(range(1, len(before + after) + 1)), second.log_text()
     parts = [line["players"]["right"] for line in before + after]
@@ -237,12 +237,15 @@ def test_an_interrupted_game_of_two_goes_on_where_it_was(launch, open_client):
     observed = [part["observed"] for part in fresh]
     every_second = range(0, len(parts), 2)
     # A partner that is late is not asked again meanwhile, and an answer after a server's last step counts nowhere.
-    lasting = [*range(answered(before)), *range(len(before), len(before) + answered(after))]
+    lasting = [
+        *range(steps_until_the_last_answer(before)),
+        *range(len(before), len(before) + steps_until_the_last_answer(after)),
+    ]
     prompt = [step for step in every_second if step in lasting and (not step or parts[step - 1]["by"] != "late")]
     assert observed == sorted(set(prompt) | set(observed) & set(every_second)), "every second step"
 
 
-def answered(lines):
+def steps_until_the_last_answer(lines):
     """The number of steps until the last one at which the partner was not late."""
     return max((number for number, line in enumerate(lines, 1) if line["players"]["right"]["by"] != "late"), default=0)
 
@@ -284,7 +287,7 @@ def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(lau
 def test_a_turn_of_limited_time_ends_without_a_press(launch, open_client):
     keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.2, "turnEnds": "random", "seed": 5}
     server = launch(two_players(turns=True), trial=TRIAL | keys)
-    played(server, open_client, frames=6)
+    play_and_end(server, open_client, frames=6)
     mine = [line["players"]["left"] for line in steps(server)[::2]]
     assert {part["by"] for part in mine} == {"random"}
 
@@ -292,13 +295,13 @@ def test_a_turn_of_limited_time_ends_without_a_press(launch, open_client):
 def test_a_policy_has_policy_seconds_in_its_turn(launch, open_client):
     keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.1, "policySeconds": 0.3}
     server = launch(two_players(turns=True, act="time.sleep(3600)"), trial=TRIAL | keys)
-    played(server, open_client, frames=5)
+    play_and_end(server, open_client, frames=5)
     assert [line["players"]["right"]["by"] for line in steps(server)[1::2]][:2] == ["late", "late"]
 
 
 def test_seeds_of_policies_follow_from_the_episodes(launch, open_client):
     act = "return (self.seed + self.asked) % 3\n\n    def reset(self, seed):\n        self.seed, self.asked = seed, 0"
     server = launch(two_players(act=act), trial=TRIAL | {"seed": 4})
-    played(server, open_client, frames=3)
+    play_and_end(server, open_client, frames=3)
     expected = int.from_bytes(hashlib.sha256(b"4\0right").digest()[:8], "big") % 2**31
     assert steps(server)[0]["players"]["right"]["action"] == (expected + 1) % 3

@@ -1,4 +1,4 @@
-"""A server without rights: everything it reads and stores goes through presigned requests, which it asks for one by one."""
+"""A server without rights reads and stores everything by presigned requests, which it asks for one by one."""
 
 import asyncio
 import contextlib
@@ -34,7 +34,7 @@ class Town(StrictS3):
     """The bucket with the records of our participant's servers."""
 
     def start(self, user=USER, attempt=1, before=None, **change):
-        """Write the record of a server that starts; what it is told."""
+        """Write the record of a server that starts; return its environment variables."""
         made = self._new(user, attempt, token=f"token-{user}-{attempt}", nonce=f"nonce-{attempt}")
         return self.keep(server.replacing(before, made) if before else made, **change)
 
@@ -81,7 +81,7 @@ def town():
         yield made
 
 
-def played(launched, open_client, *, frames=10, stop=True):
+def play_game(launched, open_client, *, frames=10, stop=True):
     async def run():
         async with open_client(launched.address) as client:
             await client.play(frames)
@@ -96,7 +96,7 @@ def played(launched, open_client, *, frames=10, stop=True):
 def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
     record = town.start()
     running = launch(trial={"ui": UI}, **town.variables(record))
-    played(running, open_client)
+    play_game(running, open_client)
     assert running.wait() == 0
     assert json.loads(town.body(ANSWER))["answers"]["outcome"] == "stopped"
     ((key, lines),) = town.recordings(record.name).items()
@@ -125,14 +125,14 @@ def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_clie
     }
 
 
-def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
+def test_neither_the_log_nor_the_agent_gets_a_secret(town, launch, open_client):
     record = town.start()
     spy = "\nimport os, sys\nprint(sorted(os.environ), file=sys.stderr, flush=True)\n"
     from tests.trial.conftest import grid_agent
 
     running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.variables(record))
     town.failing = [500, 403]
-    played(running, open_client)
+    play_game(running, open_client)
     assert running.wait() == 0
     said = running.log_text()
     assert "CREDENTIAL" not in said
@@ -144,14 +144,14 @@ def test_neither_log_nor_agent_is_told_a_secret(town, launch, open_client):
 def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
     first = town.start()
     running = launch(trial={"ui": UI}, **town.variables(first))
-    played(running, open_client, frames=30, stop=False)
+    play_game(running, open_client, frames=30, stop=False)
     lost = town.close(first, Reason.LOST)  # its end is known before it has stored what it recorded
     running.terminate()
     assert running.wait() == 0
     (before,) = town.recordings(first.name).values()
     second = town.start(attempt=2, before=lost)
     after = launch(trial={"ui": UI}, **town.variables(second))
-    client = played(after, open_client)
+    client = play_game(after, open_client)
     assert after.wait() == 0
     assert client.errors == []
     (lines,) = town.recordings(second.name).values()
@@ -159,14 +159,14 @@ def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client)
     assert lines[0]["seed"] == before[0]["seed"]
 
 
-def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(town, launch, open_client):
+def test_the_answer_of_a_game_that_ended_before_the_stop_message_is_stored_after_it(town, launch, open_client):
     record = town.start()
     running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.variables(record))
 
     async def run():
         async with open_client(running.address) as client:
             await client.play(10)
-            town.failing = [503] * 100_000  # S3 is busy for as long as the game ends
+            town.failing = [503] * 100_000  # S3 is busy while the game ends
             await client.say(command="stop")
             await client.until(lambda: client.state.get("state") == "ended")
             assert town.body(ANSWER) is None
@@ -182,18 +182,18 @@ def test_an_answer_that_was_earned_before_the_stop_message_is_stored_after_it(to
     assert town.recordings(record.name)
 
 
-def test_a_server_that_waited_learns_whose_it_is_and_stores_in_their_folder(town, launch, open_client):
+def test_a_warm_server_learns_its_participant_and_stores_in_their_folder(town, launch, open_client):
     warm_server = town.start_warm("the-secret-token")
     running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.variables(warm_server))
     time.sleep(0.5)
     own = town.hand_over(warm_server, USER)
-    played(running, open_client)
+    play_game(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None
     assert town.recordings(own)
 
 
-def test_a_name_that_is_taken_is_told_from_a_request_that_is_refused(town):
+def test_create_returns_false_for_a_name_that_is_taken_and_raises_if_refused(town):
     store = town.store(town.start())
     assert store.get(ANSWER) is None
     assert store.create(ANSWER, b"{}") is True
@@ -211,8 +211,8 @@ def test_a_file_is_stored_whole(town, tmp_path):
     assert town.body(key) == path.read_bytes()
 
 
-def test_an_answer_that_comes_before_the_body_is_sent_is_heard(tmp_path):
-    """Who has a name already need not read megabytes to say so; else the recording would be sent for ever."""
+def test_a_refusal_that_comes_before_the_body_is_sent_is_read(tmp_path):
+    """S3 may say that a name is taken before it has read the megabytes of the body; else the recording would be sent for ever."""
     path = tmp_path / "recording"
     path.write_bytes(bytes(20_000_000))
     with socket.create_server(("127.0.0.1", 0)) as listening:
@@ -235,7 +235,7 @@ def test_an_answer_that_comes_before_the_body_is_sent_is_heard(tmp_path):
 
 
 @pytest.mark.parametrize("statuses", [[403], [400], [500, 503], [409, 429, 403]])
-def test_reading_tries_again_what_may_pass(town, statuses):
+def test_reading_tries_again_after_errors_that_may_pass(town, statuses):
     store = town.store(town.start())
     store.create(ANSWER, b"{}")
     town.failing = list(statuses)
@@ -264,7 +264,7 @@ def test_a_request_that_has_expired_is_refused_and_a_new_one_is_taken(town, monk
     assert store.get(ANSWER) == b"{}"
 
 
-def test_who_does_not_answer_is_named_without_an_address(town):
+def test_an_error_without_an_answer_contains_no_address(town):
     store = PresignedStore("http://127.0.0.1:1/sign", "s", "c", pause=lambda _: None)
     with pytest.raises(StoreError) as error:
         store.get(ANSWER)
@@ -281,7 +281,7 @@ def test_of_two_servers_that_store_the_same_answer_one_wins(town):
 
 
 def test_a_presigned_request_is_used_again_until_it_is_refused(town):
-    """What is read every two seconds is not signed every two seconds."""
+    """A document that is read every two seconds is not signed every two seconds."""
     project = study(id="study", players=2, matching="match")
     record = town.keep(
         server.new_attempt(project, "s." + "0" * 20, 1, token="t", nonce="n", settings=town.settings, now=town.now())
@@ -291,7 +291,7 @@ def test_a_presigned_request_is_used_again_until_it_is_refused(town):
     town.documents.put(key, b"{}")
     assert store.look(key) == b"{}"
     assert [path for _, path, _ in town.requests].count("/sign") == 1
-    town.failing = [403]  # it has expired
+    town.failing = [403]  # the request has expired
     assert store.look(key) == b"{}"
     assert [path for _, path, _ in town.requests].count("/sign") == 2
     town.failing = [403, 403]

@@ -1,4 +1,4 @@
-"""A server that is lost is followed by another one, on which the game goes on where it was."""
+"""After a server is lost, the game goes on where it was on the next server."""
 
 import asyncio
 import json
@@ -20,7 +20,7 @@ DICE = (
 
 
 def play(server, open_client, frames, *, stop=False):
-    """Play on a server until that many pictures were seen; it is told to end then. The client."""
+    """Play until `frames` pictures were seen, then end the server; return the client."""
 
     async def run():
         async with open_client(server.address) as client:
@@ -95,7 +95,7 @@ def test_a_third_server_goes_on_after_the_second(launch, open_client):
     assert third.answer()["answers"]["frames"] == total + len(steps(lines))
 
 
-def test_episodes_that_were_over_are_not_played_again(launch, open_client, grid):
+def test_finished_episodes_are_not_played_again(launch, open_client, grid):
     trial = {"maxEpisodes": 3, "startingFrameRate": 60}
     waits = (
         "\nimport os, time\nclass Agent(Agent):\n    def step(self, action):\n"
@@ -111,7 +111,7 @@ def test_episodes_that_were_over_are_not_played_again(launch, open_client, grid)
             await client.play(1)
             await client.until(lambda: client.state["episode"] == 2)
             first.terminate()
-            first.log.with_name("go_on").touch()  # its step is over, and so is the server
+            first.log.with_name("go_on").touch()  # its step is over, and the server ends
             await client.closed()
 
     asyncio.run(until_the_second_episode())
@@ -132,11 +132,11 @@ def test_episodes_that_were_over_are_not_played_again(launch, open_client, grid)
     assert answers["score"] == 54
 
 
-def test_a_game_that_was_over_but_not_answered_is_answered(launch, open_client, grid):
+def test_the_next_server_stores_the_missing_answer_of_a_finished_game(launch, open_client, grid):
     first = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-1")
     asyncio.run(_until_done(first, open_client))
     assert first.wait() == 0
-    (first.store / "study/users/P1/answers/3.json").unlink()  # as if it was lost just before
+    (first.store / "study/users/P1/answers/3.json").unlink()  # as if the server had been lost just before
     second = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-2")
     asyncio.run(_until_done(second, open_client, start=False))
     assert second.answer()["answers"]["outcome"] == "finished"
@@ -151,7 +151,7 @@ async def _until_done(server, open_client, start=True):
         await client.until(lambda: client.done)
 
 
-def test_an_environment_that_plays_otherwise_begins_the_episode_again(launch, open_client, grid):
+def test_an_episode_whose_replay_differs_begins_again(launch, open_client, grid):
     trial = {"ui": {"stop": True, "start": True}}
     first = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-1")
     play(first, open_client, 20)
@@ -165,7 +165,7 @@ def test_an_environment_that_plays_otherwise_begins_the_episode_again(launch, op
     assert "begins again" in second.log_text()
 
 
-def test_a_damaged_recording_only_costs_the_game_that_was_on(launch, open_client):
+def test_after_a_damaged_recording_the_next_server_still_plays(launch, open_client):
     first = launch(SERVER="a-1")
     play(first, open_client, 20)
     (file,) = (first.store / "study/users/P1/trials/a-1").glob("*.gz")
@@ -203,7 +203,7 @@ LINES = st.lists(
 
 
 @given(LINES, LINES)
-def test_whatever_a_recording_says_the_past_is_one_that_can_be_gone_on_from(one, other):
+def test_any_lines_of_recordings_become_a_trial_that_can_go_on(one, other):
     together, apart = RecordedTrial(), RecordedTrial()
     text = b"".join(json.dumps(line).encode() + b"\n" for line in one + other)
     add_lines(together, [json.loads(part) for part in text.splitlines()])
@@ -214,7 +214,7 @@ def test_whatever_a_recording_says_the_past_is_one_that_can_be_gone_on_from(one,
     assert together.seconds >= 0
 
 
-def test_feedback_is_part_of_the_past():
+def test_feedback_is_read_with_the_steps_of_earlier_servers():
     past = RecordedTrial()
     said = [{"command": "good", "ns": 1}, {"command": "pause"}, {"action": "up"}]
     add_lines(past, [json.loads(recording.line("reset", episode=1, seed=7))])
@@ -223,7 +223,7 @@ def test_feedback_is_part_of_the_past():
     assert past.unfinished.steps[0].feedback == (Word("good"),)
 
 
-def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():
+def test_steps_after_the_one_from_which_a_server_resumed_are_forgotten():
     past = RecordedTrial()
     add_lines(past, [{"kind": "reset", "episode": 1, "seed": 7}])
     step = {"kind": "step", "episode": 1, "human": None, "action": 0}
@@ -233,7 +233,7 @@ def test_steps_beyond_the_one_that_a_server_went_on_from_are_forgotten():
 
 
 @pytest.mark.parametrize(("by", "given"), [("random", 2), ("none", 2), ("agent", None)])
-def test_what_the_environment_was_given_is_taken_again(by, given):
+def test_the_replay_takes_the_actions_that_the_environment_was_given(by, given):
     recorded = RecordedTrial()
     step = {"kind": "step", "episode": 1, "human": None, "action": 2, "by": by, "reward": 1.0}
     add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 3}, step])

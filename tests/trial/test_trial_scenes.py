@@ -42,7 +42,7 @@ def agent(length: int = 10**6, more: str = "pass") -> str:
 
 
 def with_images(folder: Path, **images: int) -> None:
-    """Images of random pixels, with sides of so many pixels."""
+    """Write images of random pixels, with sides of these lengths."""
     (folder / "agent" / "assets").mkdir(parents=True)
     for name, side in images.items():
         pixels = np.random.default_rng(1).integers(0, 256, (side, side, 3), np.uint8)
@@ -87,7 +87,7 @@ def test_a_client_that_comes_back_gets_the_whole_scene(launch: Any, open_client:
     asyncio.run(play())
 
 
-def test_images_are_sent_to_those_who_ask_for_them(launch: Any, open_client: Any, tmp_path: Path) -> None:
+def test_images_are_sent_to_clients_that_ask_for_them(launch: Any, open_client: Any, tmp_path: Path) -> None:
     server = started(launch, tmp_path, agent())
 
     async def play() -> None:
@@ -131,7 +131,9 @@ def test_a_client_cannot_ask_for_an_image_for_ever(launch: Any, open_client: Any
     asyncio.run(play())
 
 
-def test_earlier_clients_get_pictures_that_the_server_draws(launch: Any, open_client: Any, tmp_path: Path) -> None:
+def test_clients_of_earlier_protocols_get_pictures_that_the_server_draws(
+    launch: Any, open_client: Any, tmp_path: Path
+) -> None:
     server = started(launch, tmp_path, agent())
 
     async def play() -> None:
@@ -150,7 +152,9 @@ def test_earlier_clients_get_pictures_that_the_server_draws(launch: Any, open_cl
     asyncio.run(play())
 
 
-def test_what_cannot_be_drawn_is_said_once_and_the_game_goes_on(launch: Any, open_client: Any, tmp_path: Path) -> None:
+def test_an_object_that_cannot_be_drawn_is_logged_once_and_the_game_goes_on(
+    launch: Any, open_client: Any, tmp_path: Path
+) -> None:
     more = 'objects += [{"id": "bad", "type": "circle", "x": float("nan"), "y": 0, "radius": 1}, {"id": "e", "type": "sprite", "image": "../../etc/passwd", "x": 0, "y": 0}]'
     server = started(launch, tmp_path, agent(length=8, more=more), maxEpisodes=1)
 
@@ -180,7 +184,7 @@ def test_objects_without_a_scene_in_config_yml_end_the_game_with_a_sentence(
     assert "say in config.yml how large the picture is, as trial.scene" in server.log_text()
 
 
-def test_a_picture_of_pixels_may_come_between(launch: Any, open_client: Any, tmp_path: Path) -> None:
+def test_a_picture_of_pixels_may_come_between_scenes(launch: Any, open_client: Any, tmp_path: Path) -> None:
     more = "import numpy; assert True\n        if self.t % 4 == 2: return numpy.zeros((20, 30, 3), numpy.uint8)"
     server = started(launch, tmp_path, agent(more=more))
 
@@ -194,7 +198,7 @@ def test_a_picture_of_pixels_may_come_between(launch: Any, open_client: Any, tmp
     asyncio.run(play())
 
 
-def test_permanent_objects_of_the_first_picture_are_there_when_an_episode_is_taken_up_again(
+def test_permanent_objects_of_the_first_picture_are_shown_after_an_episode_is_resumed(
     launch: Any, open_client: Any, tmp_path: Path
 ) -> None:
     source = agent().replace("def reset(self, seed=None):", "def reset(self, seed=None):\n        self.seed = seed")

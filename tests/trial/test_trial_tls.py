@@ -46,7 +46,7 @@ def put(folder, serial):
 KEYS = {"SSL_FULLCHAIN": "ssl/fullchain.pem", "SSL_PRIVKEY": "ssl/privkey.pem", "TLS": "on"}
 
 
-def test_plays_over_tls(launch, open_client, grid, tmp_path):
+def test_a_participant_plays_over_tls(launch, open_client, grid, tmp_path):
     chain = put(tmp_path / "store" / "ssl", 1)
     server = launch(grid(30), {"maxEpisodes": 9, "startingFrameRate": 60, "ui": {"stop": True}}, **KEYS)
     trusted = ssl.create_default_context(cadata=chain.decode())
@@ -95,7 +95,7 @@ def test_a_running_server_takes_a_renewed_certificate(tmp_path):
     assert asyncio.run(serial()) == [1, 2]
 
 
-def test_missing_certificate_ends_the_process(tmp_path, launch):
+def test_a_missing_certificate_ends_the_process(tmp_path, launch):
     import pytest
 
     with pytest.raises(AssertionError, match="certificate"):

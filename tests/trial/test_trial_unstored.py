@@ -1,4 +1,4 @@
-"""A recording that cannot be stored, or not even be written: the answers are kept, and the recording if it can be."""
+"""A recording that cannot be stored, or not even be written: answers are kept, and the recording if that is possible."""
 
 import asyncio
 import time
@@ -21,7 +21,7 @@ def refuse_recordings(store: Path) -> Path:
 
 
 async def play_to_the_end(server):
-    """Both play, and one ends the game; how long it took from there until both were told that all is stored."""
+    """Let both play, and one end the game; return how long it then took until both were told that all is stored."""
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
         await anna.say(command="stop")
@@ -34,7 +34,7 @@ def outcomes(store):
     return {each: answer(store, each)["answers"]["outcome"] for each in MEMBERS}
 
 
-def test_answers_wait_for_a_recording_that_cannot_be_stored_but_not_for_ever(launch, tmp_path):
+def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_while(launch, tmp_path):
     """The members go on, and the server stays until the store takes the recording."""
     server = launch_session(launch, SPOOL=str(tmp_path / "spool"), **{SECONDS: "1.5"})
     form(server.store)
@@ -90,8 +90,8 @@ def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
     assert server.recordings()
 
 
-def test_the_answers_come_after_the_recording_if_that_can_be_stored(launch):
-    """The usual order: who reads the answer finds the recording."""
+def test_answers_are_stored_after_the_recording_if_that_can_be_stored(launch):
+    """The usual order: a program that reads the answer finds the recording."""
     server = launch_session(launch)
     form(server.store)
     asyncio.run(play_to_the_end(server))
@@ -117,7 +117,7 @@ async def seen_by_both(anna, bert):
 
 
 def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
-    """The answer of one is refused: they wait as who plays alone does, and get it when the store takes it."""
+    """The answer of one member is refused: they wait as a participant who plays alone does, until the store takes it."""
     server = launch_session(launch)
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
@@ -159,7 +159,7 @@ def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
 
-def test_the_next_game_step_is_played_while_the_answer_of_one_to_the_step_before_is_refused(launch):
+def test_the_next_game_step_is_played_while_a_members_answer_to_the_one_before_is_refused(launch):
     section = {"gather": 4, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
     server = launch_session(launch, trial=section, GAME_STEPS="3,5", LINGER_SECONDS="4")
     form(server.store)

@@ -1,4 +1,4 @@
-"""A warm server: started before anybody knows whose it will be; somebody's later, and from then on a server like any other."""
+"""A warm server starts without a participant. After the handover it is the server of its participant, like any other."""
 
 import asyncio
 import contextlib
@@ -42,7 +42,7 @@ Agent = Reporting
 
 @pytest.fixture
 def launch_warm_server(launch):
-    """Start a warm server: no USER_ID and no GROUP of anybody."""
+    """Start a warm server: without USER_ID and GROUP."""
 
     def start(agent=None, trial=None, **env):
         told = {"SPARE": "on", "SERVER": WARM_SERVER, "USER_ID": "", "SPARE_SECONDS": "60", **env}
@@ -51,13 +51,13 @@ def launch_warm_server(launch):
     return start
 
 
-def give(server, user_id="P1", group=None, own=OWN, warm_server=WARM_SERVER):
-    """What the control plane does when a participant takes the warm server."""
+def hand_over(server, user_id="P1", group=None, own=OWN, warm_server=WARM_SERVER):
+    """Hand the warm server over to a participant, as the control plane does."""
     said = json.dumps({"schema": 1, "userId": user_id, "group": group, "server": own})
-    say(server, said.encode(), warm_server)
+    write_handover(server, said.encode(), warm_server)
 
 
-def say(server, body, warm_server=WARM_SERVER):
+def write_handover(server, body, warm_server=WARM_SERVER):
     path = server.store / f"study/spares/{warm_server}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".new")
@@ -95,10 +95,10 @@ def steps(lines):
     return [line["step"] for line in lines if line["kind"] == "step"]
 
 
-# ---- nobody's yet
+# ---- before the handover
 
 
-def test_a_warm_server_lets_nobody_in_before_it_is_given(launch_warm_server, open_client):
+def test_a_warm_server_lets_no_client_in_before_it_is_handed_over(launch_warm_server, open_client):
     server = launch_warm_server()
 
     async def everybody():
@@ -117,12 +117,12 @@ def test_a_warm_server_lets_nobody_in_before_it_is_given(launch_warm_server, ope
     assert not server.store.exists(), "nothing is recorded"
 
 
-def test_only_who_has_the_token_makes_it_look(launch_warm_server, open_client):
+def test_only_a_client_with_the_token_makes_a_warm_server_look(launch_warm_server, open_client):
     server = launch_warm_server()
 
     async def strangers():
         await refused(server, open_client, 1013)  # its first look is over
-        give(server)
+        hand_over(server)
         for _ in range(5):
             await refused(server, open_client, 4401, token="wrong")
         assert "assigned to a participant now" not in server.log_text()
@@ -132,20 +132,20 @@ def test_only_who_has_the_token_makes_it_look(launch_warm_server, open_client):
     asyncio.run(strangers())
 
 
-def test_nobody_coming_does_not_end_a_warm_server(launch_warm_server):
+def test_a_warm_server_waits_beyond_its_idle_time(launch_warm_server):
     server = launch_warm_server(IDLE_SECONDS="0", GRACE_SECONDS="0")
     time.sleep(1)
     assert server.process.poll() is None
 
 
-def test_the_deadline_ends_a_warm_server_that_nobody_took(launch_warm_server):
+def test_the_deadline_ends_a_warm_server_without_a_participant(launch_warm_server):
     server = launch_warm_server(DEADLINE=str(time.time() + 2))
     assert server.wait() == 0
     assert "deadline" in server.log_text()
     assert not server.store.exists()
 
 
-def test_sigterm_ends_a_warm_server_that_nobody_took(launch_warm_server, open_client):
+def test_sigterm_ends_a_warm_server_without_a_participant(launch_warm_server, open_client):
     server = launch_warm_server()
     asyncio.run(refused(server, open_client, 1013))
     server.terminate()
@@ -160,12 +160,12 @@ def test_a_warm_server_whose_agent_does_not_start_is_replaced(launch_warm_server
     assert "ValueError: broken" in server.log_text()
 
 
-# ---- somebody's
+# ---- after the handover
 
 
-def test_the_participant_plays_and_all_lies_where_it_always_does(launch_warm_server, open_client):
+def test_the_participant_plays_and_the_files_are_where_other_servers_store_them(launch_warm_server, open_client):
     server = launch_warm_server()
-    give(server, group=2)
+    hand_over(server, group=2)
     asyncio.run(play_to_the_end(server, open_client))
     assert server.wait() == 0
     assert server.answer()["group"] == 2
@@ -178,12 +178,12 @@ def test_the_participant_plays_and_all_lies_where_it_always_does(launch_warm_ser
     assert "P1" not in server.log_text()
 
 
-def test_nobody_else_gets_in_with_the_same_token(launch_warm_server, open_client):
+def test_no_other_participant_gets_in_with_the_same_token(launch_warm_server, open_client):
     server = launch_warm_server()
 
     async def others():
         await refused(server, open_client, 1013, userId="P2")
-        give(server)
+        hand_over(server)
         for user_id in ("P2", "", None, WARM_SERVER):
             await refused(server, open_client, 4401, userId=user_id)
         await refused(server, open_client, 4401, token="wrong")
@@ -197,14 +197,14 @@ def test_a_page_that_came_too_early_gets_in_the_next_time(launch_warm_server, op
 
     async def come_twice():
         await refused(server, open_client, 1013)
-        give(server)
+        hand_over(server)
         await play_to_the_end(server, open_client)
 
     asyncio.run(come_twice())
     assert server.answered()
 
 
-def test_many_who_come_at_the_moment_it_is_given(launch_warm_server, open_client):
+def test_the_participant_gets_in_when_many_clients_come_at_the_handover(launch_warm_server, open_client):
     server = launch_warm_server(LINGER_SECONDS="60")
 
     async def come():
@@ -214,8 +214,8 @@ def test_many_who_come_at_the_moment_it_is_given(launch_warm_server, open_client
     async def all_of_them():
         coming = [asyncio.create_task(come()) for _ in range(20)]
         await asyncio.sleep(0.02)
-        give(server)
-        async with asyncio.timeout(30):  # nobody waits for a look that never comes
+        hand_over(server)
+        async with asyncio.timeout(30):  # no client may wait for a look that never comes
             for _ in coming:
                 async with open_client(server.address) as client:
                     with contextlib.suppress(ConnectionClosedError):
@@ -224,14 +224,14 @@ def test_many_who_come_at_the_moment_it_is_given(launch_warm_server, open_client
                     code = await client.closed()
                 assert code in (1000, 4409)
                 if code == 1000:
-                    break  # else one of them came late, and took the game over
+                    break  # else one of the others came late, and took the game over
             await asyncio.gather(*coming)
 
     asyncio.run(all_of_them())
 
 
 class SlowStore:
-    """Answers a look when it is told to."""
+    """A store that answers a look when a test tells it to."""
 
     def __init__(self):
         self.looks = 0
@@ -242,17 +242,17 @@ class SlowStore:
         return self.answers.get(timeout=10)
 
 
-def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it():
-    """What was looked for before somebody asked may have been missed by a hair."""
+def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_look_finds_nothing():
+    """A look that began before a client asked may have missed a handover that was written just then."""
 
     async def run():
         store, given_to = SlowStore(), []
 
-        async def give(settings, given):
+        async def hand_over(settings, given):
             given_to.append(given)
 
         search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
-        searching = asyncio.create_task(search.run(give))
+        searching = asyncio.create_task(search.run(hand_over))
         async with asyncio.timeout(10):
             while not store.looks:
                 await asyncio.sleep(0.01)
@@ -272,22 +272,24 @@ def test_who_asks_during_a_look_waits_for_the_next_one_unless_that_look_finds_it
     asyncio.run(run())
 
 
-def test_idle_counts_from_the_giving(launch_warm_server):
+def test_the_idle_time_begins_at_the_handover(launch_warm_server):
     server = launch_warm_server(IDLE_SECONDS="2", SPARE_SECONDS="0.1")
     time.sleep(2.5)
     assert server.process.poll() is None
     given_at = time.monotonic()
-    give(server)
+    hand_over(server)
     assert server.wait() == 0
     assert time.monotonic() - given_at >= 2
     assert "idle" in server.log_text()
     assert not (server.store / "study/users").exists()
 
 
-def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(launch_warm_server, open_client, grid):
+def test_the_agent_starts_before_the_handover_and_knows_the_participant_at_the_first_reset(
+    launch_warm_server, open_client, grid
+):
     server = launch_warm_server(grid() + REPORTING, GROUP="7", USER_ID="somebody-else")
     assert server.process.stdout.readline() == "started\n", "before anybody comes"
-    give(server, group=1)
+    hand_over(server, group=1)
     asyncio.run(play_to_the_end(server, open_client))
     (lines,) = server.recordings(server=OWN).values()
     nobody = {"USER_ID": None, "GROUP": None}
@@ -297,7 +299,7 @@ def test_the_agent_starts_ahead_and_knows_the_participant_at_the_first_reset(lau
 
 def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client, grid):
     server = launch_warm_server(grid() + REPORTING)
-    give(server)
+    hand_over(server)
     asyncio.run(play_to_the_end(server, open_client))
     (lines,) = server.recordings(server=OWN).values()
     assert lines[1]["info"]["now"]["GROUP"] == ""
@@ -306,7 +308,7 @@ def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client
 
 def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
     server = launch(SPARE="off", SERVER=WARM_SERVER)
-    give(server, user_id="P2")
+    hand_over(server, user_id="P2")
     asyncio.run(refused(server, open_client, 4401, userId="P2"))
 
 
@@ -319,7 +321,7 @@ def test_a_warm_server_goes_on_with_the_game_of_a_lost_server(launch, launch_war
     assert first.wait() == 0
     (before,) = first.recordings(server="a-1").values()
     second = launch_warm_server()
-    give(second, own="a-2")
+    hand_over(second, own="a-2")
     asyncio.run(play_to_the_end(second, open_client, 10))
     (after,) = second.recordings(server="a-2").values()
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
@@ -329,7 +331,7 @@ def test_a_warm_server_goes_on_with_the_game_of_a_lost_server(launch, launch_war
 
 def test_another_server_goes_on_with_the_game_of_a_lost_warm_server(launch, launch_warm_server, open_client):
     first = launch_warm_server()
-    give(first, own="a-1")
+    hand_over(first, own="a-1")
     asyncio.run(play_and_end(first, open_client, 30))
     assert first.wait() == 0
     (before,) = first.recordings(server="a-1").values()
@@ -342,7 +344,7 @@ def test_another_server_goes_on_with_the_game_of_a_lost_warm_server(launch, laun
 
 def test_a_warm_server_that_is_killed_and_started_again_keeps_what_it_recorded(launch_warm_server, open_client):
     first = launch_warm_server()
-    give(first)
+    hand_over(first)
 
     async def play():
         async with open_client(first.address) as client:
@@ -385,7 +387,7 @@ HOSTILE = {
 }
 
 
-def test_what_the_control_plane_writes_is_what_a_warm_server_reads():
+def test_a_warm_server_reads_the_handover_that_the_control_plane_writes():
     for group in (None, 0, 3):
         written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2").to_json()
         assert handover.parse(written) == Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
@@ -393,7 +395,7 @@ def test_what_the_control_plane_writes_is_what_a_warm_server_reads():
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_such_document_gives_the_warm_server_to_nobody(name):
+def test_a_bad_handover_is_refused_with_a_message_without_its_ids(name):
     with pytest.raises(BadHandover) as raised:
         handover.parse(HOSTILE[name])
     assert "P1" not in str(raised.value)
@@ -402,7 +404,7 @@ def test_what_is_no_such_document_gives_the_warm_server_to_nobody(name):
 @given(st.binary() | st.recursive(st.none() | st.booleans() | st.text() | st.integers() | st.floats(),
        lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from([*GOOD, "x"]), inner)).map(lambda v: json.dumps(v).encode()))  # fmt: skip
 @example(json.dumps(GOOD).encode())
-def test_whatever_stands_there_is_read_or_refused(body):
+def test_any_document_is_read_or_refused(body):
     try:
         found = handover.parse(body)
     except BadHandover:
@@ -416,9 +418,9 @@ def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_cli
 
     async def come():
         for name in ("half", "nothing", "too deep", "a participant like a path"):
-            say(server, HOSTILE[name])
+            write_handover(server, HOSTILE[name])
             await refused(server, open_client, 1013)
-        give(server)
+        hand_over(server)
         await play_to_the_end(server, open_client)
 
     asyncio.run(come())
@@ -428,7 +430,7 @@ def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_cli
     assert "P1" not in said
 
 
-def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
+def test_the_server_asks_a_store_that_fails_again(launch_warm_server, open_client):
     server = launch_warm_server(SPARE_SECONDS="0.1")
     blocked = server.store / "study/spares"
     blocked.parent.mkdir(parents=True)
@@ -438,7 +440,7 @@ def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
         await refused(server, open_client, 1013)
         await asyncio.sleep(0.5)
         blocked.unlink()
-        give(server)
+        hand_over(server)
         await play_to_the_end(server, open_client)
 
     asyncio.run(come())
@@ -447,11 +449,11 @@ def test_a_store_that_fails_is_asked_again(launch_warm_server, open_client):
     assert WARM_SERVER not in said
 
 
-def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_warm_server, open_client):
+def test_clients_do_not_wait_long_for_a_store_that_hangs(launch_warm_server, open_client):
     server = launch_warm_server(HELLO_SECONDS="3")
     path = server.store / f"study/spares/{WARM_SERVER}.json"
     path.parent.mkdir(parents=True)
-    os.mkfifo(path)  # whoever opens it waits for somebody who writes
+    os.mkfifo(path)  # a process that opens it waits for one that writes
 
     async def come():
         began = time.monotonic()
@@ -462,7 +464,7 @@ def test_a_store_that_hangs_keeps_nobody_waiting_for_long(launch_warm_server, op
         asyncio.run(come())
     finally:
         server.terminate()
-        waited_for = os.open(path, os.O_RDWR)  # lets the thread go that waits, and whoever looks again meanwhile
+        waited_for = os.open(path, os.O_RDWR)  # frees the thread that waits, and later looks
         path.unlink()
         os.close(waited_for)
     assert server.wait() == 0
@@ -482,26 +484,26 @@ ENV = {
 }
 
 
-def test_a_warm_server_needs_no_participant_and_believes_in_none():
+def test_a_warm_server_needs_no_participant_and_ignores_one_in_its_variables():
     for more in ({}, {"USER_ID": "P1", "GROUP": "1"}, {"USER_ID": "../x", "GROUP": "x"}):
         settings = TrialSettings.from_env({**ENV, **more})
         assert (settings.warm_server, settings.user_id, settings.group) == (True, "", None)
     assert settings.warm_server_seconds == 20
 
 
-def test_what_is_given_makes_an_ordinary_server_of_it():
+def test_after_the_handover_a_warm_server_has_the_settings_of_an_ordinary_one():
     settings = assignment.with_handover(TrialSettings.from_env(ENV), Handover("P1", 3, "a-2"))
     ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == TrialSettings.from_env(ordinary)
 
 
 @pytest.mark.parametrize("change", [{"SPARE": "yes"}, {"SPARE": "off"}, {"SPARE": ""}, {"SERVER": ""}])
-def test_without_a_participant_only_a_warm_server_can_begin(change):
+def test_without_a_participant_only_a_warm_server_can_start(change):
     with pytest.raises(SettingsError):
         TrialSettings.from_env({**ENV, **change})
 
 
-def test_the_watchdog_of_a_warm_server():
+def test_the_watchdog_of_a_warm_server_counts_from_the_handover():
     dog = Watchdog(now=None, idle=10, grace=60, deadline=1000)
     assert dog.expires() == 1000
     assert dog.verdict(999) is None

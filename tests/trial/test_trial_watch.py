@@ -26,7 +26,7 @@ async def program(server: Any, query: str = PROOF) -> Any:
 
 
 async def ask(websocket: ClientConnection, method: str, **params: Any) -> Any:
-    """The answer to a request; lines that come before it are left out."""
+    """Send a request; return its answer, without the lines that come before it."""
     await websocket.send(json.dumps({"method": method, "params": params}))
     while True:
         said = await next_line(websocket)
@@ -40,7 +40,7 @@ async def next_line(websocket: ClientConnection) -> Any:
 
 
 async def closed(websocket: ClientConnection) -> int | None:
-    """The code with which the server closes the connection, whatever it says before."""
+    """Wait until the server closes the connection; return the code."""
     with contextlib.suppress(ConnectionClosed):
         while True:
             await websocket.recv()
@@ -77,7 +77,7 @@ def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
     lines = asyncio.run(play())
     assert server.wait() == 0
     (recorded,) = server.recordings().values()
-    assert lines == recorded[1:]  # but the header
+    assert lines == recorded[1:]  # without the header
     assert [line["kind"] for line in lines] == ["reset", *["step"] * 20, "end"]
     assert {"reward", "action", "terminated", "observation"} <= lines[1].keys()
 
@@ -115,7 +115,7 @@ def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(lau
     assert {(line["by"], line["action"]) for line in together} == {("human", 1)}
 
 
-def test_a_trial_with_advice_is_resumed_with_it() -> None:
+def test_a_resumed_trial_takes_the_recorded_advice_again() -> None:
     recorded = resume.RecordedTrial()
     line = {"kind": "step", "episode": 1, "human": None, "action": 3, "reward": 1.0}
     resume.add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 4}, line, {**line, "advice": 3}])
@@ -135,7 +135,7 @@ def test_a_trial_with_advice_is_resumed_with_it() -> None:
         ([], 'a request is {"method": ..., "params": {...}}'),
     ],
 )
-def test_what_cannot_be_done_gets_a_sentence(launch, open_client, grid, request_, words):
+def test_a_wrong_request_gets_a_sentence(launch, open_client, grid, request_, words):
     server = launch(grid(None), {"gym": "advise"})
 
     async def play() -> Any:
@@ -149,7 +149,7 @@ def test_what_cannot_be_done_gets_a_sentence(launch, open_client, grid, request_
     assert watching is True
 
 
-def test_where_watching_is_allowed_advice_is_not(launch, open_client, grid):
+def test_a_program_may_not_advise_where_only_watching_is_allowed(launch, open_client, grid):
     server = launch(grid(None), {"gym": "watch"})
 
     async def play() -> Any:
@@ -160,7 +160,7 @@ def test_where_watching_is_allowed_advice_is_not(launch, open_client, grid):
     assert "the project allows no advice" in asyncio.run(play())["error"]["message"]
 
 
-def test_before_the_game_there_is_nothing_to_advise(launch, grid):
+def test_advice_before_the_game_is_refused(launch, grid):
     server = launch(grid(None), {"gym": "advise"})
 
     async def play() -> Any:
@@ -171,7 +171,7 @@ def test_before_the_game_there_is_nothing_to_advise(launch, grid):
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=other"])
-def test_who_has_no_token_may_not_watch(launch, grid, query):
+def test_a_program_without_the_token_may_not_watch(launch, grid, query):
     server = launch(grid(None), {"gym": "watch"})
 
     async def come() -> int | None:
@@ -181,7 +181,7 @@ def test_who_has_no_token_may_not_watch(launch, grid, query):
     assert asyncio.run(come()) == 4401
 
 
-def test_unless_the_project_allows_it_there_is_no_such_path(launch, grid):
+def test_the_path_for_programs_exists_only_if_the_project_allows_it(launch, grid):
     server = launch(grid(None))
 
     async def come() -> int:
@@ -193,7 +193,7 @@ def test_unless_the_project_allows_it_there_is_no_such_path(launch, grid):
     assert asyncio.run(come()) == 404
 
 
-def test_programs_that_watch_are_limited(launch, grid):
+def test_the_number_of_programs_that_watch_is_limited(launch, grid):
     server = launch(grid(None), {"gym": "watch"})
 
     async def come() -> int | None:
@@ -234,7 +234,7 @@ def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
     cut = []
     watchers = Watchers()
     with watchers.lines(lambda: cut.append(True)) as lines:
-        watchers.tell(b"x" * 20_000_000)  # a line may be as long as it is
+        watchers.tell(b"x" * 20_000_000)  # one line may be of any length
         assert not cut
         assert len(asyncio.run(lines.get())) == 20_000_000
         for _ in range(16):

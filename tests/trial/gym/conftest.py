@@ -1,4 +1,4 @@
-"""One server of environments for the tests that change nothing about it."""
+"""Fixtures: one server of environments, which tests share that leave it as it is, and its clients."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def server() -> Iterator[GymServerProcess]:
 
 @pytest.fixture
 def client(server: GymServerProcess) -> Iterator[TextClient]:
-    """A client of Gymie's: no subprotocol, no form."""
+    """A client as Gymie's: it names no subprotocol and no form."""
     with TextClient(server.url) as found:
         yield found
 
 
 @pytest.fixture
 def asking(server: GymServerProcess) -> Iterator[TextClient]:
-    """A client that asks for Gymnasium's form, and whose errors are answered."""
+    """A client that asks for Gymnasium's form; errors are answers, and the connection stays."""
     with TextClient(server.url + "?form=gymnasium") as found:
         yield found

@@ -1,4 +1,4 @@
-"""Environments that behave badly in one way each, for the server's tests; `--import` registers them."""
+"""Environments for the server's tests: each behaves badly in one way. `--import` registers them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 
 class Calm(gymnasium.Env):
-    """Counts its steps; an episode has five, or with `cut` is cut off after so many."""
+    """An environment that counts its steps. An episode has five, or is truncated after `cut` steps."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space: Any = gymnasium.spaces.Discrete(3)
@@ -43,7 +43,7 @@ class Calm(gymnasium.Env):
         return np.array([self.steps, 0.5], np.float32)
 
     def misbehave(self) -> None:
-        """What others do."""
+        """What the environments below do in a step."""
 
 
 class Infinite(Calm):
@@ -82,7 +82,7 @@ class Looping(Calm):
 
 
 class Hanging(Calm):
-    """Hangs in C, where no handler of a signal is called."""
+    """Hangs in C, where Python calls no signal handler."""
 
     def misbehave(self) -> None:
         sum(itertools.repeat(1, 10**13))
@@ -95,7 +95,7 @@ class Printing(Calm):
 
 
 class Forking(Calm):
-    """Leaves a process behind, in a session of its own, whose parent is gone."""
+    """Leaves a process behind: in a session of its own, and its parent has ended."""
 
     def misbehave(self) -> None:
         if os.fork() == 0:
@@ -118,7 +118,7 @@ class Greedy(Calm):
 
 
 class GreedyTogether(Calm):
-    """Each process stays below the limit; all of them do not."""
+    """Each of its processes stays below the limit, and all together exceed it."""
 
     def misbehave(self) -> None:
         for _ in range(3):
@@ -139,7 +139,7 @@ class Lacking(Calm):
 
 
 class Old(Calm):
-    """Of gym's old kind: four values, and an observation alone."""
+    """An environment of gym's old kind: `step` returns four values, `reset` an observation alone."""
 
     def reset(self) -> Any:  # type: ignore[override]
         self.steps = 0
@@ -151,7 +151,7 @@ class Old(Calm):
 
 
 class OldSeeded(Calm):
-    """Of gym's old kind: seeded by a method of its own."""
+    """An environment of gym's old kind, with a method `seed`."""
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         self.random = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""An environment whose steps return, raise or draw something odd, by the name that is its action."""
+"""An environment whose steps return, raise or draw something unusual: the action names what."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from gymnasium import spaces
 CALM = np.zeros(2, np.float32)
 
 
-class WithoutWords(Exception):
-    """Its text cannot be had."""
+class WithoutText(Exception):
+    """An exception whose text raises."""
 
     def __str__(self) -> str:
         raise RuntimeError("no words")
 
 
-class WordsOfAnotherType(Exception):
-    """Its text is none."""
+class TextOfAnotherType(Exception):
+    """An exception whose `__str__` returns no str."""
 
     def __str__(self) -> str:
         return 5  # type: ignore[return-value] # noqa: PLE0307
 
 
 class Key:
-    """A key of a dict that has no text."""
+    """A key of a dict; its text raises."""
 
     def __str__(self) -> str:
         raise RuntimeError("no words")
@@ -62,9 +62,9 @@ def _result(**changed: Any) -> Callable[[], Any]:
 
 RESULTS: dict[str, Callable[[], Any]] = {
     "calm": _result(),
-    # what gets a sentence; long texts are made when they are asked for
-    "exception without text": lambda: _raise(WithoutWords()),
-    "exception with odd text": lambda: _raise(WordsOfAnotherType()),
+    # results that get a sentence; long texts are made when they are asked for
+    "exception without text": lambda: _raise(WithoutText()),
+    "exception with odd text": lambda: _raise(TextOfAnotherType()),
     "three values": lambda: (CALM, 1.0, False),
     "nothing": lambda: None,
     "generator": lambda: (part for part in range(5)),
@@ -73,7 +73,7 @@ RESULTS: dict[str, Callable[[], Any]] = {
     "complex reward": _result(reward=1j),
     "huge reward": _result(reward=10**400),
     "info without end": lambda: (CALM, 1.0, False, False, {"text": "y" * 250_000_000}),
-    # what arrives
+    # results that arrive
     "reward in an array": _result(reward=np.array([2.0])),
     "infinite reward": _result(reward=float("inf")),
     "info of text": _result(info="word"),
@@ -86,7 +86,7 @@ RESULTS: dict[str, Callable[[], Any]] = {
 }
 
 PICTURES: dict[str, Callable[[], Any]] = {
-    "raised": lambda: _raise(WithoutWords()),
+    "raised": lambda: _raise(WithoutText()),
     "thing": Key,
     "deep": lambda: nested(100_000),
     "huge": lambda: np.zeros((30_000, 30_000, 3), np.uint8),

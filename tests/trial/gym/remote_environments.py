@@ -28,7 +28,7 @@ EVERYTHING = spaces.Dict(
 
 
 class Everything(gymnasium.Env[Any, Any]):
-    """Every kind of space, as action and as observation, which repeats the action; infos of many kinds."""
+    """An environment with every kind of space: its observation repeats its action. Its infos are of many kinds."""
 
     observation_space = spaces.Tuple([EVERYTHING, EVERYTHING])
     action_space = EVERYTHING
@@ -54,7 +54,7 @@ class Everything(gymnasium.Env[Any, Any]):
 
 
 class Numbers(gymnasium.Env[Any, Any]):
-    """Spaces that vector environments can batch; episodes of different lengths; infos of all kinds that they merge."""
+    """An environment that vector environments can batch: episodes of different lengths, and infos of all kinds that they merge."""
 
     observation_space = spaces.Dict(
         {
@@ -80,7 +80,7 @@ class Numbers(gymnasium.Env[Any, Any]):
 
 
 class Bad(gymnasium.Env[Any, Any]):
-    """Does what its action says."""
+    """An environment that misbehaves as its action says."""
 
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Text(40, charset="abcdefghijklmnopqrstuvwxyz ")

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[3]
 
 @contextlib.contextmanager
 def serving(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """`python -m trial.gym` with the environments of `remote_environments.py`: its address, and its process."""
+    """Run `python -m trial.gym` with the environments of `remote_environments.py`; yield its address and its process."""
     command = [sys.executable, "-W", "ignore", "-m", "trial.gym", "--port", "0"]
     imported = ["--import", "tests.trial.gym.remote_environments", *arguments]
     with subprocess.Popen(

@@ -95,7 +95,7 @@ SPACES = st.recursive(st.one_of(LEAVES, GRAPHS, STACKS), _nested, max_leaves=6)
 
 
 def sampled(space: Any, seed: int, count: int) -> list[Any]:
-    """`count` values of the space."""
+    """Sample `count` values of the space."""
     space.seed(seed)
     with np.errstate(all="ignore"):
         return [space.sample() for _ in range(count)]

@@ -64,7 +64,7 @@ def test_one_step(client: TextClient) -> None:
     assert steps.infos == [(0, {"action": 2})]
 
 
-def test_the_same_steps_as_in_json(server: GymServerProcess, client: TextClient) -> None:
+def test_steps_give_the_same_results_as_in_json(server: GymServerProcess, client: TextClient) -> None:
     made = Made(client, "CartPole-v1")
     actions = [np.int64(at % 3 == 0) for at in range(64)]
     first, _ = made.reset(seed=11)
@@ -109,7 +109,7 @@ def test_with_disabled_the_answer_ends_with_the_episode(client: TextClient) -> N
         (b"\x01\x00\x01\x00\x01\x00\x00\x00" + bytes(9), "9 bytes"),
     ],
 )
-def test_the_sentence_shows_the_action_or_how_long_what_is_none_is(
+def test_the_sentence_about_a_wrong_action_shows_it_or_its_length(
     client: TextClient, request_: bytes, shown: str
 ) -> None:
     Made(client, "Odd/Calm-v0").reset()

@@ -59,7 +59,7 @@ def test_batches_travel_as_raw_arrays(space: Any, seed: int, count: int) -> None
 # --- the form that Gymie's client reads ---
 
 
-def test_the_descriptions_have_gymies_fields() -> None:
+def test_descriptions_have_gymies_fields() -> None:
     box = describe(spaces.Box(np.array([-1, -2], np.float32), np.array([1, np.inf], np.float32)))
     assert {key: box[key] for key in ("name", "shape", "low", "high")} == {
         "name": "Box",
@@ -79,7 +79,7 @@ def test_gymies_own_descriptions_are_built() -> None:
     assert build({"name": "MultiBinary", "n": 5, "shape": [5]}) == spaces.MultiBinary(5)
 
 
-def test_the_bounds_of_a_screen_are_two_numbers_in_the_compact_form() -> None:
+def test_in_the_compact_form_equal_bounds_are_two_numbers() -> None:
     said = describe(IMAGE, compact=True)
     assert (said["low"], said["high"]) == (0, 255)
     assert build(said) == IMAGE
@@ -108,21 +108,21 @@ def test_observations_keep_infinities_and_nan(dtype: Any) -> None:
 # --- what is refused ---
 
 
-class Odd(spaces.Space[Any]):
+class OwnSpace(spaces.Space[Any]):
     """A space that is none of Gymnasium's own."""
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: describe(Odd()),
-        lambda: values.decoder(Odd()),
-        lambda: arrays.layout(Odd()),
+        lambda: describe(OwnSpace()),
+        lambda: values.decoder(OwnSpace()),
+        lambda: arrays.layout(OwnSpace()),
         lambda: describe(spaces.Dict({1: spaces.Discrete(2)})),  # type: ignore[dict-item]
         lambda: describe(spaces.Box(0, 1, (2,), np.longdouble)),
     ],
 )
-def test_a_space_that_cannot_be_sent_is_a_sentence(call: Any) -> None:
+def test_a_space_that_cannot_be_sent_gets_a_sentence(call: Any) -> None:
     with pytest.raises(CodecError, match=r"cannot be sent.*\.$"):
         call()
 
@@ -177,12 +177,12 @@ WRONG_DESCRIPTIONS: list[Any] = [
 
 
 @pytest.mark.parametrize("said", WRONG_DESCRIPTIONS, ids=lambda said: repr(said)[:60])
-def test_a_wrong_description_is_a_sentence(said: Any) -> None:
+def test_a_wrong_description_gets_a_sentence(said: Any) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         build(said)
 
 
-def test_a_description_nested_without_end_is_a_sentence() -> None:
+def test_a_very_deeply_nested_description_gets_a_sentence() -> None:
     said: Any = {"name": "Discrete", "n": 1}
     for _ in range(5000):
         said = {"name": "Tuple", "spaces": [said]}
@@ -238,13 +238,13 @@ NOT_IN_THE_SPACE: list[tuple[Any, Any]] = [
 
 @pytest.mark.parametrize(("space", "said"), WRONG_VALUES, ids=repr)
 @pytest.mark.parametrize("action", [False, True])
-def test_a_value_of_another_shape_or_type_is_a_sentence(space: Any, said: Any, action: bool) -> None:
+def test_a_value_of_another_shape_or_type_gets_a_sentence(space: Any, said: Any, action: bool) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         values.decoder(space, action=action)(said)
 
 
 @pytest.mark.parametrize(("space", "said"), NOT_IN_THE_SPACE, ids=repr)
-def test_an_action_outside_its_space_is_a_sentence(space: Any, said: Any) -> None:
+def test_an_action_outside_its_space_gets_a_sentence(space: Any, said: Any) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         values.decoder(space, action=True)(said)
 
@@ -255,7 +255,7 @@ def test_an_observation_outside_its_space_arrives(space: Any, said: Any) -> None
 
 
 @pytest.mark.parametrize(("space", "said"), NOT_IN_THE_SPACE, ids=repr)
-def test_an_action_outside_its_space_is_a_sentence_in_a_batch_too(space: Any, said: Any) -> None:
+def test_an_action_outside_its_space_gets_a_sentence_in_a_batch_too(space: Any, said: Any) -> None:
     layout, strict = arrays.layout(space), arrays.layout(space, action=True)
     inside, outside = sampled(space, 1, 1)[0], values.decoder(space)(over_json(said))
     batch = arrays.batch_of(layout, [inside, outside])
@@ -269,7 +269,7 @@ def test_a_finite_action_beyond_the_bounds_arrives_since_environments_clip_it() 
 
 
 @given(SPACES, SEEDS, st.data())
-def test_a_message_cut_short_or_too_long_is_a_sentence(space: Any, seed: int, data: Any) -> None:
+def test_a_message_cut_short_or_too_long_gets_a_sentence(space: Any, seed: int, data: Any) -> None:
     layout = arrays.layout(space)
     batch = arrays.batch_of(layout, sampled(space, seed, 3))
     message = arrays.step_request(arrays.STEP_MANY, 0, 3, layout, batch)
@@ -282,7 +282,7 @@ def test_a_message_cut_short_or_too_long_is_a_sentence(space: Any, seed: int, da
 
 
 @given(st.binary(max_size=60), st.sampled_from([FLOATS, NAMED, GRAPH, spaces.Text(3), spaces.Box(0, 1, (3,), bool)]))
-def test_bytes_by_chance_are_read_or_are_a_sentence(data: bytes, space: Any) -> None:
+def test_random_bytes_are_read_or_get_a_sentence(data: bytes, space: Any) -> None:
     layout = arrays.layout(space, action=True)
     reads = (
         lambda: arrays.read_actions(arrays.read_request(data), layout),
@@ -299,7 +299,7 @@ def test_bytes_by_chance_are_read_or_are_a_sentence(data: bytes, space: Any) -> 
 
 
 @pytest.mark.parametrize("count", [0, 2, arrays.MAX_STEPS + 1])
-def test_a_count_of_steps_that_does_not_fit_its_kind_is_a_sentence(count: int) -> None:
+def test_a_count_of_steps_that_does_not_fit_its_kind_gets_a_sentence(count: int) -> None:
     kind = arrays.STEP if count == 2 else arrays.STEP_MANY
     with pytest.raises(CodecError, match="not for"):
         arrays.read_request(struct.pack("<BxHI", kind, 0, count))
@@ -325,7 +325,7 @@ def test_a_count_of_steps_that_does_not_fit_its_kind_is_a_sentence(count: int) -
     ],
     ids=repr,
 )
-def test_an_observation_that_its_space_cannot_hold_is_a_sentence(space: Any, value: Any) -> None:
+def test_an_observation_that_its_space_cannot_hold_gets_a_sentence(space: Any, value: Any) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         arrays.batch_of(arrays.layout(space), [value])
 
@@ -392,7 +392,7 @@ def test_only_the_rows_that_were_stepped_are_sent() -> None:
 
 
 @given(SPACES, SEEDS)
-def test_a_batch_of_a_vector_is_put_as_a_whole(space: Any, seed: int) -> None:
+def test_a_batch_of_a_vector_is_sent_as_a_whole(space: Any, seed: int) -> None:
     layout = arrays.layout(space)
     rows = sampled(space, seed, 3)
     batch = layout.empty(5)
@@ -410,7 +410,7 @@ def test_a_reset_has_a_seed_and_options() -> None:
 
 
 @pytest.mark.parametrize("said", [[], {"seed": -1}, {"seed": "a"}, {"seed": True}, {"options": 3}, {"x": 1}, "{"])
-def test_a_wrong_reset_is_a_sentence(said: Any) -> None:
+def test_a_wrong_reset_gets_a_sentence(said: Any) -> None:
     body = said if isinstance(said, str) else json.dumps(said)
     with pytest.raises(CodecError, match=r"\.$"):
         arrays.read_reset(arrays.read_request(struct.pack("<BxHI", arrays.RESET, 0, 0) + body.encode()))
@@ -419,8 +419,8 @@ def test_a_wrong_reset_is_a_sentence(said: Any) -> None:
 # --- infos ---
 
 
-class Thing:
-    """Something that no codec knows."""
+class UnknownObject:
+    """An object that no codec knows."""
 
 
 SCALARS = st.one_of(
@@ -468,12 +468,15 @@ def test_infos_are_json_for_gymies_clients(info: Any) -> None:
 
 
 @pytest.mark.parametrize("write", [values.to_text, exact.to_text])
-def test_an_object_that_cannot_be_sent_is_the_name_of_its_class(write: Any) -> None:
-    assert json.loads(write({"thing": Thing(), "in a list": [Thing]})) == {"thing": "Thing", "in a list": ["type"]}
+def test_of_an_object_that_cannot_be_sent_the_name_of_its_class_arrives(write: Any) -> None:
+    assert json.loads(write({"thing": UnknownObject(), "in a list": [UnknownObject]})) == {
+        "thing": "UnknownObject",
+        "in a list": ["type"],
+    }
 
 
 @pytest.mark.parametrize("write", [values.to_text, exact.to_text])
-def test_a_dict_that_holds_itself_is_sent_to_some_depth(write: Any) -> None:
+def test_a_dict_that_contains_itself_is_sent_to_some_depth(write: Any) -> None:
     info: dict[str, Any] = {}
     info["self"] = info
     assert json.loads(write(info))
@@ -499,7 +502,7 @@ def test_a_dict_that_holds_itself_is_sent_to_some_depth(write: Any) -> None:
     ],
     ids=lambda said: said[:20],
 )
-def test_infos_that_are_none_are_a_sentence(said: str) -> None:
+def test_wrong_infos_get_a_sentence(said: str) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         exact.from_text(said)
 
@@ -520,17 +523,17 @@ def test_a_picture_travels_as_png(shape: Any) -> None:
     [None, "a line\nof text", [np.zeros((2, 2, 3), np.uint8)] * 2, np.eye(3), np.zeros((0, 2, 3), np.uint8), []],
     ids=lambda found: type(found).__name__,
 )
-def test_whatever_else_render_returns_travels(found: Any) -> None:
+def test_other_results_of_render_travel_too(found: Any) -> None:
     assert same(values.rendered(over_json(values.picture(found))), found)
 
 
-@pytest.mark.parametrize("found", [Thing(), 3, np.array(["a"])])
-def test_what_is_no_picture_is_a_sentence(found: Any) -> None:
+@pytest.mark.parametrize("found", [UnknownObject(), 3, np.array(["a"])])
+def test_a_result_that_is_no_picture_gets_a_sentence(found: Any) -> None:
     with pytest.raises(CodecError, match="cannot be sent"):
         values.picture(found)
 
 
 @pytest.mark.parametrize("said", [3, {}, {"png": "AAAA", "shape": [1]}, {"array": [1], "dtype": "O", "shape": [2]}])
-def test_an_answer_that_is_no_picture_is_a_sentence(said: Any) -> None:
+def test_an_answer_that_is_no_picture_gets_a_sentence(said: Any) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
         values.rendered(said)

@@ -56,14 +56,14 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GymServerProce
         yield found
 
 
-def test_a_step_is_what_the_program_makes_of_it(program: GymServerProcess) -> None:
+def test_the_answer_of_a_step_is_the_result_of_process_step(program: GymServerProcess) -> None:
     with TextClient(program.url) as client:
         made = client.make("CartPole-v1")
         client.ask("reset", instance_id=made)
         assert client.ask("step", instance_id=made, action=1) == [[0, 0, 0, 0], 10.0, False, {"processed": True}]
 
 
-def test_a_program_is_told_of_the_time_limit_and_its_info_is_what_is_answered(program: GymServerProcess) -> None:
+def test_process_step_gets_the_time_limit_and_its_info_is_answered(program: GymServerProcess) -> None:
     with TextClient(program.url) as client:
         made = client.make("MountainCar-v0")
         client.ask("reset", instance_id=made)
@@ -79,18 +79,18 @@ def test_steps_of_one_request_are_processed_too(program: GymServerProcess) -> No
         assert client.ask("step_many", instance_id=made, actions=[1, 1])[1] == [10.0, 10.0]
 
 
-def test_the_programs_own_errors_are_told_as_gymies(program: GymServerProcess) -> None:
+def test_errors_of_the_program_have_gymies_sentence(program: GymServerProcess) -> None:
     with TextClient(program.url) as client, pytest.raises(ConnectionClosed, match="not found"):
         client.make("missing")
 
 
-def test_parameters_that_the_program_does_not_take(program: GymServerProcess) -> None:
+def test_parameters_that_get_env_does_not_take_get_a_sentence(program: GymServerProcess) -> None:
     with TextClient(program.url + "?form=gymnasium") as client:
         said = client.ask("make", env_id="CartPole-v1", no_graphics=True)
         assert "unexpected keyword argument 'no_graphics'" in said["error"]["message"]
 
 
-def test_the_program_of_the_documentation(tmp_path: Path) -> None:
+def test_the_program_of_the_documentation_runs(tmp_path: Path) -> None:
     (text,) = [
         found
         for found in re.findall(r"```python\n(.*?)```", (ROOT / "docs/gym.md").read_text(), re.DOTALL)
@@ -126,7 +126,7 @@ def test_the_documentation_has_every_limit_with_its_default() -> None:
         (["ARGS=--seconds 10"], "-m trial.gym --port 5000 --seconds 10"),
     ],
 )
-def test_make_gym_starts_it(arguments: list[str], command: str) -> None:
+def test_make_gym_starts_a_server(arguments: list[str], command: str) -> None:
     done = subprocess.run(["make", "-n", "gym", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.split()[-len(command.split()) :] == command.split()
 
@@ -136,7 +136,7 @@ def test_only_two_functions_can_be_replaced() -> None:
         override("reset")
 
 
-def test_a_port_that_is_taken_is_told(program: GymServerProcess) -> None:
+def test_a_port_that_is_taken_is_reported(program: GymServerProcess) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "trial.gym", "--port", str(program.port)],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
@@ -155,7 +155,7 @@ def test_a_port_that_is_taken_is_told(program: GymServerProcess) -> None:
         (["--host", "192.0.2.1"], "Cannot listen at 192.0.2.1:5000: Cannot assign requested address."),
     ],
 )
-def test_what_cannot_be_is_told_before_anything_starts(
+def test_wrong_arguments_are_reported_before_anything_starts(
     arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:
@@ -167,7 +167,7 @@ def test_what_cannot_be_is_told_before_anything_starts(
 
 
 @pytest.mark.parametrize("host", [".".join(["name" * 15] * 6), "a..b"])
-def test_a_host_that_is_none_is_told(host: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_host_that_does_not_exist_is_reported(host: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--host", host]) == 1
     assert f"Cannot listen at {host}:5000: there is no such host." in capsys.readouterr().err
 
@@ -178,7 +178,7 @@ def test_a_program_says_where_it_serves(tmp_path: Path) -> None:
         assert len(client.make("CartPole-v1")) == 32
 
 
-def test_a_start_beside_the_main_thread_is_refused(tmp_path: Path) -> None:
+def test_a_start_outside_of_the_main_thread_is_refused(tmp_path: Path) -> None:
     program = """
 import threading
 from trial import gym as gymie
@@ -195,7 +195,7 @@ thread.join()
     assert "RuntimeError: The server must be started in the main thread of the program" in done.stderr
 
 
-def test_a_module_that_cannot_be_imported_is_told(tmp_path: Path) -> None:
+def test_a_module_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("raise RuntimeError('no')")
     done = subprocess.run(
         [sys.executable, "-m", "trial.gym", "--port", "0", "--import", "broken"],
@@ -222,7 +222,7 @@ def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int
 
 
 def test_ctrl_c_ends_the_server_whichever_of_its_threads_it_reaches(tmp_path: Path) -> None:
-    """As it does if it comes just before the main thread waits for connections."""
+    """Also if the signal comes just before the main thread waits for connections."""
     program = """
 import signal, sys, threading, time
 
@@ -248,7 +248,7 @@ sys.exit(main(["--port", "0"]))
 
 
 def test_a_server_of_the_tests_ends_by_ctrl_c_where_their_shell_ignores_it() -> None:
-    """A shell starts what it runs in the background so, and processes inherit it."""
+    """A shell starts its background jobs with SIGINT ignored, and processes inherit that."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with gym_server() as found:

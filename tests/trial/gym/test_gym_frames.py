@@ -15,7 +15,7 @@ from testing.gym_server import GymServerProcess
 WITHIN = 15.0
 
 
-class Raw:
+class RawConnection:
     """A connection whose bytes a test chooses."""
 
     def __init__(self, server: GymServerProcess) -> None:
@@ -31,7 +31,7 @@ class Raw:
             self.socket.sendall(piece)
 
     def hear(self) -> Frame:
-        """The next frame; the close frame, or the end, too."""
+        """The next frame, also a close frame; EOFError at the end of the connection."""
         while not (events := self.protocol.events_received()):
             data = self.socket.recv(65536)
             if not data:
@@ -43,8 +43,8 @@ class Raw:
 
 
 @pytest.fixture
-def raw(server: GymServerProcess) -> Iterator[Raw]:
-    found = Raw(server)
+def raw(server: GymServerProcess) -> Iterator[RawConnection]:
+    found = RawConnection(server)
     yield found
     found.socket.close()
 
@@ -56,7 +56,7 @@ def frame(said: bytes, opcode: Opcode = Opcode.TEXT, fin: bool = True) -> bytes:
 UNKNOWN = b'{"method": "none", "params": {}}'
 
 
-def test_two_requests_in_one_packet_are_answered_in_order(raw: Raw) -> None:
+def test_two_requests_in_one_packet_are_answered_in_order(raw: RawConnection) -> None:
     raw.say(frame(b'{"method": "one", "params": {}}') + frame(b'{"method": "two", "params": {}}'))
     answer = b""
     while answer.count(b"error") < 2:
@@ -64,12 +64,12 @@ def test_two_requests_in_one_packet_are_answered_in_order(raw: Raw) -> None:
     assert answer.index(b"`one`") < answer.index(b"`two`")
 
 
-def test_a_request_byte_by_byte(raw: Raw) -> None:
+def test_a_request_sent_byte_by_byte_is_answered(raw: RawConnection) -> None:
     raw.say(*(bytes([byte]) for byte in frame(UNKNOWN)))
     assert b"MethodNotFound" in raw.hear().data
 
 
-def test_a_request_in_fragments_with_a_ping_between_them(raw: Raw) -> None:
+def test_a_request_in_fragments_with_a_ping_between_them_is_answered(raw: RawConnection) -> None:
     raw.say(frame(UNKNOWN[:9], fin=False), frame(b"are you there", Opcode.PING))
     pong = raw.hear()
     assert (pong.opcode, pong.data) == (Opcode.PONG, b"are you there")
@@ -77,7 +77,7 @@ def test_a_request_in_fragments_with_a_ping_between_them(raw: Raw) -> None:
     assert b"MethodNotFound" in raw.hear().data
 
 
-def test_a_ping_between_requests(raw: Raw) -> None:
+def test_a_ping_between_requests_is_answered(raw: RawConnection) -> None:
     raw.say(frame(b"first", Opcode.PING))
     assert raw.hear().data == b"first"
     raw.say(frame(UNKNOWN))
@@ -87,7 +87,7 @@ def test_a_ping_between_requests(raw: Raw) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 1, 125, 126, 65535, 65536, 200_000])
-def test_requests_of_every_length(raw: Raw, length: int) -> None:
+def test_requests_of_every_length_are_answered(raw: RawConnection, length: int) -> None:
     raw.say(frame(b"x" * length))
     assert b"InvalidMessage" in raw.hear().data
     raw.say(frame(b"x" * length, Opcode.BINARY))
@@ -109,7 +109,9 @@ def test_requests_of_every_length(raw: Raw, length: int) -> None:
     ids=["unmasked", "reserved bit", "reserved opcode", "continues nothing", "ping", "no UTF-8", "huge", "huge part"],
 )
 @pytest.mark.parametrize("first", [b"", frame(UNKNOWN)], ids=["at first", "later"])
-def test_what_the_protocol_forbids_closes_with_its_code(raw: Raw, first: bytes, wrong: bytes, code: int) -> None:
+def test_a_frame_that_the_protocol_forbids_closes_with_its_code(
+    raw: RawConnection, first: bytes, wrong: bytes, code: int
+) -> None:
     if first:
         raw.say(first)
         raw.hear()
@@ -118,12 +120,12 @@ def test_what_the_protocol_forbids_closes_with_its_code(raw: Raw, first: bytes, 
     assert (found.opcode, int.from_bytes(found.data[:2], "big")) == (Opcode.CLOSE, code)
 
 
-def test_fragments_that_are_too_large_together(raw: Raw) -> None:
+def test_fragments_that_are_too_large_together_close_the_connection(raw: RawConnection) -> None:
     raw.say(frame(b"x" * 3_000_000, fin=False), frame(b"x" * 3_000_000, Opcode.CONT))
     assert raw.hear().opcode is Opcode.CLOSE
 
 
-def test_a_close_is_answered(raw: Raw) -> None:
+def test_a_close_is_answered(raw: RawConnection) -> None:
     raw.say(frame(UNKNOWN))
     raw.hear()
     raw.say(frame(b"\x03\xe8", Opcode.CLOSE))

@@ -1,4 +1,4 @@
-"""What Gymie's client sends, word by word as its source has it (Commander.ts, Env.ts, Gymie.ts), and what it gets."""
+"""The messages of Gymie's client, word by word as in its source (Commander.ts, Env.ts, Gymie.ts), and their answers."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def gymie(client: TextClient) -> GymieClient:
     return GymieClient(client)
 
 
-def closed(client: TextClient, message: str) -> tuple[int, str]:
-    """With which code and reason the server closes the connection after this message."""
+def close_reason(client: TextClient, message: str) -> tuple[int, str]:
+    """Send this message; return the code and the reason with which the server closes the connection."""
     with pytest.raises(ConnectionClosed) as found:
         client.say(message)
     assert found.value.rcvd is not None
@@ -84,7 +84,7 @@ def test_action_sample(gymie: GymieClient, env_id: str, kind: type) -> None:
     assert isinstance(gymie.command("action_sample"), kind)
 
 
-def test_a_continuous_action(gymie: GymieClient) -> None:
+def test_a_continuous_action_is_taken(gymie: GymieClient) -> None:
     gymie.make("MountainCarContinuous-v0")
     gymie.command("reset")
     state, reward, done, _ = gymie.command("step", action=[0.5])
@@ -109,7 +109,7 @@ def test_the_seed_of_make_is_for_the_first_reset_alone(client: TextClient, seeds
     assert found == [observation.tolist() for observation, _ in expected]
 
 
-def test_done_says_whether_it_was_the_time_limit(client: TextClient) -> None:
+def test_info_says_that_done_is_by_the_time_limit(client: TextClient) -> None:
     made = client.make("Odd/Calm-v0", max_episode_steps=2)
     client.ask("reset", instance_id=made)
     client.ask("step", instance_id=made, action=1)
@@ -133,12 +133,12 @@ def test_an_error_closes_with_gymies_code_and_sentence(
     client: TextClient, message: str, code: int, sentence: str
 ) -> None:
     """gymie/tests/test_gymie.py, `test_message_handle`."""
-    assert closed(client, message) == (code, sentence)
+    assert close_reason(client, message) == (code, sentence)
 
 
-def test_the_close_says_what_an_environment_lacks(client: TextClient) -> None:
+def test_the_close_names_the_package_that_an_environment_lacks(client: TextClient) -> None:
     """Gymie's sentence alone, "is malformed", tells nothing to do about it."""
-    code, sentence = closed(client, '{"method": "make", "params": {"env_id": "Odd/Lacking-v0"}}')
+    code, sentence = close_reason(client, '{"method": "make", "params": {"env_id": "Odd/Lacking-v0"}}')
     assert code == 1007
     assert sentence.startswith(
         "Environment `Odd/Lacking-v0` is malformed: DependencyNotInstalled: Box2D is not installed"
@@ -149,14 +149,14 @@ def test_a_wrong_action_closes_with_gymies_sentence(client: TextClient) -> None:
     made = client.make("CartPole-v1")
     client.ask("reset", instance_id=made)
     step = json.dumps({"method": "step", "params": {"instance_id": made, "action": -123}})
-    assert closed(client, step) == (1007, "Action `-123` is wrong")
+    assert close_reason(client, step) == (1007, "Action `-123` is wrong")
 
 
 def test_after_close_the_environment_is_gone(client: TextClient) -> None:
     made = client.make("CartPole-v1")
     client.ask("close", instance_id=made)
     reset = json.dumps({"method": "reset", "params": {"instance_id": made}})
-    assert closed(client, reset) == (1007, f"Instance `{made}` not found")
+    assert close_reason(client, reset) == (1007, f"Instance `{made}` not found")
 
 
 def test_an_environment_of_gyms_old_kind(client: TextClient) -> None:
@@ -175,7 +175,7 @@ def test_an_environment_of_gyms_old_kind_is_seeded_by_its_own_method(client: Tex
     assert client.ask("reset", instance_id=made, seed=0) == np.random.default_rng(0).random(2).tolist()
 
 
-def test_a_number_that_json_has_not_is_sent_all_the_same(gymie: GymieClient) -> None:
+def test_infinity_is_sent_although_json_has_no_such_number(gymie: GymieClient) -> None:
     gymie.make("Odd/Infinite-v0")
     assert gymie.command("reset") == [float("inf"), None]
 
@@ -198,7 +198,7 @@ def test_gymnasiums_form(asking: TextClient) -> None:
     assert asking.ask("step", instance_id=made, action=1)[2:4] == [False, True]
 
 
-def test_a_form_that_is_none_is_refused(server: GymServerProcess) -> None:
+def test_an_unknown_form_is_refused(server: GymServerProcess) -> None:
     with pytest.raises(InvalidStatus) as found, connect(server.url + "?form=other"):
         pass
     assert found.value.response.body == b"form must be one of gymie, documented, gymnasium.\n"
@@ -253,6 +253,6 @@ def test_a_picture(asking: TextClient) -> None:
     assert asking.ask("render", instance_id=made)["shape"] == [4, 6, 3]
 
 
-def test_it_says_how_a_picture_can_be_had(asking: TextClient) -> None:
+def test_the_error_without_a_picture_names_render_mode(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     assert "render_mode" in asking.ask("render", instance_id=made)["error"]["message"]

@@ -25,9 +25,9 @@ WITHIN = 15.0
 
 @pytest.fixture(autouse=True)
 def nothing_stays_behind(server: GymServerProcess) -> Iterator[None]:
-    """After each test, with all connections closed, only the server and its spawner run; and it serves others."""
+    """After each test, with all connections closed, only the server and its spawner run, and it serves other clients."""
     yield
-    until(lambda: len(below(server)) == 1, WITHIN)
+    until(lambda: len(descendants(server)) == 1, WITHIN)
     with TextClient(server.url) as other:
         assert len(other.ask("reset", instance_id=other.make("Odd/Calm-v0"))) == 2
 
@@ -38,25 +38,25 @@ def patient_server() -> contextlib.AbstractContextManager[GymServerProcess]:
     return gym_server(*odd, env={"PYTHONPATH": str(Path(__file__).parent)})
 
 
-def below(server: GymServerProcess) -> list[psutil.Process]:
-    """What the server has started and what that has started."""
+def descendants(server: GymServerProcess) -> list[psutil.Process]:
+    """The processes below the server's."""
     return psutil.Process(server.pid).children(recursive=True)
 
 
-def stepped(client: TextClient, env_id: str, **action: Any) -> Any:
-    """The answer to one step of a new environment."""
+def first_step(client: TextClient, env_id: str, **action: Any) -> Any:
+    """Make an environment, reset it and take a step; return the answer to the step."""
     made = client.make(env_id)
     client.ask("reset", instance_id=made)
     return client.ask("step", instance_id=made, **(action or {"action": 1}))
 
 
-def refused(said: Any) -> tuple[str, str]:
-    """Kind and sentence of an error."""
+def kind_and_sentence(said: Any) -> tuple[str, str]:
+    """The kind and the sentence of an error."""
     return said["error"]["type"], said["error"]["message"]
 
 
 def still_serves(client: TextClient) -> bool:
-    return len(stepped(client, "Odd/Calm-v0")) == 5
+    return len(first_step(client, "Odd/Calm-v0")) == 5
 
 
 # Messages
@@ -87,8 +87,8 @@ def still_serves(client: TextClient) -> bool:
         (b"\x00" * 8, "InvalidMessage"),
     ],
 )
-def test_what_is_no_request_gets_a_sentence(asking: TextClient, message: str | bytes, kind: str) -> None:
-    found, sentence = refused(json.loads(asking.say(message)))
+def test_a_wrong_request_gets_a_sentence(asking: TextClient, message: str | bytes, kind: str) -> None:
+    found, sentence = kind_and_sentence(json.loads(asking.say(message)))
     assert found == kind
     assert 10 < len(sentence) <= 300
     assert still_serves(asking)
@@ -103,7 +103,7 @@ def test_what_is_no_request_gets_a_sentence(asking: TextClient, message: str | b
     ],
 )
 def test_parameters_that_a_method_does_not_take_are_named(asking: TextClient, params: str, reason: str) -> None:
-    kind, sentence = refused(json.loads(asking.say(f'{{"method": "step", "params": {params}}}')))
+    kind, sentence = kind_and_sentence(json.loads(asking.say(f'{{"method": "step", "params": {params}}}')))
     assert kind == "WrongParameters"
     assert f"are wrong: {reason}" in sentence  # newer Pythons ask whether a similar name was meant
 
@@ -122,7 +122,7 @@ def test_parameters_that_a_method_does_not_take_are_named(asking: TextClient, pa
     ],
 )
 def test_a_wrong_action_gets_a_sentence(asking: TextClient, env_id: str, action: Any) -> None:
-    kind, sentence = refused(stepped(asking, env_id, action=action))
+    kind, sentence = kind_and_sentence(first_step(asking, env_id, action=action))
     assert kind == "WrongAction"
     assert sentence.startswith("Action `")
     assert still_serves(asking)
@@ -130,7 +130,7 @@ def test_a_wrong_action_gets_a_sentence(asking: TextClient, env_id: str, action:
 
 def test_a_step_before_reset_gets_gymnasiums_sentence(asking: TextClient) -> None:
     made = asking.make("CartPole-v1")
-    assert "reset" in refused(asking.ask("step", instance_id=made, action=0))[1]
+    assert "reset" in kind_and_sentence(asking.ask("step", instance_id=made, action=0))[1]
 
 
 def test_10_mb_in_a_message_close_the_connection(asking: TextClient) -> None:
@@ -140,26 +140,26 @@ def test_10_mb_in_a_message_close_the_connection(asking: TextClient) -> None:
     assert (found.value.rcvd.code, "exceeds limit" in found.value.rcvd.reason) == (1009, True)
 
 
-def test_too_many_steps_for_one_reply(asking: TextClient) -> None:
+def test_too_many_steps_for_one_reply_get_a_sentence(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
-    kind, _ = refused(asking.ask("step_many", instance_id=made, actions=[0] * 70_000))
+    kind, _ = kind_and_sentence(asking.ask("step_many", instance_id=made, actions=[0] * 70_000))
     assert kind == "LimitReached"
 
 
-def test_nothing_can_be_asked_of_anothers_environment(server: GymServerProcess, asking: TextClient) -> None:
+def test_a_client_cannot_use_another_clients_environment(server: GymServerProcess, asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     with TextClient(server.url + "?form=gymnasium") as other:
         for method in ("reset", "close", "observation_space", "render"):
-            assert refused(other.ask(method, instance_id=made))[0] == "InstanceNotFound"
+            assert kind_and_sentence(other.ask(method, instance_id=made))[0] == "InstanceNotFound"
     assert len(asking.ask("reset", instance_id=made)) == 2
 
 
-def test_a_thousand_makes(asking: TextClient) -> None:
+def test_a_thousand_requests_make_only_as_many_environments_as_allowed(asking: TextClient) -> None:
     for _ in range(1000):
         asking.websocket.send('{"method": "make", "params": {"env_id": "Odd/Calm-v0"}}')
     said = [json.loads(asking.websocket.recv(20)) for _ in range(1000)]
     assert sum("instance_id" in one for one in said) == 8
-    assert {refused(one) for one in said if "error" in one} == {
+    assert {kind_and_sentence(one) for one in said if "error" in one} == {
         ("LimitReached", "A connection may have 8 environments; it has 8. Close some.")
     }
 
@@ -181,8 +181,8 @@ def test_a_closed_environment_makes_room(asking: TextClient) -> None:
         ("Odd/Greedy-v0", "MemoryError"),
     ],
 )
-def test_the_connection_stays_when_an_environment(asking: TextClient, env_id: str, words: str) -> None:
-    assert words in refused(stepped(asking, env_id))[1]
+def test_the_connection_stays_when_an_environment_fails(asking: TextClient, env_id: str, words: str) -> None:
+    assert words in kind_and_sentence(first_step(asking, env_id))[1]
     assert still_serves(asking)
 
 
@@ -194,11 +194,9 @@ def test_the_connection_stays_when_an_environment(asking: TextClient, env_id: st
         ("Odd/Hanging-v0", "The environment took longer than 1 s; its process was ended."),
     ],
 )
-def test_the_close_says_what_became_of_an_environment_that_took_its_process_along(
-    asking: TextClient, env_id: str, words: str
-) -> None:
+def test_the_close_says_how_an_environments_process_ended(asking: TextClient, env_id: str, words: str) -> None:
     with pytest.raises(ConnectionClosed) as found:
-        stepped(asking, env_id)
+        first_step(asking, env_id)
     assert found.value.rcvd is not None
     assert (found.value.rcvd.code, found.value.rcvd.reason) == (1011, words)
 
@@ -211,30 +209,30 @@ def closed_within(client: TextClient) -> str:
     return found.value.rcvd.reason
 
 
-def test_too_many_processes_of_an_environment(asking: TextClient) -> None:
-    stepped(asking, "Odd/Multiplying-v0")
+def test_too_many_processes_of_an_environment_are_ended(asking: TextClient) -> None:
+    first_step(asking, "Odd/Multiplying-v0")
     assert closed_within(asking) == "The environments started more than 4 processes; all were ended."
 
 
-def test_too_much_memory_of_several_processes(asking: TextClient) -> None:
-    stepped(asking, "Odd/GreedyTogether-v0")
+def test_processes_that_use_too_much_memory_together_are_ended(asking: TextClient) -> None:
+    first_step(asking, "Odd/GreedyTogether-v0")
     assert closed_within(asking) == "The environments used more than 300 MB; their process was ended."
 
 
 def test_a_process_that_an_environment_left_ends_with_the_connection(
     server: GymServerProcess, asking: TextClient
 ) -> None:
-    until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
-    stepped(asking, "Odd/Forking-v0")
-    assert len(below(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
+    until(lambda: len(descendants(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
+    first_step(asking, "Odd/Forking-v0")
+    assert len(descendants(server)) == 3  # spawner, worker, and what was left; the fixture sees it gone
 
 
-def test_what_an_environment_prints_disturbs_nobody(asking: TextClient) -> None:
-    assert stepped(asking, "Odd/Printing-v0")[0] == [1.0, 0.5]
+def test_what_an_environment_prints_disturbs_no_answer(asking: TextClient) -> None:
+    assert first_step(asking, "Odd/Printing-v0")[0] == [1.0, 0.5]
 
 
 @pytest.mark.parametrize("env_id", ["Odd/Looping-v0", "Odd/Hanging-v0", "Odd/Calm-v0"])
-def test_a_client_that_vanishes_in_mid_step(server: GymServerProcess, env_id: str) -> None:
+def test_a_client_that_vanishes_during_a_step_leaves_nothing_behind(server: GymServerProcess, env_id: str) -> None:
     client = TextClient(server.url)
     made = client.make(env_id)
     client.ask("reset", instance_id=made)
@@ -243,7 +241,7 @@ def test_a_client_that_vanishes_in_mid_step(server: GymServerProcess, env_id: st
 
 
 def test_others_play_while_an_environment_hangs() -> None:
-    """Longer than an answer may take: if others waited for its end, they would get none."""
+    """It hangs for longer than an answer may take: if others waited for it, they would get no answer."""
     with patient_server() as own, TextClient(own.url + "?form=gymnasium") as other:
         stuck = TextClient(own.url)
         made = stuck.make("Odd/Looping-v0")
@@ -253,7 +251,9 @@ def test_others_play_while_an_environment_hangs() -> None:
         stuck.websocket.socket.close()
 
 
-def test_a_client_that_reads_no_answer_keeps_nobody_from_playing(server: GymServerProcess, asking: TextClient) -> None:
+def test_a_client_that_reads_no_answer_keeps_no_other_from_playing(
+    server: GymServerProcess, asking: TextClient
+) -> None:
     deaf = TextClient(server.url + "?form=gymnasium")
     made = deaf.make("Odd/Calm-v0")
     ask = json.dumps({"method": "step_many", "params": {"instance_id": made, "actions": [0] * 10_000}})
@@ -285,14 +285,14 @@ def test_only_the_path_of_environments_is_served(server: GymServerProcess) -> No
 
 
 def test_an_idle_connection_answers_pings_and_has_no_process(server: GymServerProcess) -> None:
-    until(lambda: len(below(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
+    until(lambda: len(descendants(server)) == 1, WITHIN)  # what an earlier test has left is on its way out
     with connect(server.url) as websocket:
         for _ in range(3):
             assert websocket.ping().wait(WITHIN)
-        assert len(below(server)) == 1
+        assert len(descendants(server)) == 1
 
 
-def test_what_is_no_http_is_dropped(server: GymServerProcess) -> None:
+def test_a_connection_that_is_no_http_is_dropped(server: GymServerProcess) -> None:
     for said in (b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a" * 20_000):
         with socket.create_connection(("127.0.0.1", server.port)) as raw:
             raw.settimeout(WITHIN)
@@ -305,25 +305,33 @@ def test_what_is_no_http_is_dropped(server: GymServerProcess) -> None:
 
 
 @pytest.fixture
-def small() -> Iterator[GymServerProcess]:
+def small_server() -> Iterator[GymServerProcess]:
     with gym_server(*("--workers", "2", "--connections", "4", "--steps-per-second", "10")) as found:
         yield found
 
 
-def test_no_more_connections_with_environments_than_allowed(small: GymServerProcess) -> None:
-    with TextClient(small.url) as first, TextClient(small.url) as second, TextClient(small.url) as third:
+def test_the_number_of_connections_with_environments_is_limited(small_server: GymServerProcess) -> None:
+    with (
+        TextClient(small_server.url) as first,
+        TextClient(small_server.url) as second,
+        TextClient(small_server.url) as third,
+    ):
         first.make("CartPole-v1")
         second.make("CartPole-v1")
         with pytest.raises(ConnectionClosed, match="2 connections use environments already"):
             third.make("CartPole-v1")
 
 
-def test_a_worker_that_has_ended_makes_room_at_once(small: GymServerProcess) -> None:
+def test_a_worker_that_has_ended_makes_room_at_once(small_server: GymServerProcess) -> None:
     """Even if its end and the next connection's first request reach the spawner together."""
-    with TextClient(small.url) as first, TextClient(small.url) as second, TextClient(small.url) as third:
+    with (
+        TextClient(small_server.url) as first,
+        TextClient(small_server.url) as second,
+        TextClient(small_server.url) as third,
+    ):
         first.make("CartPole-v1")
         second.make("CartPole-v1")
-        spawner, ending, _ = below(small)
+        spawner, ending, _ = descendants(small_server)
         spawner.suspend()
         ending.kill()
         third.websocket.send(json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}}))
@@ -333,18 +341,23 @@ def test_a_worker_that_has_ended_makes_room_at_once(small: GymServerProcess) -> 
         assert "error" not in third.websocket.recv(WITHIN)
 
 
-def test_no_more_connections_than_allowed(small: GymServerProcess) -> None:
-    with TextClient(small.url), TextClient(small.url), TextClient(small.url), TextClient(small.url):
-        with pytest.raises(InvalidStatus) as found, connect(small.url):
+def test_the_number_of_connections_is_limited(small_server: GymServerProcess) -> None:
+    with (
+        TextClient(small_server.url),
+        TextClient(small_server.url),
+        TextClient(small_server.url),
+        TextClient(small_server.url),
+    ):
+        with pytest.raises(InvalidStatus) as found, connect(small_server.url):
             pass
         assert found.value.response.body == b"There are 4 connections already.\n"
 
 
-def test_no_more_steps_a_second_than_allowed(small: GymServerProcess) -> None:
-    with TextClient(small.url + "?form=gymnasium") as client:
+def test_the_number_of_steps_a_second_is_limited(small_server: GymServerProcess) -> None:
+    with TextClient(small_server.url + "?form=gymnasium") as client:
         made = client.make("CartPole-v1")
         client.ask("reset", instance_id=made)
-        kind, sentence = refused(client.ask("step_many", instance_id=made, actions=[0] * 11))
+        kind, sentence = kind_and_sentence(client.ask("step_many", instance_id=made, actions=[0] * 11))
         assert (kind, sentence) == ("LimitReached", "More than 10 steps a second; send them more slowly.")
         assert len(client.ask("step", instance_id=made, action=0)) == 5
 
@@ -355,43 +368,43 @@ def test_a_connection_without_requests_is_closed() -> None:
         assert closed_within(client) == "There was no request for 1 s."
 
 
-def ended(pids: list[int]) -> bool:
+def have_ended(pids: list[int]) -> bool:
     return not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_nothing_of_a_server_that_is_ended_stays(how: signal.Signals) -> None:
+def test_no_process_of_an_ended_server_stays(how: signal.Signals) -> None:
     with gym_server() as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
-        pids = [one.pid for one in below(own)]
+        pids = [one.pid for one in descendants(own)]
         assert len(pids) == 2
         os.kill(own.pid, how)
         if how is not signal.SIGKILL:
             assert closed_within(client) == "The server ends."
-        until(lambda: ended(pids), WITHIN)
+        until(lambda: have_ended(pids), WITHIN)
 
 
 def test_workers_end_with_their_spawner(server: GymServerProcess) -> None:
     with gym_server() as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
-        spawner, worker = (one.pid for one in below(own))
+        spawner, worker = (one.pid for one in descendants(own))
         os.kill(spawner, signal.SIGKILL)
-        until(lambda: ended([worker]), WITHIN)
+        until(lambda: have_ended([worker]), WITHIN)
 
 
 def test_a_worker_that_hangs_ends_with_its_spawner() -> None:
-    """It reads its socket no more, so only the system can end it."""
+    """It no longer reads its socket, so only the system can end it."""
     with patient_server() as own, TextClient(own.url) as client:
         made = client.make("Odd/Hanging-v0")
         client.ask("reset", instance_id=made)
         client.websocket.send(json.dumps({"method": "step", "params": {"instance_id": made, "action": 1}}))
-        spawner, worker = (one.pid for one in below(own))
+        spawner, worker = (one.pid for one in descendants(own))
         time.sleep(0.3)
         os.kill(spawner, signal.SIGKILL)
-        until(lambda: ended([worker]), WITHIN)
+        until(lambda: have_ended([worker]), WITHIN)
 
 
-def test_connections_that_say_nothing_are_limited_too() -> None:
+def test_the_number_of_silent_connections_is_limited_too() -> None:
     with gym_server("--connections", "3") as own:
         silent = [socket.create_connection(("127.0.0.1", own.port)) for _ in range(103)]
         with socket.create_connection(("127.0.0.1", own.port)) as one_more:
@@ -406,11 +419,17 @@ def serves(server: GymServerProcess) -> bool:
     try:
         with TextClient(server.url) as client:
             return len(client.make("CartPole-v1")) == 32
-    except (InvalidStatus, OSError, EOFError, InvalidMessage, ConnectionClosed):  # by when it was refused
+    except (
+        InvalidStatus,
+        OSError,
+        EOFError,
+        InvalidMessage,
+        ConnectionClosed,
+    ):  # the error depends on when the server refused
         return False
 
 
-def test_more_connections_than_the_shell_allows_files() -> None:
+def test_a_server_takes_more_connections_than_the_shells_limit_of_files() -> None:
     limited = ("-c", "import resource as r, runpy, sys; r.setrlimit(r.RLIMIT_NOFILE, (64, r.getrlimit(7)[1])); "
                "sys.argv[1:] = ['--port', '0']; runpy.run_module('trial.gym', run_name='__main__')")  # fmt: skip
     with gym_server(program=limited) as own:
@@ -421,7 +440,7 @@ def test_more_connections_than_the_shell_allows_files() -> None:
 
 
 def test_hundreds_of_first_requests_at_once_are_all_answered() -> None:
-    """More than the pipe between server and spawner can hold, in both directions."""
+    """More requests than the pipe between server and spawner can hold, in both directions."""
     made = json.dumps({"method": "make", "params": {"env_id": "CartPole-v1"}})
     with gym_server("--workers", "2") as own, contextlib.ExitStack() as stack:
         clients = [TextClient(own.url) for _ in range(700)]

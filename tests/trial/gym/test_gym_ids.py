@@ -1,4 +1,4 @@
-"""Ids of gym 0.17 make what Gymnasium and ALE have of them."""
+"""Ids of gym 0.17 make their successors in Gymnasium and ALE."""
 
 from __future__ import annotations
 
@@ -49,17 +49,17 @@ def test_an_old_id_makes_its_successor(url: str, old: str, now: str) -> None:
         ("Pong-ramNoFrameskip-v4", {"obs_type": "ram"}),
     ],
 )
-def test_what_the_old_names_of_an_atari_game_said_is_an_option(old: str, options: dict[str, Any]) -> None:
+def test_an_old_name_of_an_atari_game_becomes_options(old: str, options: dict[str, Any]) -> None:
     assert ids.present(old)[1] == options
 
 
 @pytest.mark.parametrize(
     "env_id", ["CartPole-v7", "CartPole", "Nothing-v0", "NothingDeterministic-v4", "", "-v0", "ALE/"]
 )
-def test_an_id_that_was_never_there_stays_as_it_is(env_id: str) -> None:
+def test_an_unknown_id_stays_as_it_is(env_id: str) -> None:
     assert ids.present(env_id) == (env_id, {})
 
 
-def test_a_newer_version_than_there_is_remains_an_error(url: str) -> None:
+def test_a_version_that_does_not_exist_yet_remains_an_error(url: str) -> None:
     with pytest.raises(RemoteError, match="CartPole-v7"):
         RemoteEnv(url, "CartPole-v7")

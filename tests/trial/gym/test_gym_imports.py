@@ -1,4 +1,4 @@
-"""What the process that listens, and what a client, need not import."""
+"""Modules that the listening process and a client must not import."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_the_process_that_listens_imports_neither_numpy_nor_gymnasium() -> None:
     assert not found & {"numpy", "gymnasium", "PIL"}
 
 
-def test_a_client_imports_of_the_trial_what_is_for_environments_alone() -> None:
+def test_a_client_imports_only_the_trials_modules_for_environments() -> None:
     found = imported("from trial.gym import RemoteEnv")
     ours = {name for name in found if name.split(".")[0] in {"trial", "protocol", "hippodrome", "lambdas", "local"}}
     assert ours - {"trial"} == {name for name in ours if name.startswith("trial.gym")}

@@ -1,4 +1,4 @@
-"""`--record FOLDER`: what is written, and what `make data` makes of it."""
+"""`--record FOLDER`: the recordings, and the datasets that `make data` makes of them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ HERE = Path(__file__).parent
 ODD = ("--import", "odd_environments")
 
 
-def recorded(folder: Path) -> list[list[dict[str, Any]]]:
+def recordings_in(folder: Path) -> list[list[dict[str, Any]]]:
     return [recording.read(file.read_bytes()) for file in sorted(folder.glob("gym/users/*/trials/*/*.jsonl.gz"))]
 
 
-def test_what_was_played_loads_in_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorded_episodes_load_in_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with gym_server("--record", str(tmp_path / "data")) as server, TextClient(server.url + "?form=gymnasium") as client:
         made = client.make("CartPole-v1", seed=5)
         first, _ = client.ask("reset", instance_id=made)
@@ -66,7 +66,7 @@ def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) ->
         client.ask("reset", instance_id=made)
         client.ask("step", instance_id=made, action=[[0.5, 0], [1, 0]])
         client.ask("close", instance_id=made)
-    files = recorded(tmp_path)
+    files = recordings_in(tmp_path)
     assert [[line["kind"] for line in lines] for lines in files] == [["header", "reset", "step", "end"]] * 2
     assert sorted(lines[2]["action"] for lines in files) == [[0.5, 0], [1, 0]]
     assert {lines[3]["why"] for lines in files} == {"closed"}
@@ -82,7 +82,7 @@ def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
         for _ in range(5):
             client.ask("step", instance_id=made, action=2)
         client.ask("close", instance_id=made)
-    ((*_, last, end),) = recorded(tmp_path)
+    ((*_, last, end),) = recordings_in(tmp_path)
     assert (last["terminated"], end["why"], end["steps"], end["score"]) == (True, "terminated", 5, 15.0)
 
 
@@ -107,11 +107,11 @@ def test_a_client_that_goes_leaves_a_whole_recording_and_one_that_is_killed_all_
         until(lambda: len(running()) == 1)  # the first client's has ended
         os.kill(running()[0], 9)
         worker.websocket.socket.close()
-    kinds = [[line["kind"] for line in lines] for lines in recorded(tmp_path)]
+    kinds = [[line["kind"] for line in lines] for lines in recordings_in(tmp_path)]
     assert sorted(kinds) == [["header", "reset", "step"], ["header", "reset", "step", "end"]]
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         gym_server("--record", str(tmp_path / "file")) as server,

@@ -94,7 +94,7 @@ def test_every_kind_of_space_travels_as_json_too(url: str) -> None:
             assert same(read(repeated), action)
 
 
-def test_the_servers_own_limit_of_time_comes_before_the_clients() -> None:
+def test_the_clients_time_limit_is_longer_than_the_servers() -> None:
     assert Limits().seconds + 10 < client_module.TIMEOUT
 
 
@@ -125,7 +125,7 @@ def test_options_reach_the_environment(url: str) -> None:
         assert truncated
 
 
-def test_what_the_specification_says_is_known(url: str) -> None:
+def test_the_specification_of_the_environment_is_known(url: str) -> None:
     with RemoteEnv(url, "CartPole-v1") as env:
         assert env.spec is not None
         assert (env.spec.id, env.spec.max_episode_steps, env.spec.reward_threshold) == ("CartPole-v1", 500, 475.0)
@@ -151,7 +151,7 @@ def test_text_is_drawn_too(url: str) -> None:
         assert env.render() == "drawn"
 
 
-def test_a_window_is_refused_before_the_server_is_asked() -> None:
+def test_the_render_mode_human_is_refused_before_the_server_is_asked() -> None:
     with pytest.raises(ValueError, match="HumanRendering"):
         RemoteEnv("ws://127.0.0.1:1/", "CartPole-v1", render_mode="human")
 
@@ -239,7 +239,7 @@ def test_a_vector_does_what_it_does_without_a_server(url: str, env_id: str, mode
         assert same(remote.reset(seed=[9, None, 8]), local.reset(seed=[9, None, 8]))
 
 
-def test_a_vector_resets_those_of_a_mask(url: str) -> None:
+def test_a_vector_resets_the_environments_of_a_mask(url: str) -> None:
     with RemoteVectorEnv(url, "CartPole-v1", 3, autoreset_mode="Disabled") as remote:
         local = vector_of("CartPole-v1", AutoresetMode.DISABLED)
         remote.reset(seed=4)
@@ -259,19 +259,19 @@ def test_many_steps_of_a_vector_are_its_steps(url: str, env_id: str) -> None:
         observations, rewards, terminated, truncated, infos = many.step_many(actions)
         for at, action in enumerate(actions):
             observation, *rest = single.step(action)
-            assert same(_at(observations, at), observation)
+            assert same(_part_of_step(observations, at), observation)
             assert same([rewards[at], terminated[at], truncated[at], infos[at]], rest)
 
 
-def _at(batch: Any, step: int) -> Any:
+def _part_of_step(batch: Any, step: int) -> Any:
     if isinstance(batch, dict):
-        return {key: _at(part, step) for key, part in batch.items()}
+        return {key: _part_of_step(part, step) for key, part in batch.items()}
     if isinstance(batch, tuple) and not isinstance(batch[0], tuple):
-        return tuple(_at(part, step) for part in batch)
+        return tuple(_part_of_step(part, step) for part in batch)
     return batch[step]
 
 
-def test_a_vectors_pictures(url: str) -> None:
+def test_a_vector_sends_the_pictures_of_its_environments(url: str) -> None:
     with RemoteVectorEnv(url, "CartPole-v1", 2, render_mode="rgb_array") as env:
         env.reset(seed=1)
         pictures = env.render()
@@ -292,7 +292,7 @@ def test_a_registered_id_is_drawn_in_a_window_of_the_clients(url: str) -> None:
         assert [picture.shape for picture in env.render()] == [(400, 600, 3)] * 2
 
 
-def test_gymnasiums_wrappers_go_around_it(url: str) -> None:
+def test_gymnasiums_wrappers_wrap_a_remote_env(url: str) -> None:
     env = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.wrappers.TimeLimit(RemoteEnv(url, "Pendulum-v1"), 5))
     env.reset(seed=1)
     results = [env.step(env.action_space.sample()) for _ in range(5)]
@@ -305,7 +305,7 @@ def test_gymnasiums_wrappers_go_around_it(url: str) -> None:
 
 
 @pytest.mark.parametrize("env_id", ["Nothing-v7", "CartPole-v9", "", "no.such.module:X-v0", "../x"])
-def test_an_unknown_environment_is_a_sentence_and_leaves_no_connection(url: str, env_id: str) -> None:
+def test_an_unknown_environment_gets_a_sentence_and_leaves_no_connection(url: str, env_id: str) -> None:
     before = sockets()
     with pytest.raises(RemoteError):
         RemoteEnv(url, env_id)
@@ -313,7 +313,7 @@ def test_an_unknown_environment_is_a_sentence_and_leaves_no_connection(url: str,
 
 
 @pytest.mark.parametrize("action", [2, -1, np.array([1]), "1", None, 0.5, np.nan])
-def test_a_wrong_action_is_a_sentence_and_the_environment_goes_on(url: str, action: Any) -> None:
+def test_a_wrong_action_gets_a_sentence_and_the_environment_goes_on(url: str, action: Any) -> None:
     with RemoteEnv(url, "CartPole-v1") as env:
         env.reset(seed=1)
         with pytest.raises((RemoteError, CodecError), match=r"\S \S"):
@@ -325,7 +325,7 @@ def test_a_wrong_action_is_a_sentence_and_the_environment_goes_on(url: str, acti
     ("env_id", "action", "shown"),
     [("CartPole-v1", 2, "2"), ("Pendulum-v1", np.array([np.nan], np.float32), "[nan]")],
 )
-def test_a_wrong_action_is_shown(url: str, env_id: str, action: Any, shown: str) -> None:
+def test_the_sentence_shows_the_wrong_action(url: str, env_id: str, action: Any, shown: str) -> None:
     with RemoteEnv(url, env_id) as env:
         env.reset(seed=1)
         with pytest.raises(RemoteError, match=re.escape(f"Action `{shown}` is wrong: The action ")):
@@ -333,7 +333,7 @@ def test_a_wrong_action_is_shown(url: str, env_id: str, action: Any, shown: str)
 
 
 @pytest.mark.parametrize("action", ["raise", "exit", "shape", "text", "three", "nothing"])
-def test_what_an_environment_breaks_is_a_sentence_and_the_connection_remains(url: str, action: str) -> None:
+def test_an_environments_mistake_gets_a_sentence_and_the_connection_remains(url: str, action: str) -> None:
     with RemoteEnv(url, "Bad-v0") as env:
         env.reset(seed=1)
         with pytest.raises(RemoteError, match=r"\S \S") as caught:
@@ -348,7 +348,7 @@ def test_an_observation_outside_its_space_arrives(url: str) -> None:
         assert same(env.step("outside")[0], np.array([np.nan, 7], np.float32))
 
 
-def test_a_reset_that_raises_is_a_sentence(url: str) -> None:
+def test_a_reset_that_raises_gets_a_sentence(url: str) -> None:
     with RemoteEnv(url, "Bad-v0") as env:
         with pytest.raises(RemoteError, match="no reset today"):
             env.reset(options={"raise": True})
@@ -376,7 +376,7 @@ def test_an_answer_that_does_not_come_in_time_ends_the_connection(url: str) -> N
 
 
 def test_an_interrupted_request_ends_the_connection(url: str) -> None:
-    """Its answer would be taken for the next request's."""
+    """Its answer would be taken for that of the next request."""
     with RemoteEnv(url, "Bad-v0") as env:
         env.reset()
         timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
@@ -388,7 +388,7 @@ def test_an_interrupted_request_ends_the_connection(url: str) -> None:
             env.reset()
 
 
-def test_a_server_that_ends_is_a_sentence() -> None:
+def test_the_end_of_the_server_gets_a_sentence() -> None:
     with serving() as (address, process):
         env = RemoteEnv(address, "CartPole-v1")
         env.reset()
@@ -399,7 +399,7 @@ def test_a_server_that_ends_is_a_sentence() -> None:
         env.close()
 
 
-def test_no_server_is_a_sentence() -> None:
+def test_a_missing_server_gets_a_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
     with pytest.raises(ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}"):
@@ -420,12 +420,12 @@ def test_a_proxy_is_not_asked_for_this_machine(url: str, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("address", ["http://127.0.0.1:1/", "127.0.0.1:1", "", "ws://"])
-def test_an_address_that_is_none_is_a_sentence(address: str) -> None:
+def test_a_wrong_address_gets_a_sentence(address: str) -> None:
     with pytest.raises(ConnectionLost, match=r"no connection to .*: .*\."):
         RemoteEnv(address, "CartPole-v1")
 
 
-def test_a_token_stands_in_no_message() -> None:
+def test_no_message_contains_the_token() -> None:
     for address in ("ws://127.0.0.1:1/", "ws://127.0.0.1:1/gym?token=secret", "ws://me:secret@127.0.0.1:1/"):
         with pytest.raises(ConnectionLost) as caught:
             RemoteEnv(address, "CartPole-v1", token="secret")
@@ -456,7 +456,7 @@ def sockets() -> set[str]:
     return {name for name in found if name.startswith("socket:")}
 
 
-def test_nothing_stays_behind_whether_closed_or_forgotten(url: str) -> None:
+def test_no_socket_stays_open_whether_an_environment_is_closed_or_forgotten(url: str) -> None:
     gc.collect()
     threads, before = set(threading.enumerate()), sockets()
     for closed in (True, False):
@@ -472,7 +472,7 @@ def test_nothing_stays_behind_whether_closed_or_forgotten(url: str) -> None:
         assert sockets() <= before
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads: what a researcher's program may do
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # a fork beside threads, as researchers' programs may do
 def test_a_forked_process_neither_uses_nor_ends_the_connection_of_its_parent(url: str) -> None:
     with RemoteEnv(url, "CartPole-v1") as env:
         env.reset(seed=1)

@@ -1,4 +1,4 @@
-"""Whatever an environment returns, raises or draws, the request gets a sentence or a value; never is the connection lost."""
+"""Whatever an environment returns, raises or draws, the request gets a sentence or a value, and the connection stays."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from trial.gym import ConnectionLost, RemoteEnv, RemoteError
 pytestmark = pytest.mark.xdist_group("gym-server")
 
 REFUSED = {
-    "exception without text": "WithoutWords",
-    "exception with odd text": "WordsOfAnotherType",
+    "exception without text": "WithoutText",
+    "exception with odd text": "TextOfAnotherType",
     "three values": "step() must return five values",
     "nothing": "step() must return five values",
     "generator": "step() must return five values",
@@ -64,31 +64,31 @@ def instance_id(asking: TextClient) -> Any:
     return made
 
 
-def number(name: str) -> int:
+def action_named(name: str) -> int:
     return [*RESULTS, *PICTURES].index(name)
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_sent_is_a_sentence(env: RemoteEnv, name: str) -> None:
+def test_a_result_that_cannot_be_sent_gets_a_sentence(env: RemoteEnv, name: str) -> None:
     env.reset()
     with pytest.raises(RemoteError) as caught:
-        env.step(number(name))
+        env.step(action_named(name))
     assert not isinstance(caught.value, ConnectionLost)
     assert REFUSED[name] in str(caught.value)
-    assert env.step(number("calm"))[1] == 1.0
+    assert env.step(action_named("calm"))[1] == 1.0
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_sent_is_a_sentence_in_json(asking: TextClient, instance_id: str, name: str) -> None:
-    answer = asking.ask("step", instance_id=instance_id, action=number(name))
+def test_a_result_that_cannot_be_sent_gets_a_sentence_in_json(asking: TextClient, instance_id: str, name: str) -> None:
+    answer = asking.ask("step", instance_id=instance_id, action=action_named(name))
     assert REFUSED[name] in answer["error"]["message"]
-    assert asking.ask("step", instance_id=instance_id, action=number("calm"))[1] == 1.0
+    assert asking.ask("step", instance_id=instance_id, action=action_named("calm"))[1] == 1.0
 
 
 @pytest.mark.parametrize("name", ARRIVES)
-def test_what_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
+def test_a_result_that_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
     env.reset()
-    observation, reward, terminated, truncated, info = env.step(number(name))
+    observation, reward, terminated, truncated, info = env.step(action_named(name))
     assert (observation.tolist(), reward, terminated, truncated, info) == (
         [0, 0],
         ARRIVES[name][0],
@@ -99,8 +99,10 @@ def test_what_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in ARRIVES if name != "array that is no list"])
-def test_what_can_be_sent_arrives_in_json(asking: TextClient, instance_id: str, name: str) -> None:
-    observation, reward, terminated, truncated, info = asking.ask("step", instance_id=instance_id, action=number(name))
+def test_a_result_that_can_be_sent_arrives_in_json(asking: TextClient, instance_id: str, name: str) -> None:
+    observation, reward, terminated, truncated, info = asking.ask(
+        "step", instance_id=instance_id, action=action_named(name)
+    )
     assert (observation, reward, terminated, truncated, info) == (
         [0, 0],
         ARRIVES[name][0],
@@ -110,14 +112,14 @@ def test_what_can_be_sent_arrives_in_json(asking: TextClient, instance_id: str, 
     )
 
 
-def test_an_array_that_cannot_become_a_list_is_a_sentence_in_json(asking: TextClient, instance_id: str) -> None:
-    answer = asking.ask("step", instance_id=instance_id, action=number("array that is no list"))
+def test_an_array_that_cannot_become_a_list_gets_a_sentence_in_json(asking: TextClient, instance_id: str) -> None:
+    answer = asking.ask("step", instance_id=instance_id, action=action_named("array that is no list"))
     assert "RuntimeError: no list" in answer["error"]["message"]
 
 
 def test_an_info_arrives_to_some_depth(env: RemoteEnv) -> None:
     env.reset()
-    info = env.step(number("info too deep"))[4]
+    info = env.step(action_named("info too deep"))[4]
     assert isinstance(info["deep"][0][0][0][0], list)
 
 
@@ -125,28 +127,28 @@ def test_an_environment_that_closes_the_connection_ends_it_with_a_sentence(url: 
     with RemoteEnv(url, "Odd/Results-v0") as env:
         env.reset()
         with pytest.raises(ConnectionLost, match="The environment ended its process"):
-            env.step(number("closed descriptors"))
+            env.step(action_named("closed descriptors"))
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("raised", "WithoutWords"), ("thing", "cannot be sent"), ("deep", "cannot be sent"), ("huge", "MemoryError")],
+    [("raised", "WithoutText"), ("thing", "cannot be sent"), ("deep", "cannot be sent"), ("huge", "MemoryError")],
 )
-def test_what_cannot_be_drawn_is_a_sentence(env: RemoteEnv, name: str, words: str) -> None:
+def test_a_picture_that_cannot_be_drawn_gets_a_sentence(env: RemoteEnv, name: str, words: str) -> None:
     env.reset()
-    env.step(number(name))
+    env.step(action_named(name))
     with pytest.raises(RemoteError, match=words) as caught:
         env.render()
     assert not isinstance(caught.value, ConnectionLost)
 
 
-def test_the_one_step_of_a_request_has_no_number(env: RemoteEnv) -> None:
+def test_an_error_in_the_only_step_of_a_request_has_no_number(env: RemoteEnv) -> None:
     env.reset()
-    with pytest.raises(RemoteError, match=r": WithoutWords$"):
-        env.step(number("exception without text"))
+    with pytest.raises(RemoteError, match=r": WithoutText$"):
+        env.step(action_named("exception without text"))
 
 
-def test_many_steps_say_which_one_raised(env: RemoteEnv) -> None:
+def test_the_error_in_one_of_many_steps_has_its_number(env: RemoteEnv) -> None:
     env.reset()
-    with pytest.raises(RemoteError, match=r"WithoutWords \(step 2 of this request\)"):
-        env.step_many(np.array([number("calm"), number("calm"), number("exception without text")]))
+    with pytest.raises(RemoteError, match=r"WithoutText \(step 2 of this request\)"):
+        env.step_many(np.array([action_named("calm"), action_named("calm"), action_named("exception without text")]))

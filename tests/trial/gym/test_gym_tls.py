@@ -59,18 +59,18 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
         yield relayed, folder / "fullchain.pem"
 
 
-def test_a_certificate_that_is_trusted(url: tuple[str, Path]) -> None:
+def test_a_trusted_certificate_is_accepted(url: tuple[str, Path]) -> None:
     with RemoteEnv(url[0], "CartPole-v1", ca=str(url[1])) as env:
         env.reset(seed=1)
         assert env.step(1)[1] == 1.0
 
 
-def test_a_certificate_that_is_not_trusted_is_a_sentence(url: tuple[str, Path]) -> None:
+def test_an_untrusted_certificate_gets_a_sentence(url: tuple[str, Path]) -> None:
     with pytest.raises(ConnectionLost, match="certificate"):
         RemoteEnv(url[0], "CartPole-v1")
 
 
-def test_a_file_of_certificates_that_is_none_is_a_sentence(url: tuple[str, Path], tmp_path: Path) -> None:
+def test_a_wrong_file_of_certificates_gets_a_sentence(url: tuple[str, Path], tmp_path: Path) -> None:
     (tmp_path / "empty.pem").write_text("")
     for name in ("empty.pem", "nothing.pem"):
         with pytest.raises(ConnectionLost, match=r"no connection to wss://\S+: .+\."):

@@ -1,4 +1,4 @@
-"""The WebSocket of environments byte by byte (RFC 6455): what is right is answered, what is wrong is closed with its code."""
+"""The WebSocket of environments byte by byte (RFC 6455): right frames are answered, wrong ones close the connection with their code."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Wire:
         return json.loads(payload)
 
     def closed(self) -> int:
-        """The code with which the server closes, and nothing after it."""
+        """The code with which the server closes; assert that nothing follows."""
         opcode, payload = self.frame()
         assert opcode == CLOSE, (opcode, payload)
         with contextlib.suppress(OSError):
@@ -121,21 +121,21 @@ def refused(wire: Wire) -> str:
     return str(wire.answer()["error"]["type"])
 
 
-def test_a_message_in_fragments_with_pings_between(wire: Wire) -> None:
+def test_a_message_in_fragments_with_pings_between_is_answered(wire: Wire) -> None:
     wire.send(frame(TEXT, UNKNOWN[:5], fin=False) + frame(PING, b"a") + frame(CONT, UNKNOWN[5:9], fin=False))
     wire.send(frame(PONG, b"unasked") + frame(CONT, b"", fin=False) + frame(CONT, UNKNOWN[9:]))
     assert wire.frame() == (PONG, b"a")
     assert refused(wire) == "InstanceNotFound"
 
 
-def test_a_message_byte_by_byte(wire: Wire) -> None:
+def test_a_message_sent_byte_by_byte_is_answered(wire: Wire) -> None:
     for byte in frame(TEXT, UNKNOWN):
         wire.send(bytes([byte]))
         time.sleep(0.0005)
     assert refused(wire) == "InstanceNotFound"
 
 
-def test_a_character_that_two_fragments_share(wire: Wire) -> None:
+def test_a_character_split_over_two_fragments_is_read(wire: Wire) -> None:
     message = '{"method": "é", "params": {}}'.encode()
     cut = message.index("é".encode()) + 1
     wire.send(frame(TEXT, message[:cut], fin=False) + frame(CONT, message[cut:]))
@@ -213,7 +213,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_closed_with_its_code(wire: Wire, name: str) -> None:
+def test_a_wrong_frame_closes_the_connection_with_its_code(wire: Wire, name: str) -> None:
     data, code = WRONG[name]
     wire.send(data)
     found = wire.closed()
@@ -250,7 +250,7 @@ def test_a_wrong_handshake_is_answered_and_ends_nothing_else(port: int, name: st
         assert refused(other) == "InstanceNotFound"
 
 
-def test_bytes_by_chance_end_one_connection_and_no_other(port: int) -> None:
+def test_random_bytes_end_one_connection_and_no_other(port: int) -> None:
     chance = random.Random(1)
     with contextlib.closing(Wire(port).socket):
         for _ in range(60):

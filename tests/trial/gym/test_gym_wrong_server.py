@@ -1,4 +1,4 @@
-"""RemoteEnv and a server that answers wrongly: a sentence, and the connection is over."""
+"""RemoteEnv and a server with wrong answers: the client raises a sentence and ends the connection."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ Answers = Callable[[str | bytes], str | bytes]
 
 
 @contextlib.contextmanager
-def answering(*answers: str | bytes) -> Iterator[str]:
-    """A server that answers with these messages, one after the other, whatever it is asked."""
+def server_answering(*answers: str | bytes) -> Iterator[str]:
+    """A server that answers any requests with these messages, one after the other."""
 
     def handle(connection: ServerConnection) -> None:
         for _, answer in zip(connection, answers, strict=False):
@@ -71,14 +71,14 @@ def answering(*answers: str | bytes) -> Iterator[str]:
     ],
     ids=lambda answer: repr(answer)[:30],
 )
-def test_a_wrong_answer_to_make(answer: str | bytes) -> None:
-    with answering(answer) as url, pytest.raises(ConnectionLost, match=r"\.$"):
+def test_a_wrong_answer_to_make_ends_the_connection_with_a_sentence(answer: str | bytes) -> None:
+    with server_answering(answer) as url, pytest.raises(ConnectionLost, match=r"\.$"):
         RemoteEnv(url, "CartPole-v1")
 
 
 def test_an_error_as_the_answer_to_make() -> None:
     error = {"error": {"type": "LimitReached", "message": "Too many."}}
-    with answering(json.dumps(error)) as url, pytest.raises(RemoteError, match=r"^Too many\.$"):
+    with server_answering(json.dumps(error)) as url, pytest.raises(RemoteError, match=r"^Too many\.$"):
         RemoteEnv(url, "CartPole-v1")
 
 
@@ -112,8 +112,8 @@ def first(rows: int) -> bytes:
     ],
     ids=lambda answer: repr(answer)[:30],
 )
-def test_a_wrong_answer_to_step(answer: str | bytes) -> None:
-    with answering(json.dumps(MADE), answer) as url, RemoteEnv(url, "CartPole-v1") as env:
+def test_a_wrong_answer_to_step_ends_the_connection_with_a_sentence(answer: str | bytes) -> None:
+    with server_answering(json.dumps(MADE), answer) as url, RemoteEnv(url, "CartPole-v1") as env:
         with pytest.raises(ConnectionLost, match=r"\.$"):
             env.step(1)
         with pytest.raises(ConnectionLost, match="any more"):
@@ -121,9 +121,9 @@ def test_a_wrong_answer_to_step(answer: str | bytes) -> None:
 
 
 @pytest.mark.parametrize("answer", [first(0), first(2), steps(1), b""], ids=["none", "two", "steps", "nothing"])
-def test_a_wrong_answer_to_reset(answer: str | bytes) -> None:
+def test_a_wrong_answer_to_reset_ends_the_connection_with_a_sentence(answer: str | bytes) -> None:
     with (
-        answering(json.dumps(MADE), answer) as url,
+        server_answering(json.dumps(MADE), answer) as url,
         RemoteEnv(url, "CartPole-v1") as env,
         pytest.raises(ConnectionLost, match=r"\.$"),
     ):
@@ -134,7 +134,7 @@ def test_a_wrong_answer_to_reset(answer: str | bytes) -> None:
 def test_a_wrong_number_of_rows_for_a_vector(rows: int) -> None:
     """Two steps of two environments were asked for."""
     with (
-        answering(json.dumps(MADE | {"num_envs": 2}), steps(rows, kind=arrays.STEP_MANY)) as url,
+        server_answering(json.dumps(MADE | {"num_envs": 2}), steps(rows, kind=arrays.STEP_MANY)) as url,
         RemoteVectorEnv(url, "CartPole-v1", 2) as env,
         pytest.raises(ConnectionLost, match=r"\.$"),
     ):
@@ -142,9 +142,9 @@ def test_a_wrong_number_of_rows_for_a_vector(rows: int) -> None:
 
 
 @pytest.mark.parametrize("answer", ["3", '{"png": "AAAA", "shape": [1, 1, 3]}', b""])
-def test_a_wrong_answer_to_render(answer: str | bytes) -> None:
+def test_a_wrong_answer_to_render_ends_the_connection_with_a_sentence(answer: str | bytes) -> None:
     with (
-        answering(json.dumps(MADE), answer) as url,
+        server_answering(json.dumps(MADE), answer) as url,
         RemoteEnv(url, "CartPole-v1") as env,
         pytest.raises(ConnectionLost, match=r"\.$"),
     ):

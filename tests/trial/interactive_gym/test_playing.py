@@ -27,8 +27,8 @@ from trial.interactive_gym.remote_game import RemoteGame
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def project(folder: Path, source: str) -> Path:
-    """The experiment's project."""
+def make_project(folder: Path, source: str) -> Path:
+    """Run the experiment; return the folder of the project that it makes."""
     folder.mkdir()
     (folder / "experiment.py").write_text(source + RUN.replace("SERVE", "False"))
     (folder / "helper.py").write_text(HELPER)
@@ -40,8 +40,8 @@ def project(folder: Path, source: str) -> Path:
     return folder / "experiment-study"
 
 
-def play(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
-    """A server of the project, whose game was played to its end."""
+def play_project(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
+    """Play the project's game to its end on a server; return the server."""
     server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
 
     play_to_the_end(server, open_client)
@@ -53,9 +53,9 @@ SCENE = {"width": 600, "height": 400}
 
 
 def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch: Any, open_client: Any) -> None:
-    made = project(tmp_path / "mine", ALONE)
+    made = make_project(tmp_path / "mine", ALONE)
     trial = {"actionSpace": ["left", "noop", "right"], "idleAction": "noop", "maxEpisodes": 2, "scene": SCENE}
-    server = play(launch, open_client, made, trial)
+    server = play_project(launch, open_client, made, trial)
     first, second = server.recordings().values()
     for found in (first, second):
         values = [(line["step"], line["name"], line["value"]) for line in found if line["kind"] == "callback"]
@@ -66,7 +66,7 @@ def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch
 
 
 def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_client: Any) -> None:
-    made = project(tmp_path / "mine", TOGETHER)
+    made = make_project(tmp_path / "mine", TOGETHER)
     trial = {
         "actionSpace": ["0", "1", "2"],
         "players": {"0": "human", "1": "agent:Policy1"},
@@ -74,7 +74,7 @@ def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_clien
         "input": "single",
         "scene": SCENE,
     }
-    server = play(launch, open_client, made, trial)
+    server = play_project(launch, open_client, made, trial)
     (found,) = server.recordings().values()
     assert found[0]["players"]["1"]["policy"] == "agent:Policy1"
     steps = [line for line in found if line["kind"] == "step"]
@@ -92,7 +92,7 @@ def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_clien
 
 
 def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
-    made = project(tmp_path / "mine", PEOPLE)
+    made = make_project(tmp_path / "mine", PEOPLE)
     told = yaml.safe_load((made / "config.yml").read_text())["trial"] | {"instructions": None, "countdown": 0}
     members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60"}
     server = launch(
@@ -116,7 +116,7 @@ def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client:
     assert [value[2] for value in told] == [{}] * 10, "no player is a bot"
 
 
-def test_in_a_game_of_several_humans_have_the_names_of_their_players(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_a_game_of_several_people_a_humans_id_is_the_name_of_their_player(monkeypatch: pytest.MonkeyPatch) -> None:
     """The agent's code sees no id of a participant there."""
     monkeypatch.delenv("USER_ID", raising=False)
 
@@ -132,9 +132,9 @@ def test_in_a_game_of_several_humans_have_the_names_of_their_players(monkeypatch
     assert agent.game.human_players == {0: "0", 1: "1"}
 
 
-def test_running_the_experiments_file_holds_its_project_until_ctrl_c(tmp_path: Path) -> None:
+def test_running_the_experiments_file_runs_its_study_until_ctrl_c(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
-    project(folder, ALONE)
+    make_project(folder, ALONE)
     (folder / "experiment.py").write_text(ALONE + RUN.replace("SERVE", "True"))
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     running = subprocess.Popen(
@@ -182,7 +182,7 @@ class Env:
         return {}, {"a": 1, "b": -2}, {"__all__": False}, {"__all__": False}, {}
 
 
-def test_the_game_keeps_interactive_gyms_books() -> None:
+def test_the_game_counts_rewards_ticks_and_episodes_as_interactive_gym() -> None:
     config = RemoteConfig().gameplay(num_episodes=2)
     game = RemoteGame(config, Env(), {"a": "human", "b": "model"}, "P1")
     assert (game.human_players, game.bot_players, game.status) == ({"a": "P1"}, {"b": "model"}, "inactive")
@@ -209,7 +209,7 @@ def test_the_game_keeps_interactive_gyms_books() -> None:
         ({}, {}, False),
     ],
 )
-def test_a_game_is_over_when_each_player_has_ended_in_one_way_or_the_other(
+def test_a_game_is_over_when_each_player_is_terminated_or_truncated(
     terminated: dict[str, bool], truncated: dict[str, bool], over: bool
 ) -> None:
     game = RemoteGame(RemoteConfig(), None, {"a": "human", "b": "model"})

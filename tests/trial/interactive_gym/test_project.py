@@ -1,4 +1,4 @@
-"""`python experiment.py`: the project that it makes, what it says, and what it refuses."""
+"""`python experiment.py`: the project that it makes, its remarks, and the experiments that it refuses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 MAKE = RUN.replace("SERVE", "False")
 
 
-def python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, *arguments], cwd=folder, env=environment(), capture_output=True, text=True, check=False
     )
@@ -37,14 +37,14 @@ def write(folder: Path, source: str = ALONE, name: str = "experiment.py") -> Non
     (folder / "key.png").write_bytes(b"a picture")
 
 
-def made(folder: Path, source: str = ALONE) -> tuple[Path, str]:
+def project_of(folder: Path, source: str = ALONE) -> tuple[Path, str]:
     write(folder, source)
     done = run_experiment(folder)
     assert done.returncode == 0, done.stderr
     return folder / "experiment-study", done.stdout
 
 
-def refused(folder: Path, source: str) -> str:
+def refusal_of(folder: Path, source: str) -> str:
     write(folder, source)
     done = run_experiment(folder)
     assert done.returncode == 1
@@ -58,7 +58,7 @@ def config_of(project: Path) -> Any:
 
 
 def test_an_experiment_becomes_a_project(tmp_path: Path) -> None:
-    project, said = made(tmp_path)
+    project, said = project_of(tmp_path)
     assert f"The project is in {project}." in said
     assert f"make -C {ROOT} check PROJECT={project}" in said, "in the experiment's folder there is no Makefile"
     found = {path.relative_to(project).as_posix() for path in project.rglob("*") if path.is_file()}
@@ -92,7 +92,7 @@ def test_an_experiment_becomes_a_project(tmp_path: Path) -> None:
 
 
 def test_texts_become_pages(tmp_path: Path) -> None:
-    project, _ = made(tmp_path)
+    project, _ = project_of(tmp_path)
     welcome = (project / "steps/welcome.html").read_text()
     assert "<h1>Mountain car</h1>" in welcome
     assert "{% raw %}" in welcome, "what looks like a template is shown as it is"
@@ -104,32 +104,32 @@ def test_texts_become_pages(tmp_path: Path) -> None:
     assert "5000" in final
 
 
-def test_what_has_no_effect_is_said(tmp_path: Path) -> None:
-    _, said = made(tmp_path)
+def test_options_without_effect_get_a_remark(tmp_path: Path) -> None:
+    _, said = project_of(tmp_path)
     assert "Remark: host has no effect: on one machine only its own browsers reach a study" in said
     assert "Remark: max_ping has no effect: no participant is turned away" in said
     assert "waitroom" not in said, "only what the experiment sets"
 
 
-def test_a_heading_and_a_time_that_a_page_takes_no_notice_of_are_said(tmp_path: Path) -> None:
+def test_a_heading_and_a_time_that_a_page_ignores_get_a_remark(tmp_path: Path) -> None:
     more = "config.user_experience(game_header_text='Drive', game_page_text='<h2>On</h2>')\n"
-    _, said = made(tmp_path / "heading", ALONE + more)
+    _, said = project_of(tmp_path / "heading", ALONE + more)
     assert "Remark: game_header_text is left out: the instructions have a heading (<h1>) of their own" in said
-    project, said = made(
+    project, said = project_of(
         tmp_path / "time", ALONE + "config.reset_timeout = 9000\nconfig.between_episode_text = 'Rest'\n"
     )
     assert "Remark: reset_timeout has no effect: participants go on themselves from the page between" in said
     assert config_of(project)["trial"]["betweenEpisodes"] == "between"
-    project, said = made(tmp_path / "alone", ALONE + "config.reset_timeout = 9000\n")
+    project, said = project_of(tmp_path / "alone", ALONE + "config.reset_timeout = 9000\n")
     assert "reset_timeout" not in said
     assert config_of(project)["trial"]["betweenEpisodes"] == 9
 
 
-def test_players_and_their_policies(tmp_path: Path) -> None:
+def test_players_and_their_policies_become_keys_of_the_study(tmp_path: Path) -> None:
     brains = tmp_path / "brains"
     brains.mkdir()
     (brains / "two.txt").write_text("2")
-    project, _ = made(tmp_path, TOGETHER)
+    project, _ = project_of(tmp_path, TOGETHER)
     trial = config_of(project)["trial"]
     assert trial["players"] == {"0": "human", "1": "agent:Policy1"}
     assert (trial["frameSkip"], trial["input"], trial["actionSpace"]) == (1, "single", ["0", "1", "2"])
@@ -143,13 +143,13 @@ def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
     write(package, ALONE.replace("import helper", "from examples.car import helper"), "car_server.py")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "large.bin").write_bytes(b"not ours")
-    done = python(tmp_path, "-m", "examples.car.car_server")
+    done = run_python(tmp_path, "-m", "examples.car.car_server")
     assert done.returncode == 0, done.stderr
     project = package / "car-server-study"
     assert (project / "examples/car/helper.py").is_file()
     assert not list(project.rglob("large.bin"))
     assert '"examples.car.car_server", "config"' in (project / "agent.py").read_text()
-    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+    assert run_python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
 def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> None:
@@ -165,21 +165,21 @@ def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> Non
     assert (project / "examples/car/helper.py").is_file()
     assert not list(project.rglob("site-packages")), "packages are in requirements.txt"
     assert not list(project.rglob("sitecustomize.py")), "it is the machine's"
-    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+    assert run_python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
 def test_participants_read_the_words_of_an_actions_constant(tmp_path: Path) -> None:
     source = ALONE.replace("LEFT, NOOP, RIGHT = 0, 1, 2", "MoveLeft, DO_NOTHING, RIGHT = 0, 1, 2")
     source = source.replace("NOOP", "DO_NOTHING").replace("DO_DO_", "DO_").replace("LEFT", "MoveLeft")
-    project, _ = made(tmp_path, source)
+    project, _ = project_of(tmp_path, source)
     trial = config_of(project)["trial"]
     assert trial["actionSpace"] == ["moveleft", "do_nothing", "right"]
     assert trial["labels"] == {"moveleft": "Move left"}, "no button for what has no key"
     assert read_project(project).trial.labels == {"moveleft": "Move left"}
 
 
-def test_it_is_made_anew_and_what_was_changed_by_hand_stays(tmp_path: Path) -> None:
-    project, _ = made(tmp_path)
+def test_a_project_is_made_anew_and_changes_by_hand_stay(tmp_path: Path) -> None:
+    project, _ = project_of(tmp_path)
     (project / "steps/welcome.html").write_text("<h1>Mine</h1>")
     (project / "data").mkdir()
     (project / "data/answer").write_text("kept")
@@ -206,9 +206,9 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 
 def test_a_file_that_the_experiment_reads_as_it_is_imported_is_found_on_a_server(tmp_path: Path) -> None:
-    project, _ = made(tmp_path, ALONE.replace("LEFT, NOOP", "text = open('how.html').read()\nLEFT, NOOP"))
+    project, _ = project_of(tmp_path, ALONE.replace("LEFT, NOOP", "text = open('how.html').read()\nLEFT, NOOP"))
     program = f"import sys; sys.path.insert(0, {str(project)!r}); import agent; agent._experiment"
-    done = python(tmp_path.parent, "-c", program)
+    done = run_python(tmp_path.parent, "-c", program)
     assert done.returncode == 0, done.stderr
 
 
@@ -216,7 +216,7 @@ def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config, serve=False)\n")
     assert run_experiment(tmp_path).returncode == 0
-    done = python(tmp_path / "experiment-study", "-c", "import agent; print(agent.Agent.__name__)")
+    done = run_python(tmp_path / "experiment-study", "-c", "import agent; print(agent.Agent.__name__)")
     assert (done.returncode, done.stdout) == (0, "Agent\n"), done.stderr
 
 
@@ -235,20 +235,20 @@ def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
         ("config = (", "configs = [None]; configs[0] = (", "run() takes a RemoteConfig"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_wrong_experiment_gets_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
     assert old in ALONE
     source = ALONE.replace(old, new)
     if "configs" in new:
         source += "\nconfig = configs\n"
-    assert said in refused(tmp_path, source)
+    assert said in refusal_of(tmp_path, source)
 
 
-def test_an_environment_that_does_not_say_which_actions_a_player_has(tmp_path: Path) -> None:
+def test_an_environment_without_a_players_actions_gets_a_sentence(tmp_path: Path) -> None:
     made_by = "env_creator=env_creator"
     source = ALONE.replace(
         "config = (", "class Env(gymnasium.Env):\n    action_space = {'0': 1}\n\n\nconfig = ("
     ).replace(made_by, "env_creator=lambda **_: Env()")
-    assert "the environment does not say which actions 'human' has" in refused(tmp_path, source)
+    assert "the environment does not say which actions 'human' has" in refusal_of(tmp_path, source)
 
 
 def test_a_config_that_is_no_variable_of_the_file_is_refused(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_images_and_atlases_are_copied_under_their_names(tmp_path: Path) -> None
         "animation_configs=[render_configs.Animation('walk', 'chef', ['EAST.png'], 8)])\n"
     )
     source = ALONE.replace("server_app\n", "server_app, render_configs\n") + specs
-    project, said = made(tmp_path, source)
+    project, said = project_of(tmp_path, source)
     assert sorted(path.name for path in (project / "assets").iterdir()) == ["chef.json", "chef.png", "plain.png"]
     assert '"walk": {"frames": ["EAST.png"], "frameRate": 8}' in (project / "assets/chef.json").read_text()
     assert "Remark: the image 'gone' is not found at static/gone.png; sprites that show it are grey boxes" in said
@@ -302,7 +302,7 @@ if __name__ == "__main__":
 )  # fmt: skip
 
 
-def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
+def test_scenes_before_and_after_the_game_become_pages(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", "game"))
     done = run_experiment(tmp_path)
@@ -317,7 +317,7 @@ def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
     last = (project / "steps/after_1.html").read_text()
     assert 'href="https://example.org/?id={{ participant.userId|urlencode }}"' in last
     read_project(project)
-    assert python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
+    assert run_python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ def test_one_game_with_scenes_before_and_after_it(tmp_path: Path) -> None:
         ("game, type('OptionBoxes', (static_scene.StaticScene,), {})()", "a OptionBoxes is no page that can be shown"),
     ],
 )
-def test_scenes_that_cannot_be_are_refused(tmp_path: Path, scenes: str, said: str) -> None:
+def test_wrong_scenes_are_refused(tmp_path: Path, scenes: str, said: str) -> None:
     write(tmp_path)
     (tmp_path / "experiment.py").write_text(SCENES.replace("GAMES", scenes))
     done = run_experiment(tmp_path)
@@ -337,33 +337,35 @@ def test_scenes_that_cannot_be_are_refused(tmp_path: Path, scenes: str, said: st
 
 
 def test_an_experiment_with_two_humans_is_a_study_for_two_participants(tmp_path: Path) -> None:
-    project, said = made(tmp_path, PEOPLE)
+    project, said = project_of(tmp_path, PEOPLE)
     config = config_of(project)
     assert [config["project"][key] for key in ("players", "patience", "maxServers")] == [2, 90, 3]
     assert config["trial"]["players"] == {"0": "human", "1": "human"}
     assert [config["trial"][key] for key in ("maxPing", "pingSamples")] == [250, 5]
     assert "has no effect" not in said
     assert "Remark: game_page_html_fn is called for 0 alone: all participants read the same instructions" in said
-    done = python(tmp_path, "-m", "local.check", str(project))
+    done = run_python(tmp_path, "-m", "local.check", str(project))
     assert done.returncode == 0, done.stdout
     assert "is the game (fields) for 2 participants together" in done.stdout
 
 
-def test_who_found_no_other_is_led_to_the_address_for_that(tmp_path: Path) -> None:
-    project, _ = made(tmp_path, PEOPLE)
+def test_a_participant_without_a_partner_gets_the_address_for_that(tmp_path: Path) -> None:
+    project, _ = project_of(tmp_path, PEOPLE)
     page = Environment(autoescape=True).from_string((project / "steps/final.html").read_text())
     alone, paired = (page.render(participant={"userId": "P1", "unmatched": unmatched}) for unmatched in (True, False))
     assert re.findall(r'href="([^"]+)"', alone) == ["https://example.org/alone?id=P1"]
     assert re.findall(r'href="([^"]+)"', paired) == ["https://example.org/done?id=P1"]
     assert "5000" in alone
-    project, _ = made(tmp_path / "other", PEOPLE.replace("waitroom_timeout_redirect_url", "final_page_header_text"))
+    project, _ = project_of(
+        tmp_path / "other", PEOPLE.replace("waitroom_timeout_redirect_url", "final_page_header_text")
+    )
     page = Environment(autoescape=True).from_string((project / "steps/final.html").read_text())
     assert "href" not in page.render(participant={"userId": "P1", "unmatched": True}), "they have not taken part"
 
 
 @pytest.mark.parametrize(("wait", "patience"), [(1, 10), (12_500, 12.5), (60_000, 60), (10**9, 3600)])
-def test_a_waiting_time_is_one_that_a_lobby_can_have(tmp_path: Path, wait: int, patience: float) -> None:
-    project, _ = made(tmp_path, PEOPLE.replace("waitroom_timeout=90_000", f"waitroom_timeout={wait}"))
+def test_a_waiting_time_is_limited_to_those_of_a_lobby(tmp_path: Path, wait: int, patience: float) -> None:
+    project, _ = project_of(tmp_path, PEOPLE.replace("waitroom_timeout=90_000", f"waitroom_timeout={wait}"))
     assert config_of(project)["project"]["patience"] == patience
     read_project(project)
 
@@ -381,7 +383,7 @@ WITH_A_FILE = (
 
 def test_a_file_that_fits_is_a_policy(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", [[1, 0, 0], [0, 1, 0]])
-    project, said = made(tmp_path, WITH_A_FILE)
+    project, said = project_of(tmp_path, WITH_A_FILE)
     assert config_of(project)["trial"]["players"]["1"] == "sample:policies/partner.onnx"
     assert "Remark" not in said
 
@@ -389,14 +391,14 @@ def test_a_file_that_fits_is_a_policy(tmp_path: Path) -> None:
 def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path) -> None:
     (tmp_path / "brains").mkdir()
     (tmp_path / "brains/partner.onnx").write_bytes(b"a spreadsheet")
-    assert refused(tmp_path, WITH_A_FILE).startswith(
+    assert refusal_of(tmp_path, WITH_A_FILE).startswith(
         "the policy of 1 does not fit: partner.onnx is no ONNX file that onnxruntime can read: "
     )
 
 
 def test_a_file_for_other_observations_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
-    assert refused(tmp_path, WITH_A_FILE) == (
+    assert refusal_of(tmp_path, WITH_A_FILE) == (
         "the policy of 1 does not fit: partner.onnx takes observations of 7 numbers (its input 'obs'); "
         "the environment gives 2 numbers"
     )
@@ -404,13 +406,13 @@ def test_a_file_for_other_observations_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_for_other_observations_is_refused_where_no_space_is_known(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
-    said = refused(tmp_path, WITH_A_FILE.replace("    observation_space = ", "    seen_by_all = "))
+    said = refusal_of(tmp_path, WITH_A_FILE.replace("    observation_space = ", "    seen_by_all = "))
     assert "partner.onnx takes observations of 7 numbers" in said
 
 
 def test_a_file_for_other_actions_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((2, 5)))
-    assert refused(tmp_path, WITH_A_FILE) == (
+    assert refusal_of(tmp_path, WITH_A_FILE) == (
         "the policy of 1 does not fit: partner.onnx returns 5 numbers as 'output'; expected 3, one for each action"
     )
 
@@ -421,7 +423,7 @@ def test_without_onnxruntime_files_are_not_tried_and_the_project_names_it(tmp_pa
     hidden = "import importlib.util, sys; sys.modules['onnxruntime'] = None\nfrom importlib import metadata\n"
     hidden += "names = metadata.packages_distributions\n"
     hidden += "metadata.packages_distributions = lambda: {k: v for k, v in names().items() if k != 'onnxruntime'}\n"
-    project, said = made(tmp_path, hidden + WITH_A_FILE)
+    project, said = project_of(tmp_path, hidden + WITH_A_FILE)
     assert (
         f"Remark: ONNX files are not tried, since onnxruntime is not installed here: pip install {ONNXRUNTIME}" in said
     )
@@ -440,4 +442,4 @@ def test_functions_that_choose_no_action_are_refused(tmp_path: Path, old: str, n
     (tmp_path / "brains").mkdir()
     (tmp_path / "brains/two.txt").write_text("2")
     assert old in TOGETHER
-    assert refused(tmp_path, TOGETHER.replace(old, new)).startswith(said)
+    assert refusal_of(tmp_path, TOGETHER.replace(old, new)).startswith(said)

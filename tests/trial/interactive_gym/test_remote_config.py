@@ -16,7 +16,7 @@ from trial.pictures.scene import as_scene
 
 ROOT = Path(__file__).resolve().parents[3]
 
-# Interactive Gym's options, read in its remote_config.py: commit af766f1 of its repository, and for the last row b87d2cb.
+# Interactive Gym's options, from its remote_config.py: commit af766f1 of its repository, and for the last row b87d2cb.
 ITS_OPTIONS = [
     "env_creator",
     "env_name",
@@ -110,7 +110,7 @@ def test_the_documentation_says_what_each_option_becomes() -> None:
     assert options.table() in (ROOT / "docs/interactive-gym.md").read_text()
 
 
-def test_what_stands_in_its_modules_is_imported_from_there() -> None:
+def test_names_are_imported_from_interactive_gyms_modules() -> None:
     lines = (
         "from trial.remote_game import RemoteGame",
         "from trial.object_contexts import Circle, Line, Polygon",
@@ -127,7 +127,7 @@ def test_what_stands_in_its_modules_is_imported_from_there() -> None:
     assert "No module named 'trial.waiting_room'" in unknown.stderr
 
 
-def test_methods_can_be_called_one_after_the_other_and_none_changes_nothing() -> None:
+def test_methods_can_be_chained_and_the_value_none_changes_nothing() -> None:
     config = RemoteConfig().rendering(fps=24, game_width=None).gameplay(num_episodes=3).hosting("127.0.0.1", 5703)
     assert (config.fps, config.game_width, config.num_episodes, config.host, config.port) == (
         24, 600, 3, "127.0.0.1", 5703,
@@ -136,7 +136,7 @@ def test_methods_can_be_called_one_after_the_other_and_none_changes_nothing() ->
     assert config.logging(logfile="x").pyodide(run_through_pyodide=False).environment(env_config={"a": 1}) is config
 
 
-def test_lists_of_two_configs_are_not_the_same() -> None:
+def test_two_configs_do_not_share_lists() -> None:
     RemoteConfig().assets_to_preload.append("one")
     assert RemoteConfig().assets_to_preload == []
 
@@ -151,12 +151,12 @@ def test_lists_of_two_configs_are_not_the_same() -> None:
         ("hosting", {"max_concurrent_games": 0}, "max_concurrent_games must be at least 1"),
     ],
 )
-def test_what_is_no_option_or_no_value_is_refused(method: str, given: dict[str, object], said: str) -> None:
+def test_unknown_options_and_wrong_values_are_refused(method: str, given: dict[str, object], said: str) -> None:
     with pytest.raises((TypeError, AssertionError), match=said):
         getattr(RemoteConfig(), method)(**given)
 
 
-def test_composite_actions_and_waiting_rooms_are_told_as_interactive_gym_does() -> None:
+def test_composite_actions_and_waiting_rooms_are_described_as_by_interactive_gym() -> None:
     config = RemoteConfig().gameplay(action_mapping={"a": 1, ("a", "b"): 2})
     assert config.game_has_composite_actions
     assert not config.simulate_waiting_room
@@ -176,7 +176,7 @@ def test_everything_that_an_experiment_imports_is_in_trial_and_none_of_it_is_loa
         trial.no_such_name  # noqa: B018
 
 
-def test_objects_are_drawn_as_they_are() -> None:
+def test_interactive_gyms_objects_become_a_scene_without_problems() -> None:
     objects = [
         object_contexts.Sprite("a", 0.1, 0.2, 30, 36, image_name="cook", frame="EAST.png", tween=True),
         object_contexts.Line("b", "#000000", 3, [(0, 0), (1, 1)], fill_below=True, permanent=True),
@@ -207,8 +207,8 @@ def test_several_callbacks_are_told_in_turn() -> None:
     assert told == [("first", "the game"), ("second", "the game")]
 
 
-class Told:
-    """A game that keeps what is recorded."""
+class RecordingGame:
+    """A game that keeps the values that are recorded."""
 
     def __init__(self) -> None:
         self.recorded: list[Any] = []
@@ -239,7 +239,7 @@ def test_what_several_callbacks_return_is_kept_by_their_names() -> None:
 
 
 def test_a_callback_that_raises_takes_nothing_from_the_others() -> None:
-    told = Told()
+    told = RecordingGame()
     with pytest.raises(KeyError):
         callback.MultiCallback([Score, Broken, Pace]).on_episode_end(told)
     assert told.recorded == [("on_episode_end", {"Score": {"score": 3}, "Pace": [1, 2]})]
