@@ -33,7 +33,7 @@ from testing.simulation.world import PROJECT, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
 SMALLER, SMALLER_WITHIN = 340, 20.0  # as many per second: for worse conditions, and for crowds that come several times
-SEEDS = range(2026, 2029)  # of the crowds whose waits are compared; a slow span of Route 53 decides the p95 of one
+SEEDS = range(2026, 2029)  # one for each crowd: in a single crowd, a slow span of Route 53 decides the p95
 HOURS = 2.0  # after which a crowd must have finished, and its servers must be gone
 PAIRS: Project = msgspec.structs.replace(PROJECT, players=2, patience=300.0)
 FOURS: Project = msgspec.structs.replace(PAIRS, players=4)

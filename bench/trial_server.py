@@ -27,7 +27,7 @@ def trial_server(
     """Run a trial server within the block; give its port and its process.
 
     `trial` is the section of config.yml, `store` the folder or address of its recordings. `variables` are added to its
-    environment: `USER_ID` or `SESSION`, and all that differ from those here.
+    environment: `USER_ID` or `SESSION`, and new values for variables that are set here.
     """
     env = {
         **inherited,

@@ -250,7 +250,7 @@ def _moment(kind: str, text: str | None) -> Decimal | None:
 
 
 def _write(kind: str, count: int) -> str:
-    """The text of a moment; the inverse of `_moment`."""
+    """The text of which `_moment` reads this number: a date, a time, a month (`count`: months) or a week."""
     if kind == "month":
         return f"{1970 + count // 12:04d}-{count % 12 + 1:02d}"
     moment = _EPOCH + timedelta(seconds=count)

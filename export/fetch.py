@@ -39,7 +39,7 @@ class Work:
     owner: ExportedParticipant | Members | None
     fetch: list[Item]
     unchanged: list[str]  # keys
-    then: Unit | None = None  # the session's other files, which follow when its document was read
+    then: Unit | None = None  # the session's other files, which are fetched after its document is read
 
     @property
     def user(self) -> str:

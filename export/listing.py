@@ -57,7 +57,7 @@ class Tally:
     new: int = 0
     changed: int = 0
     unchanged: int = 0
-    gone: int = 0  # from the source
+    gone: int = 0  # files that are no longer in the source
     bytes: int = 0  # to fetch
     damaged: int = 0  # files in the folder that have changed or are missing
 

@@ -59,8 +59,8 @@ class SourceFile:
     raw: ExportedFile | None = None  # the unchanged copy
     frames: int = 0
     problems: list[str] = field(default_factory=list)
-    document: Mapping[str, Any] | None = None  # of any kind but a recording
-    step: str = ""  # of an answer
+    document: Mapping[str, Any] | None = None  # the content, unless the file is a recording
+    step: str = ""  # the step, if the file is an answer
     episodes: list[Mapping[str, Any]] = field(default_factory=list)
 
 

@@ -271,7 +271,7 @@ class TrialSection:
 
     @property
     def pages(self) -> Mapping[str, str]:
-        """The files in the folder of pages that the game page shows, by the name of the key."""
+        """The pages that the game page shows: key of config.yml → name of the file in the folder of pages."""
         named = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
         return {key: page for key, page in named.items() if isinstance(page, str)}
 

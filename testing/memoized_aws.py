@@ -138,7 +138,7 @@ def _context(make: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _proxies(find: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a `get_environ_proxies` that does not read the environment for clients of moto, which connect to nothing."""
+    """Return a `get_environ_proxies` that gives no proxies while moto answers: its clients connect to nothing."""
     return lambda url: {} if moto.core.models.botocore_stubber.enabled else find(url)
 
 

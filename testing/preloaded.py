@@ -257,7 +257,7 @@ def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[
                 told, pid = running.pop(each)
                 os.close(each)
                 code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-                with told, contextlib.suppress(OSError):  # who started it may be gone
+                with told, contextlib.suppress(OSError):  # the process that started it may have ended
                     told.send(str(code).encode())
                 continue
             body, fds, _, _ = socket.recv_fds(asking[each], 1 << 20, 3)

@@ -67,7 +67,7 @@ class Account:
             return self._clients[key]
 
     def fail_fast_client(self, service: str) -> Any:
-        """A new client that tries once and gives up after seconds. For calls whose answer is only a hint."""
+        """A new client that tries once and gives up after a few seconds. For calls whose answer is only a hint."""
         with self._making:
             return self._session.client(service, region_name=self.region, config=_FAIL_FAST)
 

@@ -190,7 +190,7 @@ class Wheel:
         folders = {name.split("/")[0] for name in self._zip.namelist()}
         found = [folder for folder in folders if folder.endswith(".dist-info")]
         if len(found) != 1:
-            raise ValueError("it has no one .dist-info folder")
+            raise ValueError("it must have exactly one .dist-info folder")
         return found[0]
 
     def _text(self, name: str) -> str:

@@ -43,7 +43,7 @@ def selected(given: str | None) -> StudySelection:
         found = here if given is None else given
         folder = folder if found == here else None
     if found is None:
-        raise Problem("Which project?", "Name it with --project, or run this in the project's folder.")
+        raise Problem("No project is named, and none is in this folder.", "Add --project, or run this in its folder.")
     if not ids.is_project_id(found):
         raise Problem(f"{found!r} is no project's id.", "It has letters, digits, dashes and underscores, 64 at most.")
     return StudySelection(found, folder)

@@ -189,7 +189,7 @@ def _show_warm(waiting: Sequence[WarmCost]) -> None:
     if rows:
         title = "Servers that are kept warm, for as long as the study is live, even without participants"
         screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
-        screen.result("Spot at 65 % off; on demand wherever Spot has no room when one of them starts.")
+        screen.result("On Spot at 65 % off. If Spot has no room when a warm server starts, it runs on demand.")
         screen.result("")
 
 

@@ -34,7 +34,7 @@ ROLE_TRIES = 3  # at making the stack
 
 
 def _suggest_python(python: str | None) -> None:
-    """Say that zips would hold bytecode if this machine had the functions' version of Python."""
+    """Suggest to install `python`, the functions' version, if it is missing: it makes the zips' bytecode."""
     if python and bytecode.compiler(python) is None:
         screen.info(
             f"With Python {python} on this machine, functions would start about a fifth faster. It is not needed."
@@ -122,7 +122,7 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
     """Upload the functions, make a change set, ask before a loss, and execute it."""
     account, stack = prepared.account, prepared.stack.name
     if prepared.bucket.make():
-        screen.success(f"The code bucket {prepared.bucket.name} is there.")
+        screen.success(f"The code bucket {prepared.bucket.name} has been made.")
     uploaded = prepared.bucket.upload(prepared.functions)
     if uploaded:
         screen.success(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
@@ -172,7 +172,7 @@ def _delete_failed(prepared: Prepared) -> None:
         except ClientError as error:
             code = errors.code(error)
             if code == "BucketNotEmpty":
-                screen.warning(f"The bucket {bucket} of the failed stack has something in it and stays.")
+                screen.warning(f"The bucket {bucket} of the failed stack is not empty, so it is not deleted.")
             elif code not in {"NoSuchBucket", "404"}:
                 raise
 

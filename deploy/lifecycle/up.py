@@ -43,7 +43,7 @@ def may_apply(account: Account, stack: str) -> bool:
 def study_in(folder: Path) -> project_folder.ProjectFolder | None:
     """The project in the folder; None if there is none, or it says `useAWS: false`. Raises `Problem` with mistakes."""
     if folder.is_dir() and not layout.has_config(folder):
-        screen.info(f"{folder} has no config.yml: there is no study to put there.")
+        screen.info(f"{folder} has no config.yml, so no study is registered.")
         return None
     try:
         config = read_project(folder)

@@ -42,7 +42,7 @@ def command(
 
     users = [*(_read(file) if file else ()), *(secrets.token_hex(12) for _ in range(new))]
     if not users:
-        raise Problem("For whom?", "Name a file with an id on each line, or make ids with --new 50.")
+        raise Problem("No participants are named.", "Name a file with an id on each line, or make ids with --new 50.")
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents

@@ -369,6 +369,7 @@ def _write_qr(address: str, file: Path) -> None:
         _qr(address).save(str(file), scale=8)
     except OSError as error:
         raise Problem(
-            f"The QR code could not be written to {file}: {error.strerror}.", "The study is registered all the same."
+            f"The QR code could not be written to {file}: {error.strerror}.",
+            "The study is registered all the same. Run the same command again with another file.",
         ) from None
     screen.success(f"QR code in {file}")

@@ -72,7 +72,7 @@ def without_a_key(config: Config) -> Remark | None:
 
 
 def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
-    """Yield a remark on each arrow of `ui` after which none of these actions is named, alone or with other keys."""
+    """Yield a remark on each arrow of `ui` that is in the name of none of these actions, so that it does nothing."""
     names = [name.strip().lower() for name in actions]
     if not names or not config.game_steps or config.trial.keys:
         return

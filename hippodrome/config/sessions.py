@@ -99,7 +99,7 @@ def _empty_places(checked: Checked) -> Iterator[Mistake]:
 
 
 def _seats(checked: Checked) -> Iterator[Mistake]:
-    """Seats that are not drawn by lot need a `matching` that orders the participants, and a participant for each."""
+    """`seats` other than `lot` need a `matching` that orders the participants, and a participant for each seat."""
     project = checked.root.project
     if project.seats == "lot" or not checked.valid(SEATS, MATCHING):
         return

@@ -37,9 +37,9 @@ class OpenSession(Record, frozen=True):
 
 
 class Proposal(Record, frozen=True):
-    """A session that may be formed. `labels` are its members', in the order in which they came to the lobby.
+    """A session that may be formed. `labels` are the labels of its members, in the order in which they came.
 
-    `id` is the proposal's own, under which its members confirm. `ahead`: the open session whose server it gets, if
+    `id` identifies the proposal: its members confirm it by this id. `ahead`: the open session whose server it gets, if
     there is one; if this proposal falls apart, another one may get it. `players`: the project's number when it was
     proposed; 0 in documents of earlier versions.
     """

@@ -1,8 +1,8 @@
 """The record of a server, and the transitions of its state. Pure: no clock, no I/O.
 
-States: (no record: queued) → starting → naming → ready → closed. `closed` is written after the server's resources are
-removed, so a function that fails before that is run again. If a server ended by itself, its timer is deleted after the
-record is closed (`servers/termination.py`).
+States: (no record: queued) → starting → naming → ready → closed. The server's resources are removed before `closed` is
+written, so a function that fails before that is run again. Two are removed later: the timer, and the own cluster of a
+server that ended by itself (`servers/termination.py`).
 
 A *warm server* is started ahead of its participant (`warmServers`), under a warm id. When it is ready, it is either
 assigned to a participant, whose record then owns its resources (the warm server's own record is closed with the reason

@@ -96,7 +96,7 @@ def _json(body: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):
         raise BadForm(400, "What was sent is not JSON in UTF-8.") from None
     if not isinstance(data, dict):
-        raise BadForm(400, "Answers are a JSON object: names with their values.")
+        raise BadForm(400, "Answers must be a JSON object: names with their values.")
     if len(data) > MAX_FIELDS:
         raise BadForm(400, f"There are more than {MAX_FIELDS} answers.")
     if _deeper(data, MAX_DEPTH):

@@ -51,7 +51,7 @@ def _filled(code: str, texts: dict[str, str]) -> str:
         if named := places(ENGLISH[name]):
             given, at = _arguments(code, at)
             values = dict(zip(named, (_filled(each, texts) for each in given), strict=True))
-        if done.endswith("${") and code.startswith("}", at):  # alone in a place of a template: a part of its text
+        if done.endswith("${") and code.startswith("}", at):  # `${TEXT.name}`: the text becomes part of the template
             done, at = done[:-2] + _in_template(texts[name], values), at + 1
         else:
             done += f"`{_in_template(texts[name], values)}`" if values else _literal(texts[name])

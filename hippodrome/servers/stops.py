@@ -17,7 +17,7 @@ from hippodrome.servers.services import ServerServices
 from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 
-MOST_READS = 2_000  # of records in one invocation, in which at least one message is handled; the others come again
+MOST_READS = 2_000  # of records in one invocation; messages beyond them come again, but at least one is handled
 
 
 class Stops:

@@ -1,8 +1,8 @@
 """Ends servers: `stop_server` stops them, and `task_changed` cleans up after tasks that have ended.
 
-A server's resources are deleted before its record is closed, so an interrupted termination is repeated. If the server
-ended by itself, two resources are deleted later. Its timer is deleted last (`after_close`): if that is interrupted, the
-next sweep finds the timer and repeats it. A cluster of its own is deleted once ECS reports STOPPED.
+A server's resources are deleted before its record is closed, so an interrupted termination is repeated. Two resources
+are deleted later. The timer is deleted last: if a function is interrupted before that, the next sweep finds the timer,
+and by it the record. If the server ended by itself, a cluster of its own is deleted once ECS reports STOPPED.
 
 ECS reports the end of a task twice: when its containers have ended (DEPROVISIONING), and, ten to thirty seconds or more
 later, when its network interface is deleted as well (STOPPED). The first event is enough, so that a participant gets

@@ -27,7 +27,10 @@ _COMMON_NAME = "Hippodrome on this machine"
 
 
 class Authority:
-    """The authority in `folder`, made anew if there is none, or if it ends within NAME_DAYS. Raises OSError."""
+    """A certificate authority of this machine, whose certificate and key are in `folder`. Raises OSError.
+
+    A new one is made if there is none, if it is damaged, or if its certificate expires within NAME_DAYS.
+    """
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -63,7 +66,7 @@ class Authority:
         return made.public_bytes(serialization.Encoding.PEM), _pem(key)
 
     def _load(self) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None:
-        """The authority in the folder; None if there is none, or if it is damaged or ends within NAME_DAYS."""
+        """The authority in the folder; None if there is none, or if it is damaged or expires within NAME_DAYS."""
         try:
             own = x509.load_pem_x509_certificate(self.certificate.read_bytes())
             key = serialization.load_pem_private_key(self._key_file.read_bytes(), None)

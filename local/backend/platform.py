@@ -136,7 +136,7 @@ class LocalPlatform:
             self.retry.run(step, seconds=START_RETRY_SECONDS)
 
     def close(self, seconds: float = 5.0) -> None:
-        """End every server, and let the functions handle that; what they leave, the next start handles."""
+        """End every server, and let the functions clean up for some seconds. The next start does what is left to do."""
         self._closed.set()
         self.timers.close()
         self.tasks.close(seconds)
@@ -156,7 +156,7 @@ class LocalPlatform:
             try:
                 kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
                 seen = self._existing()
-            except OSError as error:  # nothing was deleted, as far as can be seen
+            except OSError as error:  # not known, so nothing counts as deleted
                 self.retry.report(error)
                 continue
             deleted = known - seen

@@ -80,7 +80,7 @@ class ProcessTasks:
     def run(self, request: TaskRequest) -> str:
         claim = claim_of(request)
         known = self._servers.get(request.name)
-        if known and known.task.claim not in ("", claim):  # a server of another record, which was deleted with the data
+        if known and known.task.claim not in ("", claim):  # the record of that earlier server was deleted with the data
             self.forget([request.name])
         with self._lock:
             if self._closing:

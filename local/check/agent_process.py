@@ -170,7 +170,7 @@ def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> Pict
 
 
 def _assigned(document: str) -> assignment.AssignmentDocument:
-    """The document that tells a server for whom it runs: the handover itself, or that of the session that it names."""
+    """The handover; or a document of the session that it names, without members, since none is stored here."""
     found = handover.parse(document.encode())
     if not is_session_id(found.user_id):
         return found

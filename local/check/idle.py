@@ -21,7 +21,7 @@ _MOST_ACTIONS = 10
 def moves(
     begin: Callable[[int], Any], step: Callable[[int], bool], picture: Callable[[], Any], count: int, idle: int
 ) -> list[int] | None:
-    """The actions that change nothing, if the idle action changes the picture; None if not, or if that is not known.
+    """If the idle action changes the picture, return the actions that do not. Otherwise, or if it is not known, None.
 
     `begin(seed)` begins an episode. `step(action)` takes a step, and returns whether the episode is over. `picture`
     returns the picture. `count` is the number of actions.

@@ -40,7 +40,7 @@ class EnforcedWorld(Protocol):
 
 @dataclass(frozen=True)
 class ApiCall:
-    """One call of an AWS API through any botocore client but the world's own."""
+    """One call of an AWS API. Calls of the world's own clients (`EnforcedWorld.client`) are left out."""
 
     service: str  # as botocore names it: s3, ecs, ec2, route53, scheduler, sns, sqs
     operation: str  # PutObject

@@ -97,7 +97,10 @@ class SimulatedFunction:
             return self._invoke(event, {**lineage, self.name: times})
 
     def later(self, event: dict[str, Any]) -> None:
-        """Invoke asynchronously: wait while there is no concurrency left. To be spawned. Raises what `invoke` raises."""
+        """Invoke as asynchronous callers do: wait while there is no concurrency left. Raises what `invoke` raises.
+
+        Call it in a greenlet of its own (`Clock.spawn`), since it waits.
+        """
         wait, longest = ASYNC
         while True:
             try:

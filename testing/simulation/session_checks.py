@@ -18,7 +18,7 @@ ANSWERS = timedelta(seconds=30)  # a request may take so long; those present at 
 
 
 def wrong(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
-    """Return each fault as a sentence; "split", "merged" or "ghost" stands before the colon."""
+    """Return a sentence for each fault. It begins with the kind of fault: "split:", "merged:" or "ghost:"."""
     return [
         *_split(documents, project, people),
         *_merged(documents, project),

@@ -112,7 +112,7 @@ class SimulatedWorld:
         self.trials = SimTrials(platform, project.id, self.conditions.idle)
         self.matching = SimMatching(platform, project.id) if project.matching == "match" else None
         self.people = 0  # participants who have not come yet, or have not finished
-        self.calls_until_quiet = 0  # calls of the functions until nothing was left, as `watch` has seen it
+        self.calls_until_quiet = 0  # calls of the functions when `watch` last saw something left to do
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     @property

@@ -145,7 +145,7 @@ class Callbacks:
         """Whether a callback has not returned yet. It may never return."""
         return self._thread is not None and self._thread.running is not None
 
-    # ---- what happens
+    # ---- events of the session and the game
 
     def session_begins(self) -> None:
         """The session begins, or continues on this server. Only the first call has an effect."""

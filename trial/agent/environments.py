@@ -88,7 +88,7 @@ def playable(env: Any) -> Any:
 
 
 def turns(env: Any) -> AecTurns | None:
-    """The turns of an `AECEnv`, or of what `playable` made of one; None if the players act at the same time."""
+    """The turns of an `AECEnv`, or of the `ParallelEnv` that `playable` made of it; None if all act at once."""
     aec = env if is_aec(env) else getattr(env, "aec_env", None)
     return None if aec is None or not is_aec(aec) or _at_once(aec) else AecTurns(aec)
 

@@ -89,12 +89,12 @@ class JointAdapter:
 
     @property
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:
-        """As `AgentAdapter.callbacks`."""
+        """The callbacks that the agent has, once it has started."""
         return self._adapter.callbacks
 
     @property
     def agent(self) -> Any:
-        """As `AgentAdapter.agent`."""
+        """The researcher's agent, once it has started."""
         return self._adapter.agent
 
     @property

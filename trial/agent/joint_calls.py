@@ -202,7 +202,7 @@ class _Observations:
         self.by_player: dict[str, list[Observed]] = defaultdict(list)
 
     def add(self, steps: int, joint: Joint) -> None:
-        """Keep the observations of `joint`, after `steps` steps of the episode, if a policy acted upon them."""
+        """Keep the observation of each policy that acted upon `joint`, the state after `steps` steps of the episode."""
         for player in self._wanted.get(steps, ()):
             observation = snapshot(joint.observations.get(player))
             info = snapshot(joint.infos.get(player, {}))

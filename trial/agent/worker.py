@@ -75,7 +75,7 @@ class Worker:
         self._thread.start()
         self._unfinished = 0  # functions that have not returned
         self._waiting: dict[_Job, None] = {}  # those of them that are not late; a dict keeps the order
-        self._timer: asyncio.TimerHandle | None = None  # one for all of them: most return long before their limit
+        self._timer: asyncio.TimerHandle | None = None  # one for all functions: most return before their limit
         self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each
         self._notifier: _Notifier | None = None
 

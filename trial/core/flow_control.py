@@ -12,10 +12,10 @@ _WIDEST = 15  # the most frames under way, however long the round trip is
 
 
 class Window:
-    """The frames that were sent and are not acknowledged: at most two more than the game shows in one round trip.
+    """Limits the frames that were sent and are not acknowledged: to two more than the game shows in one round trip.
 
-    One more is allowed if the client acknowledges two frames at once, since the first of them waits for the second. A
-    client that has never acknowledged a frame is limited by its write buffer alone.
+    If the client acknowledges several frames at once, one more is allowed, since the first of them waits for the last.
+    A client that has never acknowledged a frame is limited by its write buffer alone.
     """
 
     def __init__(self) -> None:

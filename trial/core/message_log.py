@@ -31,7 +31,7 @@ class MessageLog:
 
     def __init__(self) -> None:
         self._messages: list[dict[str, Any]] = []
-        self._feedback: list[Word] = []  # those words of the messages that the agent has not heard
+        self._feedback: list[Word] = []  # the feedback in `_messages` that the agent has not heard yet
         self._dropped = 0
         self._fields_left = FIELDS_KEPT
         self._fields_waiting = 0

@@ -204,8 +204,13 @@ class TrialProgress:
         """A human presses a button (`held` is None), or a key goes down (True) or up (False). Raises CommandRefused.
 
         `name` is that of an action or a key. With `lasts`, the action acts until the next one, also over pauses and
-        episodes; an unknown name ends it. Turn by turn, each press and each key that goes down is a choice, which has
-        no effect if it is not the player's turn. `player` is the first human if None.
+        episodes; an unknown name ends it. `player` is the first human if None.
+
+        While the game is held, a button has no effect. A key that goes down then acts on the first step after that,
+        also if it was released; with `input: single` it never acts.
+
+        Turn by turn, each press and each key that goes down is a choice. It has no effect while the game is held, or if
+        it is not the player's turn.
         """
         on = self.playing and not self.frozen
         self.choices.act(player or self.first, name, held, lasts=lasts, on=on)

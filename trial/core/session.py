@@ -191,7 +191,7 @@ class TrialSession:
         self._record(player, "left")
 
     def start(self, player: str, now: float) -> None:
-        """The member goes on: from a page, or after a pause."""
+        """The member has sent `start`: they go on, from a page or after a pause."""
         self.presence.goes_on(player, now)
 
     def stop(self, player: str) -> None:

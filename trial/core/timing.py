@@ -92,7 +92,7 @@ class Timing:
         self._due = None
 
     def stepped(self, now: float, frame_rate: int) -> None:
-        """A step was taken."""
+        """A step was taken: count the time since the step before as played."""
         self.seconds += 1.0 / frame_rate if self._last_step is None else now - self._last_step
         self._last_step = now
 

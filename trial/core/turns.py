@@ -41,12 +41,12 @@ class Turns:
             self.chosen[player] = action
 
     def run(self, now: float) -> None:
-        """The game is on: the time of the turn runs."""
+        """Let the time of the turn run: the game goes on."""
         if self._since is None:
             self._since = now
 
     def hold(self, now: float) -> None:
-        """The game is held: the time of the turn does not run."""
+        """Stop the time of the turn: the game is held."""
         self._left, self._since = self.left(now), None
 
     def left(self, now: float) -> float:

@@ -62,7 +62,7 @@ class UnfinishedEpisode:
 
     @property
     def last_actions(self) -> dict[str, int]:
-        """By player, its action in the last step, if that was its policy's last choice."""
+        """Player → its action in the last step, for the players whose policies had chosen that action last."""
         chosen: dict[str, int | None] = {}
         for step in self.steps:
             asked = {player: part for player, part in step.players.items() if part.observed is not None}

@@ -79,7 +79,7 @@ class EnvironmentMalformed(_Named):
 
     @property
     def brief(self) -> str:
-        """Gymie's sentence with the reason, since Gymie says "malformed" also if a package is missing."""
+        """Gymie's sentence, and the reason: Gymie calls an environment malformed also if a package is missing."""
         return str(self)
 
 

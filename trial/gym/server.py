@@ -84,7 +84,7 @@ class GymServer:
         self._connections: set[_Connection] = set()
         self._with_worker: dict[int, _Connection] = {}
         self._last_number = 0
-        self._from_spawner = bytearray()  # of a message that is not complete yet
+        self._from_spawner = bytearray()  # the beginning of a message that is not complete yet
 
     def run(self) -> None:
         """Serve until a signal raises KeyboardInterrupt. Raises that, and EOFError if the spawner has ended."""

@@ -38,7 +38,7 @@ _CLOSE_SECONDS = 2  # in which a client must answer a close
 
 
 class WorkerState:
-    """A number that worker and spawner share: the time since which the worker has been busy, or negative, idle."""
+    """The time since which a worker is busy; negated, since which it is idle. The spawner reads it."""
 
     def __init__(self, memory: Any, at: int) -> None:
         self._memory = memory

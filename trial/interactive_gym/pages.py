@@ -79,7 +79,7 @@ def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, re
 
 
 def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
-    """The page between two episodes; empty if there is none."""
+    """The page between two episodes; empty if there is none. A `reset_timeout` has no effect then: that is a remark."""
     if not (config.between_episode_header or config.between_episode_text):
         return ""
     if config.reset_timeout != RemoteConfig().reset_timeout:

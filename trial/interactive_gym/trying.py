@@ -47,7 +47,7 @@ def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | 
 
 
 def _try_file(player: Any, file: Path, look: Look) -> None:
-    """Try a file as Hippodrome plays it on a server."""
+    """Load an ONNX file as a server does, and ask it for one action. Raises Unplayable if it does not fit."""
     try:
         policy = onnx.load(file.name, file, look.counts[player], look.spaces.get(player), sample=True)
         if player in look.observations:
@@ -59,7 +59,7 @@ def _try_file(player: Any, file: Path, look: Look) -> None:
 def _try_functions(
     config: RemoteConfig, player: Any, look: Look, find: Callable[[Any], Path | None], root: Path
 ) -> None:
-    """Try the experiment's own functions as they play on a server."""
+    """Make a policy of the experiment's functions, as a server does, and ask it for one action. Raises Unplayable."""
 
     def locate(name: Any) -> Any:
         path = find(name) if isinstance(name, str) else None

@@ -80,7 +80,7 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
 
 
 def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene | None:
-    """The scene `before` with new values of some objects, as most scenes are; None if something else has changed.
+    """The scene `before` with new values of some objects; None if anything else has changed. Most scenes are such.
 
     `map` compares all objects in one call, since a loop in Python over them would take most of the time of a scene.
     """

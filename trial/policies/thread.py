@@ -30,7 +30,7 @@ class PolicyThread:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._closed = False
         self._running = False
-        self._reset_error: Exception | None = None  # of the latest reset; the thread's own
+        self._reset_error: Exception | None = None  # what the latest reset raised; only the thread uses it
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 

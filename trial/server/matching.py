@@ -42,7 +42,7 @@ class Matching:
         self._logged: set[str] = set()
 
     async def run(self) -> None:
-        """Answer questions until the members are known, or `match` does not return."""
+        """Answer questions until the members are known. If a call of `match` does not return, end at once."""
         while not self._settings().assigned:
             if self._settings().session:
                 try:

@@ -45,7 +45,7 @@ _ASSET_TIMES = 3  # how often a connection may ask for the same image
 class Connection:
     """The sending half of a connection. Other methods collect pictures and messages, and `run` sends them.
 
-    Only `send_now` sends a picture itself, if nothing else is to be sent before it. Of pictures and states only the
+    Only `send_now` may send a picture itself, if nothing has to be sent before it. Of pictures and states only the
     newest one waits, so nothing builds up for a slow client.
     Pictures may be lossy (trial/pictures/encoder.py) if the client takes such frames and `lossless` is False. A client
     that does not draw scenes gets them as frames, which `draw` makes on a thread.

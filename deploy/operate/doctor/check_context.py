@@ -1,4 +1,4 @@
-"""The input of the checks of `doctor`."""
+"""The input of the checks of `doctor`, and the exception for a part of a rehearsal that fails."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ __all__ = ["Image", "ImagePlan", "build", "plan"]
 class ImagePlan:
     """The content of a project's image, and the `uri` (with digest) of the image with this content, if there is one."""
 
-    content: str  # the tag that tells the content
+    content: str  # the tag without a number: the project and the hash of the content
     bundle: Bundle
     uri: str | None
     order: Order

@@ -38,7 +38,7 @@ class Bundle:
 
     @property
     def hash(self) -> str:
-        """Twelve hex digits that depend on the content alone."""
+        """Twelve hex digits that depend only on the files' names, permissions and bytes."""
         digest = hashlib.sha256()
         for name, entry in sorted(self.entries.items()):
             inner = hashlib.sha256()

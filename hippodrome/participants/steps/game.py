@@ -91,7 +91,10 @@ class GameStep:
             self._request_server(project, owner, attempt)
 
     def _state_alone(self, visit: Visit) -> dict[str, Any]:
-        """The state of the participant's own server."""
+        """The state of the participant's own server.
+
+        Sends a lost start message again. Stops a server that was started for a study without this game step.
+        """
         record = self._services.repository.server_of(visit.project.id, visit.user_id)
         self._request_if_overdue(visit, visit.user_id, record)
         if record is not None and not record.is_closed and record.lacks(visit.step.key):
@@ -111,7 +114,7 @@ class GameStep:
         return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))
 
     def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
-        """Send a lost start message again. `owner` is the participant's id, or that of the session of `players`."""
+        """Send a lost start message again. `owner`: the id of the participant, or of a session of `players` members."""
         project, step = visit.project, visit.step
         attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
         if attempt is not None:

@@ -66,7 +66,7 @@ def _of_gymnasium(name: str, gymnasium_name: str, renamed: Mapping[str, str]) ->
 
 
 def _new(env: Any) -> gymnasium.Env[Any, Any] | None:
-    """The environment of Gymnasium that `make` returns with a `render_mode`; None if `env` has the old interface."""
+    """The environment of Gymnasium in the `Wrapper` that `make` returns if it gets a `render_mode`; else None."""
     if type(env) is Wrapper and isinstance(env.env, gymnasium.Env) and not isinstance(env.env, Env):
         return env.env
     return None
