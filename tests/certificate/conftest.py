@@ -48,19 +48,19 @@ def _pebble(tmp_path_factory: pytest.TempPathFactory, **how: timedelta) -> Itera
 
 @pytest.fixture(scope="session")
 def pebble(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pebble]:
-    """Issues for 90 days, as Let's Encrypt does until February 2027."""
+    """An authority that issues certificates for 90 days, as Let's Encrypt does until February 2027."""
     yield from _pebble(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def second_pebble(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pebble]:
-    """Another authority; it issues for 160 hours, as Let's Encrypt's profile `shortlived`."""
+    """Another authority, which issues certificates for 160 hours, as Let's Encrypt's profile `shortlived` does."""
     yield from _pebble(tmp_path_factory, lifetime=timedelta(hours=160))
 
 
 @pytest.fixture(autouse=True)
-def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`acme` looks once a second whether the authority is done; here twenty times."""
+def poll_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`acme` asks the authority once a second whether it is done; here it asks twenty times a second."""
     monkeypatch.setattr(acme.client, "time", SimpleNamespace(sleep=lambda s: time.sleep(min(s, 0.05))))
 
 
@@ -101,8 +101,9 @@ class Place:
         )  # type: ignore[arg-type]
 
     def lose_account(self) -> None:
-        """With a new one everything has to be proved again: Pebble 2.4 remembers a proof of the old one now and then,
-        although it is told never to (PEBBLE_AUTHZREUSE=0)."""
+        """Remove the account, so that the next order must prove everything again.
+
+        With the old account Pebble 2.4 sometimes accepts an earlier proof, although PEBBLE_AUTHZREUSE=0 forbids it."""
         (self.folder / ACCOUNT).unlink()
 
     def obtain(self, **more: object) -> RenewalOutcome:

@@ -1,4 +1,4 @@
-"""A name server on loopback that says what a test wants the Internet's DNS to say."""
+"""A name server on loopback that answers with the records that a test chooses."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ import dns.rrset
 import pytest
 
 Records = Mapping[tuple[str, str], Sequence[str]]
-SERVFAIL = ("SERVFAIL",)  # instead of records: those who should know do not answer
+SERVFAIL = ("SERVFAIL",)  # in the place of records: the name servers of this name do not answer
 
 
 @contextlib.contextmanager
 def answering(records: Records, asked: set[str] | None = None) -> Iterator[int]:
-    """Answers over UDP: a name that has no records at all does not exist. The port; `asked` gets what was asked for."""
+    """Answer over UDP; a name without any records does not exist. Yields the port; the questions are added to `asked`."""
     names = {name for name, _ in records}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))
@@ -59,7 +59,7 @@ def answering(records: Records, asked: set[str] | None = None) -> Iterator[int]:
 
 
 def ask_only(monkeypatch: pytest.MonkeyPatch, port: int) -> None:
-    """Let every resolver ask this name server, and nobody else."""
+    """Let every resolver ask only this name server."""
 
     class Resolver(dns.resolver.Resolver):
         def __init__(self, *_: object, **__: object) -> None:

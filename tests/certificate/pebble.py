@@ -1,6 +1,6 @@
-"""A real certificate authority: Pebble, Let's Encrypt's small sibling for tests, and its DNS, both on loopback.
+"""A real certificate authority on loopback: Pebble, Let's Encrypt's ACME server for tests, with its DNS server.
 
-Debian's packages `pebble` and `pebble-challtestsrv`. Pebble's own address is trusted by a CA made here.
+They are Debian's packages `pebble` and `pebble-challtestsrv`. A CA that is made here signs the certificate of Pebble's address.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def installed() -> bool:
 
 @dataclass
 class Pebble:
-    """`directory` is its ACME directory, `trusted` the PEM that its HTTPS is checked with."""
+    """A running Pebble: `directory` is its ACME directory, `trusted` the PEM by which its HTTPS is checked."""
 
     directory: str
     management: str
@@ -43,7 +43,7 @@ class Pebble:
     log: Path
 
     def root(self) -> str:
-        """The root certificate of what it issues."""
+        """The root of the certificates that it issues."""
         return self.ask(f"{self.management}/roots/0").decode()
 
     def ask(self, url: str) -> bytes:
@@ -56,16 +56,16 @@ class Pebble:
             return answer.read()
 
     def orders(self) -> int:
-        """How many orders it has taken."""
+        """The number of orders that it has accepted."""
         return self.log.read_text().count(" Added order ")
 
     def accounts(self) -> int:
-        """How many accounts were opened."""
+        """The number of accounts that were made."""
         return self.log.read_text().count("accounts in memory")
 
 
 class TestChallenges:
-    """`Challenges` on challtestsrv. `present` is what is published; `puts` and `removals` are all calls."""
+    """`Challenges` on challtestsrv. `present` holds the published values; `puts` and `removals` hold all calls."""
 
     __test__ = False
 
@@ -74,7 +74,7 @@ class TestChallenges:
         self.present: dict[str, list[str]] = {}
         self.puts: list[tuple[str, list[str]]] = []
         self.removals: list[tuple[str, list[str]]] = []
-        self.lies = False  # True: publishes something else
+        self.lies = False  # True: it publishes other values
 
     def put(self, name: str, values: Sequence[str], seconds: float) -> None:
         assert seconds > 0
@@ -96,7 +96,7 @@ class TestChallenges:
 
 
 def make_ca(folder: Path) -> tuple[str, Path, Path]:
-    """A CA and a certificate of its for loopback: the CA's PEM, the certificate's file and its key's."""
+    """Make a CA and a certificate for loopback that it signs: the CA's PEM, the certificate's file, the file of its key."""
     made = authority("Test CA")
     issued, files = made.issue("localhost", "127.0.0.1"), (folder / "cert.pem", folder / "key.pem")
     for file, content in zip(files, issued, strict=True):
@@ -106,13 +106,13 @@ def make_ca(folder: Path) -> tuple[str, Path, Path]:
 
 @contextlib.contextmanager
 def running(folder: Path, lifetime: timedelta = timedelta(days=90)) -> Iterator[Pebble]:
-    """Pebble and its DNS, until the block ends."""
+    """Run Pebble and its DNS server until the block ends."""
     with contextlib.ExitStack() as stack:
         for last in (False, False, True):
             try:
                 pebble = stack.enter_context(_started(folder, lifetime))
                 break
-            except DidNotStart:  # somebody else was faster at one of the ports
+            except DidNotStart:  # another process was faster at one of the ports
                 if last:
                     raise
         yield pebble
@@ -164,7 +164,7 @@ def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
             dns_management=f"http://127.0.0.1:{dns_management}",
             log=log,
         )
-        for port in (dns, dns_management, acme, management):  # its name server listens by TCP, too
+        for port in (dns, dns_management, acme, management):  # its name server also listens on TCP
             _wait_for(port, processes, folder)
         yield pebble
 

@@ -15,7 +15,7 @@ def txt(world):
     return {r["Name"]: [v["Value"] for v in r["ResourceRecords"]] for r in records if r["Type"] == "TXT"}
 
 
-def test_put_and_remove(moto_world):
+def test_a_record_is_put_and_removed(moto_world):
     challenges = moto_world.platform.challenges
     challenges.put(NAME, [VALUE], 60)
     assert txt(moto_world) == {f"{NAME}.": [f'"{VALUE}"']}
@@ -25,8 +25,8 @@ def test_put_and_remove(moto_world):
     assert set(moto_world.actions) == {"route53:ChangeResourceRecordSets", "route53:GetChange"}
 
 
-def test_only_what_the_function_may_do(moto_world):
-    """UPSERT and DELETE of TXT at one name: the conditions of the role in infra/template.yml."""
+def test_the_functions_changes_are_those_that_its_role_allows(moto_world):
+    """The role in infra/template.yml allows UPSERT and DELETE of TXT records at one name."""
     moto_world.platform.challenges.put(NAME, [VALUE, "second", VALUE], 60)
     moto_world.platform.challenges.remove(NAME, [VALUE, "second"])
     changes = [
@@ -40,13 +40,13 @@ def test_only_what_the_function_may_do(moto_world):
     assert txt(moto_world) == {}
 
 
-def test_what_others_have_put_there_meanwhile_stays(moto_world):
+def test_a_record_with_values_of_others_is_not_removed(moto_world):
     moto_world.platform.challenges.put(NAME, ["theirs"], 60)
     moto_world.platform.challenges.remove(NAME, [VALUE])
     assert txt(moto_world) == {f"{NAME}.": ['"theirs"']}
 
 
-def test_it_waits_for_the_name_servers(moto_world):
+def test_put_waits_until_the_name_servers_have_the_record(moto_world):
     slept = []
 
     def sleep(seconds):
@@ -59,7 +59,7 @@ def test_it_waits_for_the_name_servers(moto_world):
     assert len(slept) == 3
 
 
-def test_but_not_for_ever(moto_world):
+def test_put_waits_for_the_name_servers_for_a_limited_time(moto_world):
     moto_world.in_sync = False
     client = moto_world.platform._client
     challenges = Route53Challenges(
@@ -71,14 +71,14 @@ def test_but_not_for_ever(moto_world):
 
 
 @pytest.mark.parametrize("code", ["InvalidChangeBatch", "NoSuchHostedZone"])
-def test_a_record_that_cannot_be(moto_world, code):
+def test_a_refused_record_is_a_failure_of_dns(moto_world, code):
     moto_world.fail("route53:ChangeResourceRecordSets", code)
     with pytest.raises(OrderFailed) as failed:
         moto_world.platform.challenges.put(NAME, [VALUE], 60)
     assert failed.value.reason is FailureReason.DNS
 
 
-def test_a_right_that_is_missing_is_told_as_it_is(moto_world):
+def test_a_missing_right_is_raised_unchanged(moto_world):
     moto_world.fail("route53:ChangeResourceRecordSets", "AccessDenied", times=2)
     for act in (lambda c: c.put(NAME, [VALUE], 60), lambda c: c.remove(NAME, [VALUE])):
         with pytest.raises(ClientError, match="AccessDenied"):

@@ -1,4 +1,4 @@
-"""`python -m deploy certificate`: S3 and Route 53 on moto, a real authority, and a DNS of the test's own."""
+"""The command `python -m deploy certificate`: S3 and Route 53 on moto, a real authority, and the test's own DNS server."""
 
 import json
 import secrets
@@ -25,7 +25,7 @@ DOMAIN = "example.org"
 
 @pytest.fixture(autouse=True)
 def zone_ids(monkeypatch):
-    """Gap: moto's hosted zones have ids that begin with anything. AWS's begin with Z."""
+    """Gap: ids of moto's hosted zones begin with any letter. AWS's begin with Z."""
     monkeypatch.setattr(HostedZoneIdentifier, "generate", lambda *_, **__: f"Z{secrets.token_hex(10).upper()}")
 
 
@@ -43,7 +43,7 @@ def zone(world):
 
 @pytest.fixture
 def internet(monkeypatch):
-    """Nobody to ask, until a test says what DNS says."""
+    """No DNS server answers until the test calls this fixture with records."""
     stack = []
 
     def say(records):
@@ -72,7 +72,7 @@ def delegated(internet, zone):
 
 @pytest.fixture
 def own(pebble, world, tmp_path, monkeypatch):
-    """The options that lead to Pebble, whose DNS is told what Route 53 is told."""
+    """The options for Pebble as the authority; Pebble's DNS gets the records that Route 53 gets."""
     put = Route53Challenges.put
 
     def put_there_too(self, name, values, seconds):
@@ -97,7 +97,7 @@ def state(world):
 
 
 def by_hand(world, folder, origin=""):
-    """A certificate that no authority of ours has issued; `origin` lets it look like ours. It lasts a day."""
+    """Store a certificate of a CA of its own, valid for a day; `origin` makes it look like one that Hippodrome has ordered."""
     _, chain, key = make_ca(folder)
     world.put(FULLCHAIN, chain.read_bytes())
     text = (
@@ -108,7 +108,7 @@ def by_hand(world, folder, origin=""):
     world.put(PRIVKEY, text)
 
 
-def test_from_nothing_to_a_certificate(world, own, pebble, capsys):
+def test_the_command_orders_the_first_certificate(world, own, pebble, capsys):
     looked = world.run(capsys, "certificate", *own, "--dry-run")
     assert looked.code == 3
     assert "There is no certificate yet." in looked.out
@@ -139,14 +139,14 @@ def test_from_nothing_to_a_certificate(world, own, pebble, capsys):
     assert "89 days left" in said.out
     assert "Nothing to do" in said.out
 
-    # Without options it comes again from where it came, with the roots that were given then.
+    # Without options it comes from the same authority, with the roots that were given the first time.
     forced = world.run(capsys, "certificate", "--force", "--json")
     assert forced.code == 0, forced.err
     assert forced.json["serial"] != serial
     assert state(world).directory == pebble.directory
 
 
-def test_dns_does_not_say_what_was_published(world, own, pebble, capsys, monkeypatch):
+def test_wrong_values_in_dns_are_reported(world, own, pebble, capsys, monkeypatch):
     put = Route53Challenges.put
     monkeypatch.setattr(
         Route53Challenges, "put", lambda self, name, values, seconds: put(self, name, ["wrong"], seconds)
@@ -165,7 +165,7 @@ def test_dns_does_not_say_what_was_published(world, own, pebble, capsys, monkeyp
     assert "Nothing would be ordered until" in said.out
 
 
-def test_ctrl_c_and_again(world, own, capsys, monkeypatch):
+def test_after_ctrl_c_the_command_can_be_repeated(world, own, capsys, monkeypatch):
     put = Route53Challenges.put
 
     def interrupted(self, name, values, seconds):
@@ -182,14 +182,14 @@ def test_ctrl_c_and_again(world, own, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("action", "code"), [("s3:PutObject", "AccessDenied"), ("route53:ChangeResourceRecordSets", "AccessDenied")]
 )
-def test_rights_that_are_missing(world, own, capsys, action, code):
+def test_missing_rights_are_reported(world, own, capsys, action, code):
     world.fail(action, code, "not authorized", status=403)
     ran = world.run(capsys, "certificate", *own)
     assert ran.code == 1
     assert "These credentials may not" in ran.err
 
 
-def test_not_delegated(world, internet, zone, capsys):
+def test_a_domain_without_name_servers_is_reported(world, internet, zone, capsys):
     internet({("example.org", "A"): ["192.0.2.1"]})
     ran = world.run(capsys, "certificate", "--production", "--dry-run")
     assert ran.code == 1
@@ -199,7 +199,7 @@ def test_not_delegated(world, internet, zone, capsys):
         assert server.rstrip(".") in ran.err
 
 
-def test_delegated_to_somebody_else(world, internet, zone, capsys):
+def test_a_domain_with_other_name_servers_is_reported(world, internet, zone, capsys):
     internet({("example.org", "NS"): ["ns1.elsewhere.example.", "ns2.elsewhere.example."]})
     ran = world.run(capsys, "certificate", "--dry-run")
     assert ran.code == 1
@@ -210,14 +210,14 @@ def test_delegated_to_somebody_else(world, internet, zone, capsys):
     assert world.keys("SSL/") == []
 
 
-def test_nobody_to_ask_is_no_reason_to_stop(world, internet, capsys):
+def test_without_an_answer_of_dns_the_command_goes_on(world, internet, capsys):
     ran = world.run(capsys, "certificate", "--dry-run")
     assert ran.code == 3
     assert "could not be asked" in ran.err
     assert "--production" in ran.err
 
 
-def test_delegated(world, delegated, capsys):
+def test_a_delegated_domain_may_be_ordered_for(world, delegated, capsys):
     ran = world.run(capsys, "certificate", "--production", "--dry-run", "--json")
     assert ran.code == 3
     assert ran.json["decision"] == "order"
@@ -240,7 +240,7 @@ def test_delegated(world, delegated, capsys):
         ({"org": ['0 issue "amazon.com"'], "example_org": ['0 issue "letsencrypt.org"']}, True),
     ],
 )
-def test_caa_records(world, delegated, capsys, records, allowed):
+def test_caa_records_that_forbid_the_authority_are_reported(world, delegated, capsys, records, allowed):
     delegated(**records)
     ran = world.run(capsys, "certificate", "--production", "--dry-run")
     assert ran.code == (3 if allowed else 1), ran.err
@@ -249,21 +249,21 @@ def test_caa_records(world, delegated, capsys, records, allowed):
         assert '0 issuewild "letsencrypt.org"' in ran.err
 
 
-def test_the_wrong_zone(internet, capsys):
+def test_a_zone_of_another_domain_is_reported(internet, capsys):
     with Installed(RootDomain="example.com") as world:
         ran = world.run(capsys, "certificate", "--dry-run")
     assert ran.code == 1
     assert "example.com does not lie in it" in ran.err
 
 
-def test_no_zone(world, internet, capsys):
+def test_a_missing_zone_is_reported(world, internet, capsys):
     world.client("route53").delete_hosted_zone(Id=world.ids["zone"])
     ran = world.run(capsys, "certificate", "--dry-run")
     assert ran.code == 1
     assert "no hosted zone" in ran.err
 
 
-def test_a_test_certificate_is_called_one(world, delegated, tmp_path, capsys):
+def test_a_test_certificate_is_reported_as_one(world, delegated, tmp_path, capsys):
     by_hand(world, tmp_path, origin=STAGING)
     ran = world.run(capsys, "certificate", "--dry-run")
     assert "browsers do not trust it" in ran.err
@@ -271,7 +271,7 @@ def test_a_test_certificate_is_called_one(world, delegated, tmp_path, capsys):
     assert world.run(capsys, "certificate", "--dry-run", "--json").json["trustedByBrowsers"] is False
 
 
-def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
+def test_a_certificate_that_was_put_there_by_hand_is_not_replaced(world, delegated, tmp_path, capsys):
     by_hand(world, tmp_path)
     before = world.get(PRIVKEY)
     ran = world.run(capsys, "certificate", "--production")
@@ -283,7 +283,7 @@ def test_one_put_there_by_hand(world, delegated, tmp_path, capsys):
     assert "has expired" in world.run(capsys, "certificate", "--production").err
 
 
-def test_rate_limited_until(world, delegated, capsys):
+def test_no_order_is_made_before_the_rate_limit_ends(world, delegated, capsys):
     until = datetime.now(UTC) + timedelta(hours=5)
     failure = FailedOrder(datetime.now(UTC), PRODUCTION, FailureReason.RATE_LIMITED, "too many", until)
     world.put(STATE, to_json(CertificateRecord(failures=(failure,))))
@@ -292,7 +292,7 @@ def test_rate_limited_until(world, delegated, capsys):
     assert f"Nothing is ordered until {until.astimezone():%Y-%m-%d %H:%M}" in ran.err
 
 
-def test_a_limit_that_an_order_meets_is_told_with_its_end(world, delegated, capsys, monkeypatch):
+def test_a_rate_limit_that_an_order_meets_is_reported_with_its_end(world, delegated, capsys, monkeypatch):
     until = datetime.now(UTC) + timedelta(hours=5)
 
     def refused(self, wish):
@@ -305,14 +305,14 @@ def test_a_limit_that_an_order_meets_is_told_with_its_end(world, delegated, caps
     assert "→ Wait; the certificate in place stays." in ran.err
 
 
-def test_somebody_else_is_ordering(world, delegated, capsys):
+def test_another_run_that_orders_is_reported(world, delegated, capsys):
     world.put(STATE, to_json(rules.claimed(CertificateRecord(), "other", datetime.now(UTC))))
     ran = world.run(capsys, "certificate", "--production")
     assert ran.code == 1
     assert "Another run is ordering" in ran.err
 
 
-def test_an_authority_that_cannot_be_reached(world, own, tmp_path, capsys):
+def test_an_authority_that_cannot_be_reached_is_reported(world, own, tmp_path, capsys):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         directory = f"https://127.0.0.1:{closed.getsockname()[1]}/dir"
@@ -332,14 +332,14 @@ def test_an_authority_that_cannot_be_reached(world, own, tmp_path, capsys):
         (["--ca-file", __file__.replace("test_command", "nameserver")], "cannot be read"),
     ],
 )
-def test_options_that_make_no_sense(world, capsys, arguments, said):
+def test_wrong_options_are_refused(world, capsys, arguments, said):
     ran = world.run(capsys, "certificate", *arguments)
     assert ran.code == 1
     assert said in ran.err
     assert world.keys("SSL/") == []
 
 
-def test_everything_that_can_go_wrong_has_a_sentence():
+def test_every_reason_of_a_failure_has_a_sentence_and_advice():
     from hippodrome.certificates.renewal import RenewalRequest
 
     for trouble in FailureReason:
@@ -350,7 +350,7 @@ def test_everything_that_can_go_wrong_has_a_sentence():
             assert problem.details == ("said",)
 
 
-def test_obtain_for_other_commands(world, own, pebble):
+def test_other_commands_can_obtain_a_certificate(world, own, pebble):
     from deploy.aws.account import find_installation, open_account
 
     with pytest.MonkeyPatch.context() as patch:

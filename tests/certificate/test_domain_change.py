@@ -1,4 +1,4 @@
-"""An installation whose servers get a level of names of their own: the certificate for those comes before them."""
+"""An installation whose servers get their own level of names: the certificate for these names is ordered first."""
 
 # ruff: noqa: F401, F811 - fixtures are imported, and asked for by their names
 
@@ -28,7 +28,7 @@ def names(world, where):
     return read_stored(world.get(where.privkey)).names
 
 
-def test_new_names_have_their_certificate_before_any_server_has_one(before, pebble):
+def test_the_certificate_of_the_new_names_is_ordered_before_servers_get_them(before, pebble):
     former = [before.get(key) for key in FORMER]
     domain_change.certify(prepared(before))
     assert names(before, NEW) == ("*.servers.example.org",)
@@ -38,7 +38,7 @@ def test_new_names_have_their_certificate_before_any_server_has_one(before, pebb
     assert pebble.orders() == orders, "an apply that was cut off goes on"
 
 
-def test_without_it_the_stack_stays_as_it_was(before, monkeypatch):
+def test_without_the_new_certificate_the_stack_is_not_changed(before, monkeypatch):
     def fails(self, name, values, seconds):
         raise OrderFailed(FailureReason.DNS, "no")
 

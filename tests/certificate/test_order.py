@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def handshake(server: ssl.SSLContext, root: str, host: str) -> x509.Certificate:
-    """A TLS handshake in memory, checked as a browser does; the certificate that was shown."""
+    """Make a TLS handshake in memory, with a browser's checks; the server's certificate."""
     client = ssl.create_default_context(cadata=root)
     to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
     there = client.wrap_bio(to_client, to_server, server_hostname=host)
@@ -54,7 +54,7 @@ def handshake(server: ssl.SSLContext, root: str, host: str) -> x509.Certificate:
 
 
 def served(place: Place) -> Certificate:
-    """What a trial server makes of the bucket."""
+    """The TLS context that a trial server makes of the bucket."""
     env = {
         "PROJECT_ID": "a",
         "USER_ID": "b",
@@ -70,7 +70,7 @@ def served(place: Place) -> Certificate:
     return certificate
 
 
-def test_the_first_order(place):
+def test_the_first_order_stores_certificate_state_and_account(place):
     outcome = place.obtain(email="admin@example.org")
     assert outcome.ordered
     assert outcome.stored.names == (f"*.{DOMAIN}",)
@@ -104,7 +104,7 @@ def test_browsers_that_trust_the_authority_accept_it_for_the_servers_names_only(
         handshake(server.context, place.pebble.trusted, f"k3f9-1.{DOMAIN}")
 
 
-def test_a_fresh_one_is_not_ordered_again(place):
+def test_a_fresh_certificate_is_not_ordered_again(place):
     place.obtain()
     before, orders = place.key, place.pebble.orders()
     place.ahead = timedelta(days=59)
@@ -127,14 +127,14 @@ def test_a_renewal_has_a_new_key_and_the_same_account(place):
     assert served(place)
 
 
-def test_nothing_was_ever_ordered_so_the_timer_orders_nothing(place):
+def test_without_an_earlier_order_the_timer_orders_nothing(place):
     orders = place.pebble.orders()
     assert renew(place.renewal(), DOMAIN, 60) is None
     assert place.pebble.orders() == orders
     assert not (place.folder / STATE).exists()
 
 
-def test_an_expired_one_is_replaced(place):
+def test_an_expired_certificate_is_replaced(place):
     place.obtain()
     place.ahead = timedelta(days=200)
     outcome = place.obtain()
@@ -142,7 +142,7 @@ def test_an_expired_one_is_replaced(place):
     assert "expired" in outcome.decision.why
 
 
-def test_a_short_lived_one_is_renewed_half_way(tmp_path, second_pebble):
+def test_a_short_lived_certificate_is_renewed_at_half_its_lifetime(tmp_path, second_pebble):
     place = Place(tmp_path, second_pebble)
     stored = place.obtain().stored
     at = renew_at(stored.not_before, stored.not_after)
@@ -153,7 +153,7 @@ def test_a_short_lived_one_is_renewed_half_way(tmp_path, second_pebble):
     assert place.obtain().ordered
 
 
-def test_from_one_authority_to_another_and_back(place, second_pebble):
+def test_the_authority_can_be_changed_and_changed_back(place, second_pebble):
     here, there = place.pebble, second_pebble
     place.obtain()
     account = json.loads(place.read(ACCOUNT))[here.directory]
@@ -170,7 +170,7 @@ def test_from_one_authority_to_another_and_back(place, second_pebble):
     handshake(served(place).context, here.root(), f"a.{DOMAIN}")
 
 
-def test_dns_says_something_else(place):
+def test_wrong_values_in_dns_fail_the_order_and_keep_the_certificate(place):
     place.obtain()
     place.lose_account()
     kept = place.key, place.chain
@@ -185,7 +185,7 @@ def test_dns_says_something_else(place):
     state = place.state
     assert [failure.reason for failure in state.failures] == ["validation"]
     assert (state.claim, state.challenges) == ("", ())
-    # Then it waits, and whoever insists may try three times more within the hour.
+    # Then it waits; with `force` it may try three times more within the hour.
     orders = place.pebble.orders()
     waiting = place.obtain()
     assert waiting.decision.verdict is Verdict.WAIT
@@ -198,7 +198,7 @@ def test_dns_says_something_else(place):
     assert refused.decision.verdict is Verdict.WAIT
     assert timedelta(minutes=55) < refused.decision.until - place.now() <= timedelta(hours=1)
     assert place.pebble.orders() == orders
-    # Repaired, and time has gone by: all is forgotten.
+    # When DNS is right and time has passed, the failures do not matter any more.
     place.challenges.lies = False
     place.ahead += timedelta(hours=21)
     assert place.obtain().ordered
@@ -207,7 +207,7 @@ def test_dns_says_something_else(place):
 
 @pytest.mark.parametrize("stage", OrderStage)
 @pytest.mark.parametrize("what", [KeyboardInterrupt, RuntimeError, OSError])
-def test_interrupted_anywhere_the_next_run_goes_on(place, stage, what):
+def test_after_an_interruption_at_any_stage_the_next_run_goes_on(place, stage, what):
     def tell(reached):
         if reached is stage:
             raise what("here")
@@ -231,7 +231,7 @@ class Killed(BaseException):
 
 
 class Mortal:
-    """Documents of a process that is killed at its n-th write: nothing works from then on, and nothing is tidied up."""
+    """Documents of a process that is killed at its n-th write: no later call works, and nothing is cleaned up."""
 
     def __init__(self, documents, writes):
         self._documents = documents
@@ -248,8 +248,8 @@ class Mortal:
         return call
 
 
-def test_killed_at_any_write_the_next_run_goes_on(place):
-    """Over a certificate that is in use: whenever a server starts, it finds a pair that fits."""
+def test_after_a_kill_at_any_write_the_next_run_goes_on(place):
+    """The run replaces a certificate that is in use: at any moment a server that starts finds a pair that fits."""
     place.obtain()
     for writes in range(20):
         serial = place.state.serial
@@ -264,7 +264,7 @@ def test_killed_at_any_write_the_next_run_goes_on(place):
             break
         assert served(place)
         stored = place.renewal().read()[1]
-        if stored.serial == serial:  # not yet stored: the dead run's claim has to lapse
+        if stored.serial == serial:  # not yet stored: the killed run's claim has to lapse
             if place.state.claim:
                 assert place.obtain().decision.verdict is Verdict.BUSY
                 place.ahead += CLAIM
@@ -279,10 +279,10 @@ def test_killed_at_any_write_the_next_run_goes_on(place):
         assert place.state.serial == place.renewal().read()[1].serial
     else:
         pytest.fail("it never came to an end")
-    assert writes >= 4  # one less where the authority remembers that the name was proven
+    assert writes >= 4  # one less if the authority remembers that the name was proved
 
 
-def test_killed_at_any_write_of_the_very_first_order(place):
+def test_after_a_kill_at_any_write_of_the_first_order_servers_have_a_whole_pair(place):
     """As soon as there is a key, a server can start."""
     for writes in range(20):
         mortal = Mortal(place.documents, writes)
@@ -304,7 +304,7 @@ def test_killed_at_any_write_of_the_very_first_order(place):
 
 
 def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_path):
-    """A real process and SIGKILL: what it published is found in the state and removed."""
+    """A real process gets SIGKILL: the next run finds its record in the state, and removes it."""
     program = """
 import os, signal, sys
 from datetime import UTC, datetime
@@ -335,7 +335,7 @@ Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(
 
 
 class Paused:
-    """Documents of a run that has looked at everything and waits before its first write of the state."""
+    """Documents of a run that has read everything, and waits before its first write of the state."""
 
     def __init__(self, documents, wait):
         self._documents = documents
@@ -351,7 +351,7 @@ class Paused:
 
 
 class PausedChallenges:
-    """Names of a run that waits, in the middle of its order, until the others have come to their end."""
+    """Challenges of a run that waits, in the middle of its order, until the others have ended."""
 
     def __init__(self, challenges, wait):
         self._challenges = challenges
@@ -365,8 +365,8 @@ class PausedChallenges:
         self._challenges.put(*args)
 
 
-def test_of_renewals_that_look_at_the_same_moment_one_orders_and_servers_read_a_whole_pair(place):
-    """All have seen the old certificate before any claims the order; the others end while that one is ordering."""
+def test_of_several_renewals_at_once_one_orders_and_servers_read_a_whole_pair(place):
+    """All have read the old certificate before any of them claims the order; the others end while that one orders."""
     place.obtain()
     place.ahead = timedelta(days=61)
     orders, outcomes, wrong = place.pebble.orders(), [], []
@@ -410,8 +410,8 @@ def test_of_renewals_that_look_at_the_same_moment_one_orders_and_servers_read_a_
     assert not place.challenges.present
 
 
-def test_a_renewal_that_has_looked_before_another_one_ordered_does_not_order_again(place):
-    """It has seen the old certificate and writes its claim when the other one is done. It looks again, and finds a new one."""
+def test_a_renewal_that_read_the_state_before_another_ordered_does_not_order_again(place):
+    """It has read the old certificate, and writes its claim when the other run is done. Then it reads again, and finds the new certificate."""
     place.obtain()
     place.ahead = timedelta(days=61)
     orders = place.pebble.orders()
@@ -420,15 +420,15 @@ def test_a_renewal_that_has_looked_before_another_one_ordered_does_not_order_aga
         assert place.obtain().ordered
         place.ahead = (
             timedelta()
-        )  # Pebble has issued it now, not in 61 days: by the clock of the test it would be old at once
+        )  # Pebble has issued it now and not in 61 days: by the clock of the test it would be due for renewal at once
 
     late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now, PLACE).obtain(place.wish())
     assert late.decision.verdict is Verdict.FRESH
     assert place.pebble.orders() == orders + 1
 
 
-def test_whoever_is_overtaken_stores_nothing(place):
-    """--force takes over from a run that is only slow; the slow one finds out and leaves everything alone."""
+def test_a_run_that_was_overtaken_stores_nothing(place):
+    """A run with --force takes over from a slow run; the slow run notices it and stores nothing."""
     other = []
 
     def tell(stage):
@@ -444,7 +444,7 @@ def test_whoever_is_overtaken_stores_nothing(place):
     assert not place.challenges.present
 
 
-def test_the_state_is_lost_or_damaged(place):
+def test_a_lost_or_damaged_state_is_made_anew(place):
     serial = place.obtain().stored.serial
     for content in (None, b"{", b'{"claimed": "2026-01-01T00:00:00"}', b'["a"]'):
         (place.folder / STATE).unlink()
@@ -455,14 +455,14 @@ def test_the_state_is_lost_or_damaged(place):
         assert place.state.serial == serial
 
 
-def test_the_certificate_is_damaged(place):
+def test_a_damaged_certificate_is_replaced(place):
     place.obtain()
     (place.folder / PRIVKEY).write_text(place.key[:300])
     assert place.obtain().ordered
     assert served(place)
 
 
-def test_one_put_there_by_hand_is_left_alone(place, tmp_path):
+def test_a_certificate_that_was_put_there_by_hand_is_not_changed(place, tmp_path):
     _, chain, key = make_ca(tmp_path)
     place.documents.create(FULLCHAIN, chain.read_bytes())
     place.documents.create(PRIVKEY, key.read_bytes())
@@ -475,8 +475,8 @@ def test_one_put_there_by_hand_is_left_alone(place, tmp_path):
     assert served(place)
 
 
-def test_the_record_of_the_challenge_cannot_be_removed(place):
-    """The certificate is worth more than tidiness; the next run tries again."""
+def test_a_challenge_record_that_cannot_be_removed_does_not_fail_the_order(place):
+    """The certificate is stored nevertheless; the next run tries again to remove the record."""
     remove, place.challenges.remove = place.challenges.remove, None
     assert place.obtain().ordered
     assert place.notes == ["the challenge's TXT record could not be removed"]
@@ -491,7 +491,7 @@ def test_no_private_key_is_ever_logged(place, caplog, capfd):
     caplog.set_level(logging.DEBUG)
     place.obtain()
     said = caplog.text + "".join(capfd.readouterr())
-    assert "order-plz" in said  # the library does say things
+    assert "order-plz" in said  # the library does log something
     value = serialization.load_pem_private_key(place.key.encode(), None).private_numbers().private_value
     plain = base64.urlsafe_b64encode(value.to_bytes(32, "big")).decode().rstrip("=")
     secrets = place.key.split("-----BEGIN CERT")[0].splitlines()[2:4]  # the third line is the public part
@@ -502,14 +502,14 @@ def test_no_private_key_is_ever_logged(place, caplog, capfd):
         assert secret not in place.read(STATE)
 
 
-def test_the_authority_refuses_the_name(place):
+def test_a_name_that_the_authority_refuses_fails_the_order(place):
     with pytest.raises(OrderFailed) as failed:
         place.obtain(domain="blocked.example")
     assert failed.value.reason is FailureReason.REFUSED
     assert "blocked" in str(failed.value) or "polic" in str(failed.value).lower()
 
 
-def test_an_address_that_is_not_trusted(place):
+def test_an_authority_that_is_not_trusted_counts_as_unreachable(place):
     with pytest.raises(OrderFailed) as failed:
         place.obtain(trusted="")
     assert failed.value.reason is FailureReason.UNREACHABLE
@@ -517,7 +517,7 @@ def test_an_address_that_is_not_trusted(place):
 
 
 class Conflicting:
-    """Every write meets another, the way S3 answers a write that was sent twice: it is there, and a Conflict."""
+    """Documents whose every write succeeds and raises Conflict, as S3 answers a write that was sent twice."""
 
     def __init__(self, documents):
         self._documents = documents
@@ -534,13 +534,13 @@ class Conflicting:
         raise Conflict(args[0])
 
 
-def test_writes_whose_answers_are_lost(place):
+def test_writes_whose_answers_are_lost_do_not_fail_the_order(place):
     assert place.renewal(Conflicting(place.documents)).obtain(place.wish()).ordered
     assert place.state.claim == ""
     assert served(place)
 
 
-# ---- authorities that behave otherwise
+# ---- authorities that do not behave as Pebble does
 
 
 @contextmanager
@@ -622,8 +622,8 @@ def refused(retry_after, more=""):
     ],
     ids=["seconds", "date", "sentence", "nothing", "absurd", "nonsense"],
 )
-def test_rate_limited(tmp_path, answer, hours):
-    """A wait that the authority asks for is kept, even with `force`."""
+def test_the_wait_of_a_rate_limit_is_observed(tmp_path, answer, hours):
+    """The time that the authority asks to wait is observed, even with `force`."""
     with authority(acme(answer(datetime.now(UTC)))) as directory:
         renewal, wish = alone(tmp_path), RenewalRequest(DOMAIN, directory)
         with pytest.raises(OrderFailed) as failed:
@@ -632,7 +632,7 @@ def test_rate_limited(tmp_path, answer, hours):
         assert abs(failed.value.until - datetime.now(UTC) - timedelta(hours=hours)) < timedelta(minutes=5)
         decision = renewal.obtain(RenewalRequest(DOMAIN, directory, force=True)).decision
         assert (decision.verdict, decision.until) == (Verdict.WAIT, failed.value.until)
-        # Another authority has nothing to do with it.
+        # The limit does not hold for another authority.
         assert renewal.decide(RenewalRequest(DOMAIN, "https://elsewhere.example/dir")).verdict is Verdict.ORDER
 
 
@@ -654,7 +654,7 @@ def test_rate_limited(tmp_path, answer, hours):
         (lambda path, here: (200, {"Content-Type": "application/json"}, b"[1]"), FailureReason.BROKEN),
     ],
 )
-def test_authorities_that_do_not_want_to_or_make_no_sense(tmp_path, answers, trouble):
+def test_refusals_and_malformed_answers_of_an_authority_have_their_reasons(tmp_path, answers, trouble):
     with authority(answers) as directory:
         renewal = alone(tmp_path)
         with pytest.raises(OrderFailed) as failed:
@@ -668,7 +668,7 @@ def test_authorities_that_do_not_want_to_or_make_no_sense(tmp_path, answers, tro
 
 
 @pytest.mark.parametrize(("times", "trouble"), [(7, FailureReason.CAA), (8, FailureReason.UNREACHABLE)])
-def test_a_nonce_may_be_refused_seven_times_in_a_row(tmp_path, times, trouble):
+def test_a_nonce_may_be_refused_a_limited_number_of_times(tmp_path, times, trouble):
     refusals = [problem("badNonce", "again", 400)] * times
 
     def answers(path, here):
@@ -680,7 +680,7 @@ def test_a_nonce_may_be_refused_seven_times_in_a_row(tmp_path, times, trouble):
     assert failed.value.reason is trouble
 
 
-def test_nobody_is_there(tmp_path):
+def test_an_authority_that_does_not_answer_is_unreachable(tmp_path):
     with authority(acme((200, {}, b""))) as directory:
         pass
     with pytest.raises(OrderFailed) as failed:

@@ -1,4 +1,4 @@
-"""The function on the timer, with a real authority."""
+"""The function `renew_certificate`, which a timer calls, with a real authority."""
 
 from datetime import timedelta
 from types import SimpleNamespace
@@ -34,12 +34,12 @@ def function(place):
     installed.use(None)
 
 
-def test_nothing_was_ever_ordered(function, place, log):
+def test_without_an_earlier_order_the_function_orders_nothing(function, place, log):
     assert function() == {"certificate": "none"}
     assert "nothing to renew" in log.getvalue()
 
 
-def test_it_renews_when_it_is_time_from_where_it_came(function, place, log):
+def test_a_due_certificate_is_renewed_at_its_own_authority(function, place, log):
     place.obtain()
     first, account = place.key, place.read(ACCOUNT)
     assert function()["certificate"] == "fresh"
@@ -55,7 +55,7 @@ def test_it_renews_when_it_is_time_from_where_it_came(function, place, log):
         assert line not in log.getvalue()
 
 
-def test_a_failure_is_raised_for_the_alarm_and_then_it_waits(function, place, log):
+def test_a_failure_is_raised_for_the_alarm_and_then_the_function_waits(function, place, log):
     place.obtain()
     place.lose_account()
     place.ahead, place.challenges.lies = timedelta(days=61), True
@@ -67,8 +67,8 @@ def test_a_failure_is_raised_for_the_alarm_and_then_it_waits(function, place, lo
     assert function()["certificate"] == "ordered"
 
 
-def test_it_ends_before_it_is_ended(function, place):
-    """Little time left: a timeout of its own, with everything tidied up, and not Lambda's."""
+def test_the_function_ends_before_lambdas_timeout(function, place):
+    """When little time is left, the function ends by its own timeout and cleans up, before Lambda's timeout."""
     place.obtain()
     place.lose_account()
     place.ahead = timedelta(days=61)
@@ -79,7 +79,7 @@ def test_it_ends_before_it_is_ended(function, place):
     assert float(place.state.failures[-1].text) < 30.0
 
 
-def test_an_installation_whose_servers_get_names_of_their_own_orders_anew_from_where_it_did_before(function, place):
+def test_after_a_change_of_names_a_new_certificate_comes_from_the_earlier_authority(function, place):
     """Servers that earlier versions named keep their certificate; that of the new names comes from the same directory."""
     place.renewal(at=FORMER).obtain(place.wish(domain=ROOT_DOMAIN))
     former = [place.read(key) for key in FORMER]
@@ -89,14 +89,14 @@ def test_an_installation_whose_servers_get_names_of_their_own_orders_anew_from_w
     assert function()["certificate"] == "fresh"
 
 
-def test_it_stops_where_there_is_no_certificate_of_ours(function, place, tmp_path):
+def test_a_certificate_that_was_put_there_by_hand_is_not_renewed(function, place, tmp_path):
     place.documents.create(PRIVKEY, b"-----BEGIN PRIVATE KEY-----\n")
     assert function() == {"certificate": "none"}
     assert place.key.startswith("-----BEGIN PRIVATE")
 
 
-def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, pebble, monkeypatch):
-    """Route 53 and S3 on moto, each call judged by the roles in infra/template.yml (see testing/iam/enforcement.py)."""
+def test_the_functions_role_allows_its_calls_and_no_other_role_allows_its_writes(moto_world, pebble, monkeypatch):
+    """Route 53 and S3 on moto; the roles in infra/template.yml must allow each call (see testing/iam/enforcement.py)."""
     from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
     from testing.iam.actions import asks
@@ -131,5 +131,5 @@ def test_on_aws_it_does_what_its_role_allows_and_what_no_other_may(moto_world, p
         assert judge.may("renew_certificate", ask), ask
         if ask.kind.split()[0] in {"s3:PutObject", "route53:ChangeResourceRecordSets"} or "SSL" in str(ask.resource):
             served = ask.kind.split()[0] == "s3:GetObject" and str(ask.resource).endswith(".pem")
-            signs = {"sign_requests"} if served else set()  # what servers get by its requests
+            signs = {"sign_requests"} if served else set()  # the documents that servers get by presigned requests
             assert set(judge.who_may(ask)) == {"renew_certificate"} | signs, ask

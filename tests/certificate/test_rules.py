@@ -1,4 +1,4 @@
-"""When a certificate is ordered: decisions, without any authority."""
+"""The decisions when a certificate is ordered, without an authority."""
 
 from datetime import UTC, datetime, timedelta
 
@@ -53,13 +53,13 @@ def decide(state=NEVER, present=None, force=False, directory=STAGING) -> Decisio
     ("lifetime", "left"),
     [(398, 30), (90, 30), (64, 64 / 3), (47, 47 / 3), (45, 15), (10, 10 / 3), (160 / 24, 80 / 24), (1, 0.5)],
 )
-def test_when_to_renew(lifetime, left):
+def test_a_certificate_is_renewed_so_many_days_before_its_end(lifetime, left):
     end = NOW + lifetime * DAY
     assert abs(end - rules.renew_at(NOW, end) - left * DAY) < timedelta(seconds=1)
 
 
 @given(st.timedeltas(min_value=timedelta(minutes=1), max_value=timedelta(days=4000)))
-def test_it_is_renewed_after_its_first_half_and_before_its_end(lifetime):
+def test_a_certificate_is_renewed_after_its_first_half_and_before_its_end(lifetime):
     at = rules.renew_at(NOW, NOW + lifetime)
     assert NOW + lifetime / 2 - timedelta(milliseconds=1) <= at < NOW + lifetime  # times have whole microseconds
     assert at >= NOW + lifetime - timedelta(days=30) - timedelta(seconds=1)
@@ -80,13 +80,13 @@ def test_it_is_renewed_after_its_first_half_and_before_its_end(lifetime):
         (stored(91 * DAY, directory=""), Verdict.FOREIGN),
     ],
 )
-def test_what_there_is_to_do(present, due):
+def test_the_decision_follows_from_the_present_certificate(present, due):
     assert decide(present=present).verdict is due
     assert decide(present=present).why
     assert decide(present=present, force=True).verdict is Verdict.ORDER
 
 
-def test_after_failures_it_waits_longer_and_longer():
+def test_the_wait_after_failures_grows_with_their_number():
     for count, minutes in [(1, 1), (2, 10), (3, 100), (4, 1200), (9, 1200)]:
         failures = [failure(timedelta(seconds=30), FailureReason.TIMEOUT)] * count
         decision = decide(CertificateRecord(failures=tuple(failures)))
@@ -105,7 +105,7 @@ def test_a_daily_timer_tries_every_day():
     )
 
 
-def test_even_who_insists_fails_at_most_four_validations_an_hour():
+def test_even_with_force_at_most_four_validations_an_hour_may_fail():
     recent = tuple(failure(timedelta(minutes=m)) for m in (50, 40, 30, 20))
     decision = decide(CertificateRecord(failures=recent), force=True)
     assert (decision.verdict, decision.until) == (Verdict.WAIT, NOW + timedelta(minutes=10))
@@ -115,7 +115,7 @@ def test_even_who_insists_fails_at_most_four_validations_an_hour():
     assert decide(CertificateRecord(failures=others), force=True).verdict is Verdict.ORDER
 
 
-def test_what_the_authority_asked_for_holds_for_everybody():
+def test_a_wait_that_the_authority_asked_for_holds_even_with_force():
     asked = CertificateRecord(failures=(failure(DAY, FailureReason.RATE_LIMITED, until=NOW + DAY),))
     for force in (False, True):
         assert decide(asked, force=force) == Decision(Verdict.WAIT, decide(asked).why, NOW + DAY)
@@ -123,11 +123,11 @@ def test_what_the_authority_asked_for_holds_for_everybody():
     assert decide(over).verdict is Verdict.ORDER
 
 
-def test_a_clock_that_went_wrong_stops_nothing():
+def test_a_failure_in_the_future_does_not_prevent_orders():
     assert decide(CertificateRecord(failures=(failure(-400 * DAY),))).verdict is Verdict.ORDER
 
 
-def test_a_claim_holds_for_a_while():
+def test_a_claim_prevents_other_orders_for_a_limited_time():
     held = rules.claimed(CertificateRecord(), "me", NOW - CLAIM + timedelta(seconds=1))
     assert decide(held) == Decision(Verdict.BUSY, decide(held).why, NOW + timedelta(seconds=1))
     assert decide(held, force=True).verdict is Verdict.ORDER
@@ -136,7 +136,7 @@ def test_a_claim_holds_for_a_while():
 
 
 @given(st.integers(0, 30), st.text(max_size=3000))
-def test_the_state_does_not_grow(count, text):
+def test_the_size_of_the_state_is_limited(count, text):
     state = CertificateRecord()
     for _ in range(count):
         state = rules.failed(state, FailedOrder(NOW, STAGING, FailureReason.REFUSED, text))
@@ -146,12 +146,12 @@ def test_the_state_does_not_grow(count, text):
     assert rules.succeeded(state, stored(), "", NOW).failures == ()
 
 
-def test_a_state_with_times_of_no_zone_is_none():
+def test_a_state_with_times_without_a_zone_is_refused():
     with pytest.raises(msgspec.ValidationError):
         from_json(b'{"claimed": "2026-01-01T00:00:00"}', CertificateRecord)
 
 
-def test_days_left():
+def test_the_days_left_may_be_negative():
     assert stored().days_left(NOW) == 89
     assert stored(DAY, 2 * DAY).days_left(NOW) == 1
     assert stored(2 * DAY, DAY).days_left(NOW) == -1

@@ -1,4 +1,4 @@
-"""A trial server that runs while its certificate is renewed: a real process, asked over TLS."""
+"""A real trial server runs while its certificate is renewed, and is asked over TLS."""
 
 import asyncio
 import json
@@ -31,7 +31,7 @@ class Agent:
 
 @pytest.fixture
 def trial(place, tmp_path):
-    """Starts a trial server over the bucket; its port."""
+    """A function that starts a trial server with the bucket and returns its port."""
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent" / "agent.py").write_text(AGENT)
     env = {
@@ -81,10 +81,10 @@ def shown(port, root):
 
 
 def wait_until_shown(port, root, serial):
-    until(lambda: shown(port, root) == serial, 30)  # every connection on the way succeeds
+    until(lambda: shown(port, root) == serial, 30)  # every connection meanwhile must succeed
 
 
-def test_a_running_server_picks_up_the_renewed_certificate(place, trial):
+def test_a_running_server_shows_the_renewed_certificate(place, trial):
     first = place.obtain().stored.serial
     port, root = trial(), place.pebble.root()
     assert shown(port, root) == first
@@ -112,8 +112,8 @@ def test_connections_stay_while_the_certificate_changes(place, trial):
     asyncio.run(stay())
 
 
-def test_half_a_renewal_hurts_nobody(place, trial, tmp_path):
-    """The run was killed between privkey.pem and fullchain.pem: running servers go on, and new ones can start."""
+def test_half_a_renewal_affects_no_server(place, trial, tmp_path):
+    """The renewal was killed between writing privkey.pem and fullchain.pem: running servers go on, and new ones can start."""
     place.obtain()
     old_chain = place.chain
     place.ahead = timedelta(days=61)
@@ -124,8 +124,8 @@ def test_half_a_renewal_hurts_nobody(place, trial, tmp_path):
     assert shown(trial(), root) == second
 
 
-def test_a_pair_that_does_not_fit_leaves_the_running_server_as_it_is(place, trial, tmp_path):
-    """Somebody puts one file there by hand, and not the other."""
+def test_a_pair_that_does_not_fit_is_not_used_by_a_running_server(place, trial, tmp_path):
+    """An administrator puts one file there by hand and not the other."""
     serial = place.obtain().stored.serial
     port, root = trial(), place.pebble.root()
     (place.folder / PRIVKEY).write_text("-----BEGIN PRIVATE KEY-----\nnonsense\n-----END PRIVATE KEY-----\n")

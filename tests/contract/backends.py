@@ -1,4 +1,4 @@
-"""What the contract tests need of a backend besides its ports: to look behind them, and to make things happen."""
+"""Backends for the contract tests: their ports, and functions that read and change what is behind the ports."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def name(attempt: int = 1, user: str = "P1") -> str:
 
 
 class Backend(Protocol):
-    """A platform and the strings behind it."""
+    """A platform, and functions that act behind its ports."""
 
     platform: Platform
 
@@ -39,17 +39,17 @@ class Backend(Protocol):
         """A server that this backend can run; in the installation's cluster unless `changes` say otherwise."""
 
     def interface(self, task: str) -> str:
-        """Let the task reach RUNNING; the id of its network interface, as its event would say it."""
+        """Let the task reach RUNNING; the id of its network interface, as in the task's event."""
 
     def fire(self, name: str) -> None:
         """Let the timer fire now."""
 
     def arrived(self, queue: str) -> list[Any]:
-        """Take what the function behind "start", "stop" or "task" would get; delayed messages at once."""
+        """Take the messages that the function behind "start", "stop" or "task" would get; delayed messages come at once."""
 
 
 class MotoBackend:
-    """`hippodrome.aws` on moto; what moto lacks is bridged, and noted, in `testing/moto_world.py`."""
+    """`hippodrome.aws` on moto; `testing/moto_world.py` adds, and notes, what moto lacks."""
 
     def __init__(self, world: MotoWorld) -> None:
         self.world = world
@@ -99,7 +99,7 @@ class LocalBackend:
 
 
 class MemoryBackend:
-    """The fake that the services' tests stand on: they prove nothing unless it keeps the contract too."""
+    """The fake platform of the services' tests: they prove something only if it keeps the contract."""
 
     def __init__(self) -> None:
         self.fake = FakePlatform()

@@ -13,7 +13,7 @@ from tests.contract.backends import Backend, local_backend, memory_backend, moto
 
 @pytest.fixture(params=["aws", "local", "memory"])
 def backend(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Backend]:
-    """A fresh installation."""
+    """A new installation."""
     if request.param == "aws":
         with moto_backend() as made:
             yield made

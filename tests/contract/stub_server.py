@@ -1,4 +1,4 @@
-"""A server that only listens: what `local` runs in the contract tests in the place of a trial."""
+"""A server that only listens: `local` runs it in the contract tests instead of a trial."""
 
 import http.server
 import json

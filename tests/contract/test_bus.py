@@ -24,7 +24,7 @@ def test_each_topic_feeds_its_own_queue(backend: Backend) -> None:
     assert backend.arrived("start") == []
 
 
-def test_later_comes_back_to_the_tasks_queue(backend: Backend) -> None:
+def test_a_delayed_message_comes_to_the_tasks_queue(backend: Backend) -> None:
     backend.platform.bus.send_delayed(MESSAGE, 900)
     backend.platform.bus.send_delayed({"changes": "C1"}, 0)
     arrived = backend.arrived("task")

@@ -23,13 +23,13 @@ def test_added_names_are_listed(names: Dns) -> None:
     assert sorted(names.list()) == sorted(RECORDS)
 
 
-def test_names_removed_are_gone(names: Dns) -> None:
+def test_removed_names_are_not_listed(names: Dns) -> None:
     names.change(add=RECORDS)
     _wait(names, names.change(remove=RECORDS[:3]))
     assert list(names.list()) == RECORDS[3:]
 
 
-def test_names_removed_twice(names: Dns) -> None:
+def test_names_may_be_removed_twice(names: Dns) -> None:
     names.change(add=RECORDS)
     names.change(remove=RECORDS[:2])
     _wait(names, names.change(remove=RECORDS[:3]))
@@ -39,24 +39,24 @@ def test_names_removed_twice(names: Dns) -> None:
     assert list(names.list()) == []
 
 
-def test_names_that_never_were_are_removed_beside_additions(names: Dns) -> None:
+def test_one_change_may_add_names_and_remove_missing_ones(names: Dns) -> None:
     _wait(names, names.change(add=RECORDS[:1], remove=RECORDS[1:]))
     assert list(names.list()) == RECORDS[:1]
 
 
-def test_the_same_removal_twice_in_one_change(names: Dns) -> None:
+def test_one_change_may_name_a_removal_twice(names: Dns) -> None:
     names.change(add=RECORDS)
     names.change(remove=[RECORDS[0], RECORDS[0]])
     assert sorted(names.list()) == sorted(RECORDS[1:])
 
 
-def test_a_name_that_leads_elsewhere_by_now_is_not_removed(names: Dns) -> None:
+def test_a_name_that_has_another_address_now_is_not_removed(names: Dns) -> None:
     names.change(add=RECORDS[:1])
     names.change(remove=[DnsRecord(RECORDS[0].name, "203.0.113.99")])
     assert list(names.list()) == RECORDS[:1]
 
 
-def test_a_name_added_again_leads_to_the_new_address(names: Dns) -> None:
+def test_a_name_that_is_added_again_gets_the_new_address(names: Dns) -> None:
     names.change(add=RECORDS[:1])
     names.change(add=RECORDS[:1])
     assert list(names.list()) == RECORDS[:1]
@@ -65,12 +65,12 @@ def test_a_name_added_again_leads_to_the_new_address(names: Dns) -> None:
     assert list(names.list()) == [elsewhere]
 
 
-def test_no_change_is_in_sync(names: Dns) -> None:
+def test_an_empty_change_is_in_sync(names: Dns) -> None:
     assert names.in_sync(names.change())
     assert names.in_sync(names.change(remove=RECORDS))
 
 
-def test_a_browser_dials_the_name_or_the_address(names: Dns) -> None:
+def test_a_browser_connects_to_the_name_or_the_address(names: Dns) -> None:
     assert names.browser_host(RECORDS[0]) in RECORDS[0]
 
 

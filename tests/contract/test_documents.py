@@ -19,7 +19,7 @@ KEY = "study/users/P_1-a/participant.json"
 
 @pytest.fixture(autouse=True)
 def restless_threads() -> Iterator[None]:
-    """Threads take turns as often as they can: without this, a write that is not atomic looks as if it were."""
+    """Let threads take turns as often as they can: otherwise a write that is not atomic could seem atomic."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     yield
@@ -46,20 +46,20 @@ def test_any_bytes_may_be_stored(documents: Documents, body: bytes) -> None:
     assert found.body == body
 
 
-def test_a_missing_document_is_none(documents: Documents) -> None:
+def test_get_of_a_missing_document_is_none(documents: Documents) -> None:
     assert documents.get(KEY) is None
     documents.create(KEY, b"one")
     assert documents.get("study/users/P_1-a") is None
     assert documents.get(KEY + "x") is None
 
 
-def test_an_unchanged_document_is_the_known_one_itself(documents: Documents) -> None:
+def test_get_of_an_unchanged_document_returns_the_known_one(documents: Documents) -> None:
     documents.create(KEY, b"one")
     known = documents.get(KEY)
     assert documents.get(KEY, known) is known
 
 
-def test_a_changed_document_is_read_anew(documents: Documents) -> None:
+def test_get_reads_a_changed_document_again(documents: Documents) -> None:
     documents.create(KEY, b"one")
     known = documents.get(KEY)
     assert known is not None
@@ -78,7 +78,7 @@ def test_create_does_not_overwrite(documents: Documents) -> None:
     assert documents.get(KEY) == (b"one", etag)
 
 
-def test_replace_wants_the_present_version(documents: Documents) -> None:
+def test_replace_needs_the_present_version(documents: Documents) -> None:
     first = documents.create(KEY, b"one")
     second = documents.replace(KEY, b"two", first)
     assert second != first
@@ -88,7 +88,7 @@ def test_replace_wants_the_present_version(documents: Documents) -> None:
     documents.replace(KEY, b"three", second)
 
 
-def test_replace_of_a_document_that_is_not_there(documents: Documents) -> None:
+def test_replace_of_a_missing_document_raises_conflict(documents: Documents) -> None:
     etag = documents.create(KEY, b"one")
     with pytest.raises(Conflict):
         documents.replace(KEY + "x", b"two", etag)
@@ -98,7 +98,7 @@ def test_replace_of_a_document_that_is_not_there(documents: Documents) -> None:
     assert documents.get(KEY) is None
 
 
-def test_put_writes_whatever_is_there(documents: Documents) -> None:
+def test_put_writes_over_any_document(documents: Documents) -> None:
     documents.put(KEY, b"one")
     first = documents.get(KEY)
     assert first is not None
@@ -115,13 +115,13 @@ def test_put_writes_whatever_is_there(documents: Documents) -> None:
     assert found.body == b"five"
 
 
-def test_put_again_is_a_newer_time_in_a_listing(documents: Documents, platform: Platform) -> None:
-    """What is put again is there now, though its bytes are the same: so a participant who waits is seen."""
+def test_a_repeated_put_gives_a_newer_time_in_a_listing(documents: Documents, platform: Platform) -> None:
+    """A document that is put again with the same bytes gets a new time: so the lobby sees that a participant still waits."""
     clock = getattr(platform, "wait", None)
     documents.put(KEY, b"here")
     [before] = documents.list(KEY)
     end = time.monotonic() + 10
-    while time.monotonic() < end:  # a listing of S3 has whole seconds
+    while time.monotonic() < end:  # times in a listing of S3 have whole seconds
         clock(seconds=0.3) if clock else time.sleep(0.3)
         documents.put(KEY, b"here")
         [after] = documents.list(KEY)
@@ -131,15 +131,15 @@ def test_put_again_is_a_newer_time_in_a_listing(documents: Documents, platform: 
 
 
 @concurrent
-def test_of_many_who_put_at_once_one_is_whole(documents: Documents) -> None:
+def test_of_many_puts_at_once_one_is_stored_whole(documents: Documents) -> None:
     bodies = [b"%d" % n * 100_000 for n in range(8)]
-    assert len(_at_once(8, lambda n: documents.put(KEY, bodies[n]))) == 8
+    assert len(successful_at_once(8, lambda n: documents.put(KEY, bodies[n]))) == 8
     found = documents.get(KEY)
     assert found is not None
     assert found.body in bodies
 
 
-def test_delete_twice_and_begin_anew(documents: Documents) -> None:
+def test_a_document_may_be_deleted_twice_and_created_again(documents: Documents) -> None:
     documents.create(KEY, b"one")
     documents.delete(KEY)
     documents.delete(KEY)
@@ -148,8 +148,8 @@ def test_delete_twice_and_begin_anew(documents: Documents) -> None:
 
 
 @concurrent
-def test_of_many_who_create_at_once_one_wins(documents: Documents) -> None:
-    won = _at_once(8, lambda n: documents.create(KEY, b"%d" % n))
+def test_of_many_creates_at_once_one_succeeds(documents: Documents) -> None:
+    won = successful_at_once(8, lambda n: documents.create(KEY, b"%d" % n))
     assert len(won) == 1
     found = documents.get(KEY)
     assert found is not None
@@ -157,9 +157,9 @@ def test_of_many_who_create_at_once_one_wins(documents: Documents) -> None:
 
 
 @concurrent
-def test_of_many_who_replace_at_once_one_wins(documents: Documents) -> None:
+def test_of_many_replaces_at_once_one_succeeds(documents: Documents) -> None:
     etag = documents.create(KEY, b"nobody")
-    won = _at_once(8, lambda n: documents.replace(KEY, b"%d" % n, etag))
+    won = successful_at_once(8, lambda n: documents.replace(KEY, b"%d" % n, etag))
     assert len(won) == 1
     found = documents.get(KEY)
     assert found is not None
@@ -167,7 +167,7 @@ def test_of_many_who_replace_at_once_one_wins(documents: Documents) -> None:
 
 
 @concurrent
-def test_no_change_is_lost_among_many_who_try_again(documents: Documents) -> None:
+def test_no_change_is_lost_if_many_writers_try_again(documents: Documents) -> None:
     documents.create(KEY, b"0")
 
     def count_up(_: int) -> None:
@@ -218,7 +218,7 @@ def test_a_listing_says_size_and_time(documents: Documents, platform: Platform) 
 
 
 @pytest.mark.explores
-def test_a_listing_does_not_end_with_a_page(documents: Documents, pages: int) -> None:
+def test_a_listing_has_the_documents_of_all_pages(documents: Documents, pages: int) -> None:
     keys = [f"study/users/P{n}/participant.json" for n in range(1, 2 * pages + 6)]
     for key in keys:
         documents.create(key, b"{}")
@@ -230,8 +230,8 @@ def test_the_platforms_clock_is_in_utc(platform: Platform) -> None:
     assert platform.now() > datetime(2026, 1, 1, tzinfo=UTC)
 
 
-def _at_once(count: int, write: Callable[[int], object]) -> list[int]:
-    """Who of `count` threads did not meet a `Conflict`."""
+def successful_at_once(count: int, write: Callable[[int], object]) -> list[int]:
+    """Run `count` threads at once; the numbers of those that did not meet a `Conflict`."""
     ready = threading.Barrier(count)
 
     def one(n: int) -> bool:

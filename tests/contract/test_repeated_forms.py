@@ -56,7 +56,7 @@ def at_once(journey: Journey, bodies: list[tuple[str, str]]) -> None:
 
 
 @concurrent
-def test_of_many_equal_forms_at_once_one_is_an_answer(journey: Journey, platform: Platform) -> None:
+def test_of_many_equal_forms_at_once_one_is_stored(journey: Journey, platform: Platform) -> None:
     for number, step in enumerate(STEPS[:3]):
         at_once(journey, [(json.dumps({"words": str(number)}), "application/json")] * AT_ONCE)
         assert answered(platform) == [f"{key}.json" for key in STEPS[: int(step)]]
@@ -72,7 +72,7 @@ def test_a_form_with_a_ticket_and_programs_that_repeat_it_at_once_answer_one_ste
     assert answered(platform) == ["1.json"]
 
 
-def test_sent_again_at_once_it_is_known_again(journey: Journey, platform: Platform) -> None:
+def test_a_form_that_is_sent_again_at_once_is_recognized(journey: Journey, platform: Platform) -> None:
     for body in ('{"words": "fun"}', '{"words": "fun"}', '{"words": "none"}', '{"words": "fun"}'):
         post(journey, body)
     assert answered(platform) == ["1.json", "2.json"]

@@ -29,21 +29,21 @@ def whose(tasks: Tasks) -> set[tuple[str, str, str]]:
     return {(task.task, task.cluster, task.name) for task in tasks.list()}
 
 
-def test_a_listed_task_that_runs_says_so_and_where_its_address_is(backend: Backend, tasks: Tasks) -> None:
+def test_a_listed_task_that_runs_has_its_network_interface(backend: Backend, tasks: Tasks) -> None:
     interface = backend.interface(tasks.run(backend.request(name())))
     (listed,) = tasks.list()
     assert (listed.interface, listed.runs) == (interface, True)
     assert set(tasks.addresses([interface])) == {interface}
 
 
-def test_run_twice_is_one_task(backend: Backend, tasks: Tasks) -> None:
+def test_a_repeated_run_starts_one_task(backend: Backend, tasks: Tasks) -> None:
     request = backend.request(name())
     assert tasks.run(request) == tasks.run(request)
     assert len(list(tasks.list())) == 1
 
 
 @concurrent
-def test_run_by_many_at_once_is_one_task(backend: Backend, tasks: Tasks) -> None:
+def test_many_runs_at_once_start_one_task(backend: Backend, tasks: Tasks) -> None:
     request = backend.request(name())
     with ThreadPoolExecutor(4) as threads:
         assert len(set(threads.map(lambda _: tasks.run(request), range(4)))) == 1
@@ -56,7 +56,7 @@ def test_a_repetition_with_another_environment_is_still_the_same_task(backend: B
     assert tasks.run(request) == tasks.run(other)
 
 
-def test_stop_twice(backend: Backend, tasks: Tasks) -> None:
+def test_a_task_may_be_stopped_twice(backend: Backend, tasks: Tasks) -> None:
     task = tasks.run(backend.request(name()))
     tasks.stop(task, CLUSTER, "hippodrome: the stop step")
     tasks.stop(task, CLUSTER, "hippodrome: the stop step")
@@ -64,7 +64,7 @@ def test_stop_twice(backend: Backend, tasks: Tasks) -> None:
     assert list(tasks.list()) == []
 
 
-def test_stop_of_what_never_ran(backend: Backend, tasks: Tasks) -> None:
+def test_stopping_a_task_that_never_ran_changes_nothing(backend: Backend, tasks: Tasks) -> None:
     task = tasks.run(backend.request(name()))
     other = task[:-5] + "fedcb"
     tasks.stop(other, CLUSTER, "hippodrome: never was")
@@ -72,7 +72,7 @@ def test_stop_of_what_never_ran(backend: Backend, tasks: Tasks) -> None:
     assert tasks.find(name(), CLUSTER) == task
 
 
-def test_addresses_of_running_tasks_and_of_nothing(backend: Backend, tasks: Tasks) -> None:
+def test_running_tasks_have_different_addresses_and_no_tasks_none(backend: Backend, tasks: Tasks) -> None:
     running = [backend.interface(tasks.run(backend.request(name(n)))) for n in (1, 2)]
     found = tasks.addresses(running)
     assert sorted(found) == sorted(running)
@@ -81,12 +81,12 @@ def test_addresses_of_running_tasks_and_of_nothing(backend: Backend, tasks: Task
     assert tasks.addresses([]) == {}
 
 
-def test_addresses_leaves_out_what_has_none(backend: Backend, tasks: Tasks) -> None:
+def test_interfaces_without_an_address_are_left_out(backend: Backend, tasks: Tasks) -> None:
     running = backend.interface(tasks.run(backend.request(name())))
     assert list(tasks.addresses([running, "eni-0000000000000bare", running])) == [running]
 
 
-def test_a_participants_own_cluster_lives_as_long_as_its_task(backend: Backend, tasks: Tasks) -> None:
+def test_a_participants_own_cluster_exists_as_long_as_its_task(backend: Backend, tasks: Tasks) -> None:
     tasks.create_cluster(name())
     tasks.create_cluster(name())
     assert list(tasks.clusters()) == [name()]
@@ -103,6 +103,6 @@ def test_a_participants_own_cluster_lives_as_long_as_its_task(backend: Backend, 
     assert tasks.find(name(), name()) is None
 
 
-def test_a_cluster_that_never_was_may_be_deleted(tasks: Tasks) -> None:
+def test_a_missing_cluster_may_be_deleted(tasks: Tasks) -> None:
     tasks.delete_cluster(name(7))
     assert list(tasks.clusters()) == []

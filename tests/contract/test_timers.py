@@ -26,7 +26,7 @@ def test_timers_are_listed_until_cancelled(timers: Timers, platform: Platform) -
     assert sorted(timers.list()) == [name(1), name(3)]
 
 
-def test_cancelled_twice(timers: Timers, platform: Platform) -> None:
+def test_a_timer_may_be_cancelled_twice(timers: Timers, platform: Platform) -> None:
     timers.set(name(), platform.now() + HOUR, STOP)
     timers.cancel(name())
     timers.cancel(name())
@@ -45,7 +45,7 @@ def test_a_timer_publishes_its_message_to_the_stop_topic_once(backend: Backend) 
     assert backend.arrived("start") == []
 
 
-def test_a_timer_is_replaced_by_one_of_its_name(backend: Backend) -> None:
+def test_a_timer_is_replaced_by_a_new_one_of_its_name(backend: Backend) -> None:
     timers = backend.platform.timers
     timers.set(name(), backend.platform.now() + 2 * HOUR, STOP)
     timers.set(name(), backend.platform.now() + HOUR, {**STOP, "reason": "another"})
@@ -64,13 +64,13 @@ def test_a_timer_may_be_set_again_after_it_fired_or_was_cancelled(backend: Backe
     assert list(timers.list()) == [name()]
 
 
-def test_a_time_that_has_passed_still_fires(backend: Backend) -> None:
+def test_a_timer_for_a_time_in_the_past_fires(backend: Backend) -> None:
     backend.platform.timers.set(name(), backend.platform.now() - HOUR, STOP)
     backend.fire(name())
     assert backend.arrived("stop") == [STOP]
 
 
-def test_more_timers_than_a_page_holds(timers: Timers, platform: Platform) -> None:
+def test_all_timers_are_listed_if_they_are_more_than_a_page_holds(timers: Timers, platform: Platform) -> None:
     wanted = [name(n, user) for user in ("P1", "P2") for n in range(1, 71)]
     for one in wanted:
         timers.set(one, platform.now() + HOUR, STOP)

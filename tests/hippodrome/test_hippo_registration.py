@@ -1,4 +1,4 @@
-"""What HIPPO's updateProject.py sends to update_project_master_list, and what it reads of the answer."""
+"""update_project_master_list accepts what HIPPO's updateProject.py sends, and answers in the form that it reads."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def platform() -> Iterator[FakePlatform]:
     place.use(None)
 
 
-def test_it_is_registered_with_remarks(platform: FakePlatform) -> None:
+def test_the_scripts_project_is_registered_with_remarks(platform: FakePlatform) -> None:
     answer = update_project_master_list.handler(PAYLOAD, None)
     assert answer["statusCode"] == 200, answer
     assert all(word in answer["body"] for word in ("ecsTask", "containerName", "stopServerStep", "trial"))
@@ -51,7 +51,7 @@ def test_it_is_registered_with_remarks(platform: FakePlatform) -> None:
     {"steps": {"1": "nowhere.html"}}, {"steps": {"1": ["a"]}}, {"steps": {"1": {"2": "a"}}}, {"steps": {}}, {"steps": 7},
     {"id": "../x"}, {"id": None}, {"id": {}}, {"steps": {"1": "x" * 300_000}}, {"events": []}, {"awsSetup": "a"},
 ])  # fmt: skip
-def test_what_cannot_be_registered_is_a_sentence(platform: FakePlatform, change: dict[str, Any]) -> None:
+def test_a_project_that_cannot_be_registered_gets_a_sentence(platform: FakePlatform, change: dict[str, Any]) -> None:
     answer = update_project_master_list.handler({**PAYLOAD, **change}, None)
     assert answer["statusCode"] == 400
     assert 0 < len(answer["body"]) < 2_000
@@ -83,7 +83,9 @@ OURS = {"signedLinks": True, "maxParticipants": 5, "maxServers": 3, "maxServerHo
 
 
 @pytest.mark.parametrize("given", ["flight", "a b"])
-def test_it_neither_opens_a_study_by_invitation_nor_lifts_its_limits(platform: FakePlatform, given: str) -> None:
+def test_the_script_neither_opens_a_study_by_invitation_nor_lifts_its_limits(
+    platform: FakePlatform, given: str
+) -> None:
     project_id = given.replace(" ", "-")
     for file in ("consent", "thank"):
         platform.documents.put(step_key(project_id, file), b"<p>")
@@ -99,7 +101,7 @@ def test_it_neither_opens_a_study_by_invitation_nor_lifts_its_limits(platform: F
         assert (project.id, project.task_definition, project.trial["game"]) == (project_id, "t:1", "CartPole-v1")
 
 
-def test_what_it_says_itself_is_taken(platform: FakePlatform) -> None:
+def test_keys_that_the_script_sends_itself_are_registered(platform: FakePlatform) -> None:
     assert registered(platform, signedLinks=True, maxServers=3).signed_links
     changed = registered(platform, signedLinks=False)
     assert (changed.signed_links, changed.max_servers) == (False, 3)
@@ -130,7 +132,7 @@ def test_pages_of_an_earlier_make_register_are_shown_if_the_script_uploaded_none
     assert "<p>" in first_page("u1")
 
 
-def test_numbered_pages_are_those_of_groups(platform: FakePlatform) -> None:
+def test_numbered_pages_are_pages_of_groups(platform: FakePlatform) -> None:
     for file in ("consent-0", "consent-1", "thank", "consent-form"):
         platform.documents.put(f"flight/{file}.html", f"<p>page {file}".encode())
     assert [step.variants for step in registered(platform).steps] == [2, 0, 0]
@@ -148,7 +150,9 @@ def test_numbered_pages_are_those_of_groups(platform: FakePlatform) -> None:
         (("consent-1", "thank"), "consent.html has not been uploaded"),
     ],
 )
-def test_groups_that_cannot_be_are_a_sentence(platform: FakePlatform, files: tuple[str, ...], missing: str) -> None:
+def test_wrong_numbers_of_group_pages_get_a_sentence(
+    platform: FakePlatform, files: tuple[str, ...], missing: str
+) -> None:
     platform.documents.delete(step_key("flight", "consent"))
     for file in files:
         platform.documents.put(f"flight/{file}.html", b"<p>")
@@ -179,7 +183,9 @@ def test_the_documents_of_participants_are_not_listed(platform: FakePlatform, mo
         ({"bucket": "hippo-lab"}, "awsSetup.bucket is hippo-lab, but"),
     ],
 )
-def test_a_study_for_another_place_is_refused(platform: FakePlatform, changes: dict[str, Any], said: str) -> None:
+def test_a_study_for_another_installation_is_refused(
+    platform: FakePlatform, changes: dict[str, Any], said: str
+) -> None:
     here = {"bucket": "the-bucket", "region": "eu-central-1", "root_domain": "example.org"}
     platform.settings = replace(platform.settings, **here)
     answer = update_project_master_list.handler({**PAYLOAD, **changes}, None)
@@ -210,7 +216,7 @@ def test_remarks_are_in_the_log_since_the_script_does_not_print_them(
     assert "\n".join(line.remarks) == answer["body"]
 
 
-def test_pages_that_were_uploaded_under_another_id_are_a_sentence(platform: FakePlatform) -> None:
+def test_pages_that_were_uploaded_under_another_id_get_a_sentence(platform: FakePlatform) -> None:
     for file in ("consent", "thank"):
         platform.documents.put(f"a flight/{file}.html", b"<p>")
     answer = update_project_master_list.handler({**PAYLOAD, "id": "a flight"}, None)
@@ -229,7 +235,7 @@ def test_a_study_that_the_script_registered_can_be_closed_and_keeps_its_pages(pl
 
 
 @pytest.mark.parametrize("folder", ["users", "../other", None, 7, []])
-def test_a_folder_of_pages_is_one_of_two(platform: FakePlatform, folder: Any) -> None:
+def test_the_folder_of_pages_is_steps_or_empty(platform: FakePlatform, folder: Any) -> None:
     ours = {**registration_of(registered(platform), live=True), "pageFolder": folder}
     (problem,) = update_project_master_list.handler({"project": ours}, None)["problems"]
     assert problem.startswith("pageFolder: must be steps")

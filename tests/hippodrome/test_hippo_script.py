@@ -1,4 +1,4 @@
-"""What HIPPO's `updateProject.py` does on AWS, call by call, with each call of the functions judged by its role."""
+"""HIPPO's `updateProject.py` on AWS, call by call; the role of each function must allow the function's calls."""
 
 from __future__ import annotations
 

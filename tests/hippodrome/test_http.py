@@ -1,4 +1,4 @@
-"""Requests out of API Gateway's events, and responses into them."""
+"""Requests are read from API Gateway's events, and responses are written as its events."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_event_becomes_a_request() -> None:
 
 
 @pytest.mark.parametrize("event", [{}, {"body": None, "headers": None, "rawQueryString": None, "rawPath": None}])
-def test_an_event_that_says_nothing_asks_for_the_first_page(event: dict[str, Any]) -> None:
+def test_an_empty_event_is_a_get_of_the_root(event: dict[str, Any]) -> None:
     assert Request.from_event(event) == Request("GET", "/", (), {}, b"")
 
 
@@ -110,7 +110,7 @@ def test_without_a_stage_the_path_is_the_one_that_browsers_see(route: str) -> No
 
 
 @pytest.mark.parametrize("query", ["a=%ff", "a=\ud800", "&".join(["a=1"] * 65)])
-def test_a_malformed_query_is_none_and_names_nothing(query: str) -> None:
+def test_a_malformed_query_is_none_and_has_no_fields(query: str) -> None:
     read = request(query)
     assert read.query is None
     assert (read.query_value("a"), read.has_query("a"), read.url(b="1")) == (None, False, "/next?b=1")
@@ -136,7 +136,7 @@ def test_a_content_type_is_read_without_its_parameters(header: str, kind: str) -
     ("accept", "json"),
     [("application/json", True), ("text/html, application/json", False), ("*/*", False), ("text/html", False)],
 )
-def test_a_program_that_asks_for_json_gets_it(accept: str, json: bool) -> None:
+def test_a_request_wants_json_if_its_accept_header_prefers_it(accept: str, json: bool) -> None:
     assert request(accept=accept).wants_json is json
     assert request().wants_json is False
 
@@ -156,12 +156,12 @@ def test_a_program_that_asks_for_json_gets_it(accept: str, json: bool) -> None:
         ("", False),
     ],
 )
-def test_gzip_is_sent_to_those_who_accept_it(header: str, accepted: bool) -> None:
+def test_gzip_is_accepted_if_the_header_says_so(header: str, accepted: bool) -> None:
     assert request(accept_encoding=header).accepts_gzip is accepted
     assert request().accepts_gzip is False
 
 
-def test_the_own_address_keeps_the_query_and_never_names_another_host() -> None:
+def test_a_requests_own_url_keeps_the_query_and_never_names_another_host() -> None:
     assert request("a=1&b=2&a=3").url(b="x y") == "/next?a=1&a=3&b=x+y"
     assert Request("GET", "//evil.example/ä b\r\n", (), {}).url() == "/evil.example/%C3%A4%20b%0D%0A?"
     assert Request("GET", "\\/evil", (), {}).url() == "/evil?"
@@ -169,7 +169,7 @@ def test_the_own_address_keeps_the_query_and_never_names_another_host() -> None:
     assert Request("GET", "/\ud800", (), {}).url() == "/%3F?"
 
 
-def test_every_response_says_what_browsers_must_not_do() -> None:
+def test_every_response_has_the_headers_that_restrict_browsers() -> None:
     event = Response(404, "no", {"X-Other": "1", "Cache-Control": "no-store"}).to_event()
     assert event == {
         "statusCode": 404,
@@ -203,7 +203,7 @@ def test_texts_of_more_than_a_thousand_characters_travel_compressed_where_that_i
     assert event == long.to_event(compress=True), "the same bytes each time"
 
 
-def test_the_kinds_of_responses() -> None:
+def test_each_kind_of_response_has_its_status_body_and_headers() -> None:
     assert http.html(200, "<p>", {"A": "b"}) == Response(
         200, "<p>", {"Content-Type": "text/html; charset=utf-8", "A": "b"}
     )

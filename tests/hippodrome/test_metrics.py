@@ -1,4 +1,4 @@
-"""What the sweep tells CloudWatch, and that the template's alarms and dashboard read just that."""
+"""The metrics that functions write for CloudWatch; the template's alarms and dashboard read exactly these."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def platform() -> Iterator[FakePlatform]:
     place.use(None)
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def metrics_line(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """The one line of metrics on stdout, among the log's lines."""
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
     (found,) = [line for line in lines if "_aws" in line]
@@ -47,7 +47,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 
 
 def ours(kind: str) -> list[dict[str, Any]]:
-    """Those of the template's resources that watch our own metrics."""
+    """The template's resources of this type that watch Hippodrome's own metrics."""
     return [one for one in cfn.resources(kind).values() if one["Namespace"] == metrics.NAMESPACE]
 
 
@@ -68,20 +68,20 @@ def test_the_census_counts_our_servers_and_the_age_of_the_oldest(platform: FakeP
     assert done.running == RunningServers(count=2, oldest=timedelta(minutes=30))
 
 
-def test_without_servers_there_is_none_and_no_age(platform: FakePlatform) -> None:
+def test_without_servers_the_count_and_the_age_are_zero(platform: FakePlatform) -> None:
     done = Sweep(platform)
     done.run()
     assert done.running == RunningServers(0, timedelta())
 
 
-def test_a_sweep_tells_what_it_found(
+def test_a_sweep_writes_its_findings_as_metrics(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("STACK", "hippodrome-2")
     start(platform, *USERS)
     platform.clock += timedelta(minutes=90)
     sweep.handler({}, None)
-    line = told(capsys)
+    line = metrics_line(capsys)
     assert line["Stack"] == "hippodrome-2"
     assert (line["Servers"], line["OldestServer"], line["ServersOverdue"]) == ([2.0], [90.0], [2.0])
     (described,) = line["_aws"]["CloudWatchMetrics"]
@@ -90,7 +90,7 @@ def test_a_sweep_tells_what_it_found(
     assert not any(secret in text for secret in (*USERS, "maze", ids.server_label("maze", USERS[0])))
 
 
-def test_without_a_stack_nothing_is_told(
+def test_without_a_stack_no_metrics_are_written(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("STACK", raising=False)
@@ -102,7 +102,7 @@ def failed_task(name: str, stop_code: str, reason: str) -> dict[str, Any]:
     return task_event("arn:task", name, "STOPPED", "STOPPED", stop_code=stop_code, reason=reason)
 
 
-def test_servers_that_fail_are_told_by_whose_matter_it_is_and_each_once(
+def test_failed_servers_are_counted_once_by_who_can_mend_the_cause(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("STACK", "hippodrome-2")
@@ -113,24 +113,24 @@ def test_servers_that_fail_are_told_by_whose_matter_it_is_and_each_once(
     ]
     for _ in range(2):  # events may come twice
         task_changed.handler(queue_event(events), None)
-    line = told(capsys)
+    line = metrics_line(capsys)
     assert (line["Stack"], line["Fault"], line["ServersFailed"]) == ("hippodrome-2", "image", [2.0])
     assert line["causes"] == {"image": 2}
     (described,) = line["_aws"]["CloudWatchMetrics"]
     assert (described["Namespace"], described["Dimensions"]) == (metrics.NAMESPACE, [["Stack", "Fault"]])
 
 
-def test_a_server_that_aws_refuses_is_told_at_its_start(
+def test_a_server_that_aws_refuses_is_counted_at_its_start(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("STACK", "hippodrome-2")
     platform.tasks.fail = [Refused("ClientException: TaskDefinition not found.")]
     message = {"projectId": "maze", "userId": USERS[0], "attempt": 1}
     start_server.handler(queue_event([message]), None)
-    assert told(capsys)["causes"] == {"no task definition": 1}
+    assert metrics_line(capsys)["causes"] == {"no task definition": 1}
 
 
-def test_where_nothing_fails_nothing_is_told(
+def test_without_failures_no_metrics_of_failures_are_written(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("STACK", "hippodrome-2")
@@ -140,24 +140,24 @@ def test_where_nothing_fails_nothing_is_told(
     assert "_aws" not in capsys.readouterr().out
 
 
-def test_the_functions_that_start_servers_do_not_load_what_they_seldom_need() -> None:
+def test_the_functions_that_start_servers_do_not_import_the_metrics() -> None:
     code = "import lambdas.task_changed, lambdas.start_server, sys; sys.exit('hippodrome.metrics' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-def test_every_cause_has_a_fault_that_an_alarm_watches_and_a_sentence() -> None:
+def test_every_cause_has_a_category_with_an_alarm_and_a_sentence() -> None:
     watched = {a["Dimensions"][1]["Value"] for a in ours("AWS::CloudWatch::Alarm") if len(a["Dimensions"]) > 1}
     assert {cause.category for cause in Cause} == watched
     assert all(cause.sentence.endswith(".") for cause in Cause)
 
 
-def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_alarms_and_dashboard_read_exactly_the_metrics_that_are_written(capsys: pytest.CaptureFixture[str]) -> None:
     metrics.report(
         "hippodrome",
         RunningServers(1, timedelta(minutes=7)),
         SweepResult(tasks=1, names=2, timers=3, clusters=4, failed=9),
     )
-    line = told(capsys)
+    line = metrics_line(capsys)
     assert (line["LeftoversRemoved"], line["SweepFailures"]) == ([10.0], [9.0])
     names = {metric["Name"] for metric in line["_aws"]["CloudWatchMetrics"][0]["Metrics"]}
 
@@ -172,7 +172,9 @@ def test_alarms_and_dashboard_read_what_is_told(capsys: pytest.CaptureFixture[st
     shown: set[str] = set()
     for widget in body["widgets"]:
         space = ""
-        for metric in (m for m in widget["properties"].get("metrics", []) if m[0] != "..."):  # as the one before it
+        for metric in (
+            m for m in widget["properties"].get("metrics", []) if m[0] != "..."
+        ):  # the same as the metric before it
             space = metric[0] if metric[0] != "." else space
             shown |= {metric[1]} if space == metrics.NAMESPACE else set()
     assert shown == names | {"ServersFailed"}

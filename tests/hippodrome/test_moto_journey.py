@@ -1,4 +1,4 @@
-"""The functions' journey on AWS as moto plays it: from the link until nothing is left, in order and in disorder."""
+"""A participant's study on moto's AWS: from the link until nothing is left, with messages in order and in disorder."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def alice(study: StudyOnMoto) -> Person:
     return Person(study, "R_alice")
 
 
-def test_a_participant_from_the_link_until_nothing_is_left(study: StudyOnMoto, alice: Person) -> None:
+def test_a_participant_plays_from_the_link_to_the_end_and_nothing_is_left(study: StudyOnMoto, alice: Person) -> None:
     world = study.world
     assert "take part" in alice.look()
     alice.answer(consent="yes")
@@ -80,7 +80,7 @@ def test_a_participant_from_the_link_until_nothing_is_left(study: StudyOnMoto, a
     assert len(world.task_arns()) == 1
 
 
-def test_messages_in_the_envelope_of_sns_do_as_well() -> None:
+def test_messages_in_the_envelope_of_sns_are_also_accepted() -> None:
     with MotoWorld(raw_delivery=False) as world:
         study = StudyOnMoto(world)
         alice = Person(study, "R_alice")
@@ -114,7 +114,7 @@ def test_two_participants_have_a_server_each(study: StudyOnMoto, alice: Person) 
     study.assert_nothing_left()
 
 
-def test_the_shutdown_is_there_before_the_task_and_stops_it(study: StudyOnMoto, alice: Person) -> None:
+def test_the_timer_is_set_before_the_task_runs_and_stops_it(study: StudyOnMoto, alice: Person) -> None:
     world = study.world
     alice.to_the_game()
     with world.recording() as calls:
@@ -143,7 +143,7 @@ def test_the_shutdown_is_there_before_the_task_and_stops_it(study: StudyOnMoto, 
     assert (ended["state"], ended["again"]) == ("ended", True)
 
 
-def test_a_delayed_stop_over_http_is_a_timer_of_its_own(study: StudyOnMoto, alice: Person) -> None:
+def test_a_delayed_stop_over_http_sets_its_own_timer(study: StudyOnMoto, alice: Person) -> None:
     alice.to_the_game()
     study.deliver()
     event = aws_events.load("http_post_json")
@@ -159,7 +159,7 @@ def test_a_delayed_stop_over_http_is_a_timer_of_its_own(study: StudyOnMoto, alic
     study.assert_nothing_left()
 
 
-def test_a_server_taken_by_spot_is_followed_by_another(study: StudyOnMoto, alice: Person) -> None:
+def test_a_server_that_spot_takes_is_replaced(study: StudyOnMoto, alice: Person) -> None:
     alice.to_the_game()
     study.deliver()
     before, (first,) = alice.poll(), study.living()
@@ -181,7 +181,7 @@ def test_a_server_taken_by_spot_is_followed_by_another(study: StudyOnMoto, alice
     assert after["url"] == before["url"].replace("-1.", "-2.")
     assert len(study.world.records()) == len(study.world.timers()) == 1
 
-    study.happen(study.world.task_event(first, "STOPPED", stop_code="SpotInterruption"))  # said once more, late
+    study.happen(study.world.task_event(first, "STOPPED", stop_code="SpotInterruption"))  # the event comes again, late
     study.deliver()
     assert alice.poll()["state"] == "ready"
     alice.play()
@@ -208,7 +208,7 @@ def test_without_spot_capacity_the_server_is_on_demand(study: StudyOnMoto, alice
     assert study.world.task(study.living()[0]).capacity_provider_name == "FARGATE"
 
 
-def test_a_cluster_of_the_participants_own_goes_with_the_server() -> None:
+def test_a_participants_own_cluster_is_removed_with_the_server() -> None:
     with MotoWorld() as world:
         study = StudyOnMoto(world, cluster="participant")
         alice = Person(study, "R_alice")
@@ -223,7 +223,7 @@ def test_a_cluster_of_the_participants_own_goes_with_the_server() -> None:
     installed.use(None)
 
 
-def test_nobody_waits_until_their_cluster_can_be_deleted() -> None:
+def test_a_replacement_does_not_wait_until_the_old_cluster_can_be_deleted() -> None:
     with MotoWorld() as world:
         study = StudyOnMoto(world, cluster="participant")
         alice = Person(study, "R_alice")
@@ -266,7 +266,7 @@ def test_the_second_registration_keeps_the_secret_and_the_study_goes_on(study: S
 # The sweep
 
 
-def test_the_sweep_removes_our_leftovers_and_nothing_of_strangers(study: StudyOnMoto, alice: Person) -> None:
+def test_the_sweep_removes_our_leftovers_and_nothing_of_others(study: StudyOnMoto, alice: Person) -> None:
     world = study.world
     bob = Person(study, "R_bob")
     for person in (alice, bob):
@@ -296,7 +296,7 @@ def test_the_sweep_removes_our_leftovers_and_nothing_of_strangers(study: StudyOn
     assert not any(again.values())
 
 
-def test_the_sweep_replaces_a_server_whose_end_nobody_told_us(study: StudyOnMoto, alice: Person) -> None:
+def test_the_sweep_replaces_a_server_whose_last_event_was_lost(study: StudyOnMoto, alice: Person) -> None:
     alice.to_the_game()
     study.deliver()
     (task,) = study.living()
@@ -310,7 +310,7 @@ def test_the_sweep_replaces_a_server_whose_end_nobody_told_us(study: StudyOnMoto
     assert (alice.poll()["state"], alice.poll()["attempt"]) == ("ready", 2)
 
 
-def test_the_sweep_stops_what_its_timer_has_forgotten(study: StudyOnMoto, alice: Person) -> None:
+def test_the_sweep_stops_a_server_whose_timer_was_lost(study: StudyOnMoto, alice: Person) -> None:
     alice.to_the_game()
     study.deliver()
     name = ids.server_name(ids.server_label(PROJECT, alice.user), 1)
@@ -335,7 +335,7 @@ def zone(world: MotoWorld) -> list[tuple[str, str]]:
 
 
 def run(world: MotoWorld, started_by: str) -> str:
-    """A task that none of our functions has run."""
+    """Run a task that none of our functions has started."""
     network = {"subnets": world.env["SUBNET"].split(","), "securityGroups": [world.env["SECURITY_GROUP"]]}
     answer = world.client("ecs").run_task(
         cluster="hippodrome",
@@ -348,7 +348,7 @@ def run(world: MotoWorld, started_by: str) -> str:
 
 
 def strangers(world: MotoWorld) -> list[str]:
-    """What others keep in the same zone, cluster and schedule group; their tasks."""
+    """Make resources of others in the same zone, cluster and schedule group; their tasks."""
     other = ids.server_name(ids.server_label("somebody-elses", "R_carol"), 1)  # well formed, but not in our bucket
     for name in ("example.org", "www.example.org", f"{other}.example.org", f"{other}.sub.example.org"):
         add_name(world, name, "198.51.100.1")
@@ -365,12 +365,12 @@ def strangers(world: MotoWorld) -> list[str]:
     return [run(world, "a-cron-job"), run(world, other)]
 
 
-# Twice, late, in any order
+# Messages that come twice, late, or in any order
 
 
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sample(range(6), 3))
-def test_everything_twice_and_in_any_order_comes_to_the_same_end(seed: int) -> None:
+def test_repeated_messages_in_any_order_lead_to_the_same_end(seed: int) -> None:
     disorder = random.Random(seed)
     with MotoWorld() as world:
         study = StudyOnMoto(world, disorder)
@@ -395,7 +395,7 @@ def test_everything_twice_and_in_any_order_comes_to_the_same_end(seed: int) -> N
 
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sample(range(4), 2))
-def test_spot_may_strike_at_any_moment_of_the_disorder(seed: int) -> None:
+def test_an_interruption_by_spot_at_any_moment_leads_to_the_same_end(seed: int) -> None:
     disorder = random.Random(1000 + seed)
     with MotoWorld() as world:
         study = StudyOnMoto(world, disorder)

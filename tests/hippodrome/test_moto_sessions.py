@@ -1,4 +1,4 @@
-"""Pairs on AWS as moto plays it: from their links to their answers, until nothing is left."""
+"""Pairs on moto's AWS: from their links to their answers, until nothing is left."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def session_of(study: StudyOnMoto, member: MotoMember) -> str:
     return str(member.membership["session"])
 
 
-def test_a_pair_from_two_links_until_nothing_is_left(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
+def test_a_pair_plays_from_two_links_to_the_end_and_nothing_is_left(
+    study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
+) -> None:
     alice, bob = pair
     come(study, *pair)
     (task,) = study.living()  # one server for both, started ahead
@@ -94,7 +96,7 @@ def test_a_pair_that_is_faster_than_the_start_messages_gets_one_server(
     study.assert_nothing_left()
 
 
-def test_the_first_to_finish_leaves_the_server_to_the_other(
+def test_the_first_member_who_finishes_leaves_the_server_to_the_other(
     study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
 ) -> None:
     come(study, *pair)
@@ -111,7 +113,7 @@ def test_the_first_to_finish_leaves_the_server_to_the_other(
     study.assert_nothing_left()
 
 
-def test_a_lost_server_is_replaced_for_both(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
+def test_a_lost_server_is_replaced_for_both_members(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
     come(study, *pair)
     before = meet(*pair)
     study.lose(study.living()[0])
@@ -156,7 +158,7 @@ def test_a_pair_is_handed_a_warm_server() -> None:
     installed.use(None)
 
 
-def test_a_server_ahead_of_one_who_gives_up_is_stopped(study: StudyOnMoto) -> None:
+def test_a_server_ahead_is_stopped_if_its_participant_gives_up(study: StudyOnMoto) -> None:
     alice = MotoMember(study, "R_alice")
     come(study, alice)
     assert len(study.living()) == 1
@@ -169,7 +171,7 @@ def test_a_server_ahead_of_one_who_gives_up_is_stopped(study: StudyOnMoto) -> No
     study.assert_nothing_left()
 
 
-def test_the_sessions_server_gets_requests_for_both_answers(
+def test_a_sessions_server_gets_requests_for_both_answers(
     study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]
 ) -> None:
     come(study, *pair)

@@ -1,4 +1,4 @@
-"""An entry, a record or a page that cannot be read takes nothing from anybody else."""
+"""An entry, a record or a page that cannot be read affects no other participant or project."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def platform() -> FakePlatform:
 
 
 def page(platform: FakePlatform, user: str, project: str = "maze") -> tuple[int, str]:
-    """What somebody's link answers."""
+    """The status and body of the answer to a participant's link."""
     answer = Browser(platform, f"projectId={project}&userId={user}").send()
     return answer["statusCode"], str(answer["body"])
 
@@ -62,7 +62,7 @@ def entries(platform: FakePlatform) -> list[Any]:
 
 
 @pytest.mark.parametrize("entry", BROKEN.values(), ids=BROKEN)
-def test_the_participants_of_other_projects_go_on(platform: FakePlatform, entry: Any) -> None:
+def test_participants_of_other_projects_go_on(platform: FakePlatform, entry: Any) -> None:
     spoil(platform, entry)
     assert page(platform, "alice")[0] == 200
     Servers(platform).start(StartServer("maze", "alice"))
@@ -70,7 +70,7 @@ def test_the_participants_of_other_projects_go_on(platform: FakePlatform, entry:
     assert sweep.handler({}, None)["failed"] == 0
 
 
-def test_the_participants_of_the_project_are_told_that_it_is_out_of_order(platform: FakePlatform) -> None:
+def test_participants_of_an_unreadable_entry_see_that_the_study_is_out_of_order(platform: FakePlatform) -> None:
     spoil(platform, BROKEN["no steps"])
     status, text = page(platform, "alice", "broken")
     assert (status, "out of order" in text) == (500, True)
@@ -78,7 +78,7 @@ def test_the_participants_of_the_project_are_told_that_it_is_out_of_order(platfo
 
 
 @pytest.mark.parametrize("entry", BROKEN.values(), ids=BROKEN)
-def test_registering_another_project_leaves_the_entry_as_it_is(platform: FakePlatform, entry: Any) -> None:
+def test_registering_another_project_does_not_change_the_unreadable_entry(platform: FakePlatform, entry: Any) -> None:
     spoil(platform, entry)
     for file in ("consent-0", "consent-1", "bye"):
         platform.documents.put(step_key("other", file), b"x")
@@ -89,7 +89,9 @@ def test_registering_another_project_leaves_the_entry_as_it_is(platform: FakePla
     assert [one["id"] for one in entries(platform) if one != kept] == ["maze", "other"]
 
 
-def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: FakePlatform) -> None:
+def test_registering_the_project_itself_replaces_the_unreadable_entry_and_keeps_its_secret(
+    platform: FakePlatform,
+) -> None:
     """The secret signs the links and codes that participants have."""
     spoil(platform, BROKEN["steps as HIPPO writes them"])
     for file in ("consent-0", "consent-1", "bye"):
@@ -103,7 +105,7 @@ def test_registering_the_project_itself_mends_it_and_keeps_its_secret(platform: 
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b'{"projects": {}}', b"\xff", b'{"projects": ' + b"[" * 100_000])
-def test_a_list_that_is_none_is_not_written_over(platform: FakePlatform, body: bytes) -> None:
+def test_an_unreadable_list_is_not_overwritten(platform: FakePlatform, body: bytes) -> None:
     platform.documents.put(MASTER_LIST, body)
     for file in ("consent-0", "consent-1", "bye"):
         platform.documents.put(step_key("other", file), b"x")
@@ -112,13 +114,13 @@ def test_a_list_that_is_none_is_not_written_over(platform: FakePlatform, body: b
     assert platform.documents.kept[MASTER_LIST][0] == body
 
 
-def test_a_list_without_trouble_is_written_as_ever() -> None:
+def test_a_readable_list_is_written_as_it_was_read() -> None:
     listed = MasterList([study(), study(id="other")])
     assert read_list(write_list(listed)) == listed
     assert write_list(listed) == to_json(listed)
 
 
-def test_a_server_whose_record_cannot_be_read_is_nobody_elses_trouble(platform: FakePlatform) -> None:
+def test_an_unreadable_record_of_a_server_affects_only_its_participant(platform: FakePlatform) -> None:
     for user in ("alice", "bob"):
         Servers(platform).start(StartServer("maze", user))
     platform.documents.put(server.key(ids.server_label("maze", "alice")), b"{")
@@ -130,7 +132,7 @@ def test_a_server_whose_record_cannot_be_read_is_nobody_elses_trouble(platform: 
     assert page(platform, "bob")[0] == 200
 
 
-def test_who_has_no_readable_record_still_sees_their_page(platform: FakePlatform) -> None:
+def test_a_participant_without_a_readable_record_still_sees_their_page(platform: FakePlatform) -> None:
     platform.documents.put(step_key("maze", "consent-0"), b"<p>{{ participant.from }}, {{ participant.userId }}</p>")
     platform.documents.put(step_key("maze", "consent-1"), b"<p>{{ participant.from }}, {{ participant.userId }}</p>")
     platform.documents.put(participant_key("maze", "alice"), b"[]")
@@ -139,7 +141,7 @@ def test_who_has_no_readable_record_still_sees_their_page(platform: FakePlatform
     assert Repository(platform.documents).participant("maze", "alice") is None
 
 
-def test_a_page_that_does_not_render_is_its_own_trouble(platform: FakePlatform) -> None:
+def test_a_page_that_does_not_render_affects_no_other_project(platform: FakePlatform) -> None:
     platform.documents.put(step_key("maze", "consent-0"), b"{{ 1 / 0 }}")
     platform.documents.put(step_key("maze", "consent-1"), b"{{ 1 / 0 }}")
     other = study(id="other")
@@ -151,7 +153,7 @@ def test_a_page_that_does_not_render_is_its_own_trouble(platform: FakePlatform) 
 
 
 @pytest.mark.parametrize("document", ["_places/maze.json", "_spares/maze.json", "maze/places/0.json"])
-def test_places_of_one_project_that_cannot_be_read_keep_no_other(platform: FakePlatform, document: str) -> None:
+def test_unreadable_slots_of_one_project_do_not_affect_another(platform: FakePlatform, document: str) -> None:
     limited = study(max_servers=2, max_participants=16, warm_servers=1)
     other = study(id="other", max_servers=2)
     platform.documents.put(MASTER_LIST, to_json(MasterList([limited, other])))
@@ -163,7 +165,7 @@ def test_places_of_one_project_that_cannot_be_read_keep_no_other(platform: FakeP
     assert (swept["asked"], swept["failed"] <= 1) == (1, True)
 
 
-def test_without_a_readable_list_of_projects_the_sweep_still_ends_what_is_over(platform: FakePlatform) -> None:
+def test_without_a_readable_list_of_projects_the_sweep_still_stops_overdue_servers(platform: FakePlatform) -> None:
     Servers(platform).start(StartServer("maze", "alice"))
     Servers(platform).stop([StopServer("maze", "alice")])
     platform.timers.set(ids.server_name(ids.server_label("maze", "alice"), 1), platform.now(), {})

@@ -1,4 +1,4 @@
-"""update_project_master_list."""
+"""`update_project_master_list` registers projects in the master list."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def listed(platform: FakePlatform) -> MasterList:
 
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
-    """What signs the project's tickets, as functions see it."""
+    """The secret that signs the project's tickets, as functions read it."""
     project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret
 
 
-def test_a_project_is_added_and_later_put_in_its_place(platform: FakePlatform) -> None:
+def test_a_project_is_added_and_later_replaced(platform: FakePlatform) -> None:
     assert register(registration())["registered"] == "maze"
     register(registration("other"))
     register(registration(name="A better maze", live=False))
@@ -67,7 +67,7 @@ def test_a_project_is_added_and_later_put_in_its_place(platform: FakePlatform) -
     ]
 
 
-def test_its_secret_stays_so_that_codes_and_open_pages_stay_valid(platform: FakePlatform) -> None:
+def test_a_registered_projects_secret_stays_so_that_codes_and_open_pages_stay_valid(platform: FakePlatform) -> None:
     register(registration())
     before = secret(platform)
     register(registration(name="new"))
@@ -101,13 +101,13 @@ def test_many_researchers_at_once_are_all_registered(platform: FakePlatform) -> 
     assert {p.id for p in listed(platform).projects} == {f"p{n}" for n in range(12)}
 
 
-def test_a_page_nobody_uploaded_is_named(platform: FakePlatform) -> None:
+def test_a_page_that_was_not_uploaded_is_named(platform: FakePlatform) -> None:
     platform.documents.delete("maze/steps/consent-1.html")
     assert register(registration()) == {"problems": ["project.steps.1: consent-1.html has not been uploaded"]}
     assert MASTER_LIST not in platform.documents.kept
 
 
-def test_a_page_of_the_game_nobody_uploaded_is_named(platform: FakePlatform) -> None:
+def test_a_page_of_the_game_that_was_not_uploaded_is_named(platform: FakePlatform) -> None:
     told = registration(trial={"game": "x/Y-v0", "instructions": "rules"}, gamePages={"instructions": 2})
     told["events"]["stopServerStep"] = "finalStep"
     told["steps"].insert(1, {"key": "2", "page": "game", "variants": 0})
@@ -124,7 +124,7 @@ def test_groups_of_pages_that_the_trial_does_not_name_are_refused(platform: Fake
 
 
 @pytest.mark.parametrize("project", [None, [], "x", {}, {"id": "../x"}, {"id": "maze", "steps": "all"}, {"id": 7}])
-def test_what_is_not_a_project_is_refused_in_words(platform: FakePlatform, project: object) -> None:
+def test_a_message_that_is_no_project_is_refused_with_a_sentence(platform: FakePlatform, project: object) -> None:
     assert register(project)["problems"]
     assert MASTER_LIST not in platform.documents.kept
 
@@ -139,14 +139,16 @@ def test_a_project_for_another_installation_is_refused(platform: FakePlatform) -
 
 
 def test_a_warm_server_must_be_able_to_wait_an_hour_before_it_is_played_on(platform: FakePlatform) -> None:
-    """Otherwise all of them would be replaced again and again."""
+    """Otherwise the warm servers would be replaced again and again."""
     assert platform.settings.max_runtime == 120
     assert "registered" in register(registration(warmServers=2, maxRuntime=60))
     assert "registered" in register(registration(maxRuntime=61))
     (problem,) = register(registration(warmServers=2, maxRuntime=61))["problems"]
     assert problem.startswith("project.warmServers is 2")
     assert "may need 121 minutes, and this installation allows 120" in problem
-    assert "registered" in register(registration(warmServers=2, maxRuntime=61, live=False))  # closing always works
+    assert "registered" in register(
+        registration(warmServers=2, maxRuntime=61, live=False)
+    )  # closing a project is always allowed
 
 
 def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePlatform) -> None:
@@ -156,7 +158,7 @@ def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePl
     assert "ServerNames" in problem
 
 
-def test_front_ends_without_tokens_are_taken_only_where_that_is_allowed(platform: FakePlatform) -> None:
+def test_front_ends_without_tokens_are_registered_only_where_that_is_allowed(platform: FakePlatform) -> None:
     asked = {"subdomain": "userId", "plainClients": True, "frontEnd": ["https://play.example.org"]}
     (problem,) = register(registration(**asked))["problems"]
     assert problem == "project.plainClients is true, which this installation's parameter PlainClients does not allow"
@@ -173,7 +175,7 @@ def test_a_list_written_by_hippo_is_read(platform: FakePlatform) -> None:
     assert {p.id for p in listed(platform).projects} == {"old", "maze"}
 
 
-def test_a_study_that_is_registered_for_another_number_of_players_keeps_the_one_before(platform: FakePlatform) -> None:
+def test_a_registration_for_another_number_of_players_keeps_the_one_before(platform: FakePlatform) -> None:
     steps = [
         {"key": "1", "page": "consent", "variants": 2},
         {"key": "2", "page": "game", "variants": 0},
@@ -191,7 +193,7 @@ def test_a_study_that_is_registered_for_another_number_of_players_keeps_the_one_
     assert (project.trial["game"], before.trial["game"]) == ("for 3", "for 2")
 
 
-def test_a_study_of_several_participants_does_not_become_one_for_each_alone(platform: FakePlatform) -> None:
+def test_a_study_of_several_participants_cannot_be_registered_again_for_one(platform: FakePlatform) -> None:
     steps = [
         {"key": "1", "page": "consent", "variants": 2},
         {"key": "2", "page": "game", "variants": 0},

@@ -1,4 +1,4 @@
-"""A type of step is a row in the model and a file that shows it: neither is there without the other, and no more is needed."""
+"""A type of step is a row in the model and a file that shows it: each row has a file, and nothing else is needed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
 
 
 class BreakStep(PageStep):
-    """A type that no researcher's file stands for: a sentence, and any form goes on."""
+    """A type without a file of the researcher's: it shows a sentence, and any form leads to the next step."""
 
     def show(self, visit: Visit) -> Response:
         return http.html(200, f"<p>Take a break, {visit.user_id}.</p>", {})

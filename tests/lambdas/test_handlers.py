@@ -1,4 +1,4 @@
-"""Every function's handler with the payloads of AWS in `tests/events`, and with what nobody should ever send."""
+"""Every function's handler, with AWS's payloads in `tests/events` and with malformed events."""
 
 from __future__ import annotations
 
@@ -53,19 +53,19 @@ NOTHING_FAILED: dict[str, Any] = {"batchItemFailures": []}
 
 @pytest.fixture
 def platform() -> Iterator[FakePlatform]:
-    yield fresh()
+    yield new_platform()
     installed.use(None)
 
 
-def fresh() -> FakePlatform:
-    """A platform in memory with the study that the payloads speak of."""
+def new_platform() -> FakePlatform:
+    """A platform in memory with the study that the payloads name."""
     made = studies.installed(studies.study(id=PROJECT, events=Events("2", "4")))
     installed.use(made)
     return made
 
 
 def users(event: dict[str, Any]) -> list[str]:
-    """Whom the ECS events of a batch are about, in order."""
+    """The participants of the ECS events of a batch, in order."""
     found = []
     for record in event["Records"]:
         overrides = json.loads(record["body"])["detail"]["overrides"]["containerOverrides"]
@@ -115,21 +115,21 @@ def states(platform: FakePlatform, event: dict[str, Any]) -> list[tuple[ServerSt
 # The payloads of AWS
 
 
-def test_there_is_no_payload_without_a_test() -> None:
+def test_every_payload_has_a_test() -> None:
     here = Path(__file__).read_text(encoding="utf-8")
     missing = [file.stem for file in aws_events.EVENTS.glob("*.json") if f'"{file.stem}"' not in here]
     assert missing == []
 
 
-def test_http_get(platform: FakePlatform) -> None:
+def test_a_get_shows_the_first_page_and_stores_the_participant(platform: FakePlatform) -> None:
     answer = next_step.handler(aws_events.load("http_get"), None)
     assert answer["statusCode"] == 200
     assert answer["headers"]["Content-Type"] == "text/html; charset=utf-8"
     assert f"{PROJECT}/users/R_3fGxW2vPqT9aBcD/participant.json" in platform.documents.kept
 
 
-def test_http_post_form(platform: FakePlatform) -> None:
-    """A form in base64, as API Gateway delivers it. Its ticket is made up: the step where she stands is what counts."""
+def test_a_posted_form_is_stored_and_redirects(platform: FakePlatform) -> None:
+    """A form in base64, as API Gateway delivers it. Its ticket is invalid, so the participant's present step is answered."""
     user = "R_3fGxW2vPqT9aBcD"
     next_step.handler(aws_events.load("http_get"), None)
     platform.documents.put(f"{PROJECT}/users/{user}/answers/1.json", b"{}")
@@ -143,7 +143,7 @@ def test_http_post_form(platform: FakePlatform) -> None:
     }
 
 
-def test_http_post_json(platform: FakePlatform) -> None:
+def test_a_posted_json_form_is_answered_with_json(platform: FakePlatform) -> None:
     """HIPPO's front end: JSON in, JSON out."""
     event = aws_events.load("http_post_json")
     next_step.handler({**event, "requestContext": {"http": {"method": "GET"}}}, None)
@@ -155,7 +155,7 @@ def test_http_post_json(platform: FakePlatform) -> None:
 
 
 @pytest.mark.parametrize("payload", ["rest_get", "http_get_format_1", "http_get_stage"])
-def test_a_get_of_the_other_formats(platform: FakePlatform, payload: str) -> None:
+def test_events_of_other_formats_get_the_same_page(platform: FakePlatform, payload: str) -> None:
     """A REST API, and an HTTP API with payload format 1.0 or a named stage: the same page."""
     plain = {**aws_events.load("http_get"), "requestContext": {"http": {"method": "GET"}}}
     answer, usual = (next_step.handler(event, None) for event in (aws_events.load(payload), plain))
@@ -173,32 +173,32 @@ def _form_fields(answer: dict[str, Any]) -> list[str]:
     ("http_get", "/next?"), ("http_get_format_1", "/next?"), ("rest_get", "?"), ("http_get_stage", "?"),
 ])  # fmt: skip
 def test_a_form_goes_to_the_address_that_the_browser_sees(platform: FakePlatform, payload: str, address: str) -> None:
-    """With a named stage that is not known, so the form's address is its query alone."""
+    """With a named stage, the address is not known, so the form's address is only its query."""
     page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
     assert f'action="{address}projectId={PROJECT}&amp;userId=R_3fGxW2vPqT9aBcD"' in page
 
 
 @pytest.mark.parametrize(("payload", "folder"), [("http_get", "/steps/"), ("rest_get", "steps/")])
-def test_a_picture_is_asked_for_behind_the_stage(platform: FakePlatform, payload: str, folder: str) -> None:
+def test_the_address_of_a_picture_includes_the_stage(platform: FakePlatform, payload: str, folder: str) -> None:
     for n in (0, 1):
         platform.documents.put(step_key(PROJECT, f"consent-{n}"), b'<img src="maze.png">')
     page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
     assert f'src="{folder}{PROJECT}/maze.png"' in page
 
 
-def test_a_rest_api_gets_no_bytes_that_it_would_not_decode(platform: FakePlatform) -> None:
-    """Unless its binaryMediaTypes say so, it passes a body in base64 on as it is."""
+def test_a_rest_api_gets_no_body_in_base64(platform: FakePlatform) -> None:
+    """Unless its binaryMediaTypes say so, a REST API does not decode a body in base64."""
     assert next_step.handler(aws_events.load("http_get_format_1"), None)["isBase64Encoded"]
     assert not next_step.handler(aws_events.load("rest_get"), None)["isBase64Encoded"]
 
 
-def test_a_request_without_a_query(platform: FakePlatform) -> None:
-    """`queryStringParameters` is null then."""
+def test_a_request_without_a_query_gets_an_error_page(platform: FakePlatform) -> None:
+    """In such an event `queryStringParameters` is null."""
     answer = next_step.handler(aws_events.load("rest_get_without_query"), None)
     assert (answer["statusCode"], json.loads(answer["body"])["page"]) == (400, "Project ID Not Found")
 
 
-def test_a_post_of_a_rest_api(platform: FakePlatform) -> None:
+def test_a_post_through_a_rest_api_is_stored(platform: FakePlatform) -> None:
     next_step.handler(aws_events.load("rest_get"), None)
     answer = next_step.handler(aws_events.load("rest_post_json"), None)
     assert (answer["statusCode"], answer["headers"]["Access-Control-Allow-Origin"]) == (200, "*")
@@ -207,13 +207,13 @@ def test_a_post_of_a_rest_api(platform: FakePlatform) -> None:
     assert stored["answers"] == {"age": "34", "comment": "Très bien ✓"}
 
 
-def test_a_start_message_straight_from_the_topic(platform: FakePlatform) -> None:
+def test_a_start_message_directly_from_the_topic_starts_one_server(platform: FakePlatform) -> None:
     for _ in range(2):
         assert start_server.handler(aws_events.load("sns_start"), None) == NOTHING_FAILED
     assert len(platform.tasks.running) == 1
 
 
-def test_a_stop_message_without_a_project_straight_from_the_topic(platform: FakePlatform) -> None:
+def test_a_stop_message_without_a_project_directly_from_the_topic_stops_the_server(platform: FakePlatform) -> None:
     start_server.handler(aws_events.load("sns_start"), None)
     for _ in range(2):
         assert stop_server.handler(aws_events.load("sns_stop_user"), None) == NOTHING_FAILED
@@ -221,8 +221,8 @@ def test_a_stop_message_without_a_project_straight_from_the_topic(platform: Fake
     assert not platform.timers.due
 
 
-def test_lambda_repeats_an_event_of_the_topic_that_failed(platform: FakePlatform) -> None:
-    """It looks at nothing that the function returns, so the function raises."""
+def test_a_failed_event_of_the_topic_raises_so_that_lambda_repeats_it(platform: FakePlatform) -> None:
+    """Lambda does not look at what the function returns, so the function raises."""
     platform.tasks.fail = [ConnectionError()]
     with pytest.raises(RetryLater):
         start_server.handler(aws_events.load("sns_start"), None)
@@ -230,8 +230,8 @@ def test_lambda_repeats_an_event_of_the_topic_that_failed(platform: FakePlatform
     assert len(platform.tasks.running) == 1
 
 
-def test_start_messages(platform: FakePlatform) -> None:
-    """The second participant never had a first server, so there is nothing for a second attempt to follow."""
+def test_start_messages_of_the_queue_start_one_server(platform: FakePlatform) -> None:
+    """The second participant never had a first server, so their second attempt is not started."""
     event = aws_events.load("sqs_start_raw")
     for _ in range(2):
         assert start_server.handler(deepcopy(event), None) == NOTHING_FAILED
@@ -239,7 +239,7 @@ def test_start_messages(platform: FakePlatform) -> None:
     assert request.name == ids.server_name(ids.server_label(PROJECT, "R_3fGxW2vPqT9aBcD"), 1)
 
 
-def test_stop_messages_in_the_envelope_of_sns(platform: FakePlatform) -> None:
+def test_stop_messages_in_the_envelope_of_sns_stop_the_server(platform: FakePlatform) -> None:
     start_server.handler(aws_events.load("sqs_start_raw"), None)
     event = aws_events.load("sqs_stop_wrapped")
     for _ in range(2):
@@ -248,7 +248,7 @@ def test_stop_messages_in_the_envelope_of_sns(platform: FakePlatform) -> None:
     assert not platform.timers.due
 
 
-def test_a_running_task_gets_its_name_in_one_go(platform: FakePlatform) -> None:
+def test_a_running_task_is_named_and_ready_with_one_event(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_running")
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
@@ -264,7 +264,7 @@ def test_a_task_that_is_only_being_provided_changes_nothing(platform: FakePlatfo
 
 
 @pytest.mark.parametrize("payload", ["sqs_task_spot_warning", "sqs_task_spot_warning_no_code"])
-def test_a_warning_of_spot_does_not_end_a_server_that_is_ready(platform: FakePlatform, payload: str) -> None:
+def test_a_warning_of_spot_does_not_close_a_ready_server(platform: FakePlatform, payload: str) -> None:
     event = aws_events.load(payload)
     claimed(platform, event, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     assert task_changed.handler(event, None) == NOTHING_FAILED
@@ -321,7 +321,7 @@ def test_a_task_that_stopped_is_cleaned_up(platform: FakePlatform, payload: str,
         ("sqs_task_stopped_exit_no_code", ""),
     ],
 )
-def test_the_record_of_a_server_that_failed_says_why(platform: FakePlatform, payload: str, cause: str) -> None:
+def test_the_record_of_a_failed_server_holds_the_cause(platform: FakePlatform, payload: str, cause: str) -> None:
     event = aws_events.load(payload)
     claimed(platform, event)
     task_changed.handler(event, None)
@@ -329,7 +329,7 @@ def test_the_record_of_a_server_that_failed_says_why(platform: FakePlatform, pay
     assert record.cause == cause
 
 
-def test_the_end_of_a_server_is_told_twice_and_told_once_is_enough(platform: FakePlatform) -> None:
+def test_the_second_event_of_a_servers_end_changes_nothing(platform: FakePlatform) -> None:
     ended, gone = aws_events.load("sqs_task_deprovisioning_spot"), aws_events.load("sqs_task_stopped_spot")
     claimed(platform, ended, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
     task_changed.handler(ended, None)
@@ -343,7 +343,7 @@ def test_the_end_of_a_server_is_told_twice_and_told_once_is_enough(platform: Fak
     assert [m["attempt"] for _, m in platform.bus.sent] == [attempt + 1]
 
 
-def test_a_task_that_we_stopped_is_left_to_the_one_who_stopped_it(platform: FakePlatform) -> None:
+def test_the_event_of_a_task_that_hippodrome_stopped_changes_nothing(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_stopped_user")
     claimed(platform, event)
     assert json.loads(event["Records"][0]["body"])["detail"]["stoppedReason"].startswith("hippodrome:")
@@ -351,7 +351,7 @@ def test_a_task_that_we_stopped_is_left_to_the_one_who_stopped_it(platform: Fake
     assert states(platform, event) == [(ServerState.STARTING, None)]
 
 
-def test_a_whole_batch_of_changes(platform: FakePlatform) -> None:
+def test_each_event_of_a_batch_is_handled(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_tasks")
     claimed(platform, event)
     assert task_changed.handler(event, None) == NOTHING_FAILED
@@ -366,7 +366,7 @@ def test_a_whole_batch_of_changes(platform: FakePlatform) -> None:
     assert (ServerState.CLOSED, Reason.LOST) in by_status["SpotInterruption"]
 
 
-def test_the_timer_of_the_sweep(platform: FakePlatform) -> None:
+def test_the_timers_event_runs_the_sweep(platform: FakePlatform) -> None:
     platform.dns.records["www.example.org"] = "198.51.100.1"
     assert not any(sweep.handler(aws_events.load("schedule_sweep"), None).values())
     assert platform.dns.records == {"www.example.org": "198.51.100.1"}
@@ -402,7 +402,7 @@ def test_only_the_stop_that_failed_comes_again(platform: FakePlatform) -> None:
     assert not platform.tasks.running
 
 
-def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatform) -> None:
+def test_only_the_task_without_an_address_is_checked_again(platform: FakePlatform) -> None:
     event = aws_events.load("sqs_task_running")
     other = deepcopy(event["Records"][0])
     body = json.loads(other["body"])
@@ -411,7 +411,7 @@ def test_only_the_task_without_an_address_is_looked_at_again(platform: FakePlatf
     body["detail"]["taskArn"] += "0"
     for item in body["detail"]["attachments"][0]["details"]:
         if item["name"] == "networkInterfaceId":
-            item["value"] = "eni-bare"  # the fake's interface that has no address yet
+            item["value"] = "eni-bare"  # this interface has no address in the fake
     for item in body["detail"]["overrides"]["containerOverrides"][0]["environment"]:
         if item["name"] == "USER_ID":
             item["value"] = user
@@ -437,7 +437,7 @@ def test_when_the_names_cannot_be_changed_every_event_of_the_batch_comes_again(p
     assert states(platform, event) == [(ServerState.READY, None)]
 
 
-# What is not ours, and what nobody should know
+# Messages of others, and private content
 
 
 def batch(*bodies: Any) -> dict[str, Any]:
@@ -464,7 +464,7 @@ NOT_OURS = [
 
 
 @pytest.mark.parametrize("queue", QUEUES)
-def test_what_is_not_ours_is_dropped_and_its_content_is_not_logged(
+def test_messages_of_others_are_dropped_and_their_content_is_not_logged(
     platform: FakePlatform, log: io.StringIO, queue: str
 ) -> None:
     event = batch(*NOT_OURS)
@@ -479,14 +479,14 @@ def test_what_is_not_ours_is_dropped_and_its_content_is_not_logged(
     assert not platform.bus.sent
 
 
-def test_the_messages_of_a_batch_that_are_ours_are_done_beside_what_is_not(platform: FakePlatform) -> None:
+def test_valid_messages_of_a_batch_are_handled_beside_others(platform: FakePlatform) -> None:
     ours = {"projectId": PROJECT, "userId": "alice"}
     assert start_server.handler(batch(SECRET, ours, {"userId": 1}), None) == NOTHING_FAILED
     assert len(platform.tasks.running) == 1
 
 
 def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io.StringIO) -> None:
-    """A whole journey, with a failure at every function, in which all that is private bears a mark."""
+    """A whole journey with a failure of every function; all private values contain a mark."""
     user = f"{SECRET}-user"
     get = {**aws_events.load("http_get"), "rawQueryString": f"projectId={PROJECT}&userId={user}&note={SECRET}"}
     post = {**aws_events.load("http_post_form"), "rawQueryString": get["rawQueryString"], "isBase64Encoded": False}
@@ -528,7 +528,7 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
     assert secret not in text
 
 
-# Anything at all
+# Arbitrary input
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
@@ -568,7 +568,7 @@ def mostly(number: int) -> Any:
 @mostly(150)
 @given(records=st.lists(MESSAGES, max_size=4), queue=st.sampled_from(sorted(QUEUES)))
 def test_no_batch_raises_and_only_its_own_messages_come_again(records: list[dict[str, Any]], queue: str) -> None:
-    platform = fresh()
+    platform = new_platform()
     start_server.handler(batch({"projectId": PROJECT, "userId": "alice"}), None)
     failed = QUEUES[queue]({"Records": records}, None)["batchItemFailures"]
     assert {failure["itemIdentifier"] for failure in failed} <= {record["messageId"] for record in records}
@@ -582,8 +582,8 @@ ODD_RECORDS = st.dictionaries(st.sampled_from(["messageId", "body", "attributes"
 @pytest.mark.usefixtures("_put_back")
 @mostly(100)
 @given(records=st.lists(ODD_RECORDS | JSON, max_size=4), queue=st.sampled_from(sorted(QUEUES)))
-def test_records_that_are_none_do_not_raise(records: list[Any], queue: str) -> None:
-    fresh()
+def test_malformed_records_do_not_raise(records: list[Any], queue: str) -> None:
+    new_platform()
     QUEUES[queue]({"Records": records}, None)
 
 
@@ -620,7 +620,7 @@ REQUESTS = st.fixed_dictionaries(
 @mostly(300)
 @given(event=REQUESTS, which=st.sampled_from(sorted(WEB)))
 def test_every_request_gets_an_answer(event: dict[str, Any], which: str) -> None:
-    fresh()
+    new_platform()
     answer = WEB[which](event, None)
     assert 200 <= answer["statusCode"] < 500
     assert isinstance(answer["body"], str)
@@ -633,7 +633,7 @@ def test_every_request_gets_an_answer(event: dict[str, Any], which: str) -> None
 @mostly(100)
 @given(event=st.dictionaries(st.text(max_size=10), JSON, max_size=5), project=JSON | NEARLY)
 def test_any_registration_gets_an_answer(event: dict[str, Any], project: Any) -> None:
-    platform = fresh()
+    platform = new_platform()
     before = dict(platform.documents.kept)
     for given_event in (event, {"project": project}, {**event, "project": {**event, "id": PROJECT}}):
         answer = update_project_master_list.handler(given_event, None)
@@ -641,7 +641,7 @@ def test_any_registration_gets_an_answer(event: dict[str, Any], project: Any) ->
     assert platform.documents.kept == before
 
 
-def test_a_failure_of_ours_is_a_sentence_and_not_a_traceback(platform: FakePlatform) -> None:
+def test_an_internal_failure_shows_a_sentence_and_no_traceback(platform: FakePlatform) -> None:
     def broken(*args: Any) -> Any:
         raise RuntimeError(SECRET)
 
@@ -655,8 +655,8 @@ def test_a_failure_of_ours_is_a_sentence_and_not_a_traceback(platform: FakePlatf
         assert "Traceback" not in answer["body"]
 
 
-def test_names_given_to_the_platform_are_records_of_ours(platform: FakePlatform) -> None:
-    """A follow-up names servers by label only; one that is made up leads nowhere."""
+def test_a_follow_up_with_invalid_labels_changes_no_name(platform: FakePlatform) -> None:
+    """A follow-up names servers by label only; an invalid label has no effect."""
     follow_up = {"change": "C1", "servers": [{"label": "../../etc", "attempt": 1}, {"label": "", "attempt": -5}]}
     assert task_changed.handler(batch(follow_up), None) == NOTHING_FAILED
     assert platform.dns.records == {}
@@ -667,13 +667,15 @@ HANDLERS: list[Callable[[dict[str, Any], object], Any]] = [*QUEUES.values(), *WE
 
 
 @pytest.mark.parametrize("handler", HANDLERS)
-def test_an_empty_event_is_no_trouble(platform: FakePlatform, handler: Callable[[dict[str, Any], object], Any]) -> None:
+def test_an_empty_event_does_not_raise(
+    platform: FakePlatform, handler: Callable[[dict[str, Any], object], Any]
+) -> None:
     assert isinstance(handler({}, None), dict)
 
 
 @pytest.mark.parametrize("handler", [next_step, send_start_server_message, send_stop_server_message])
 @pytest.mark.parametrize("method", ["GET", "POST", "OPTIONS", "PUT"])
-def test_over_https_browsers_are_told_to_stay_there_and_over_http_they_are_not(handler: Any, method: str) -> None:
+def test_responses_over_https_have_strict_transport_security_and_others_do_not(handler: Any, method: str) -> None:
     installed.use(studies.installed())
     said = []
     for headers in ({"x-forwarded-proto": "https"}, {"x-forwarded-proto": "http"}, {}):

@@ -1,4 +1,4 @@
-"""What an attacker would send, and how to see whether it worked: shared by the tests of this folder."""
+"""Input of an attacker, and checks whether it had an effect, for the tests of this folder."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ MINE = "alice"
 
 
 def study(**changes: object) -> Project:
-    """Like the example, with pages that show back all that a participant sends."""
+    """A study like the example, whose pages show all that a participant has sent."""
     pages = ("mirror", "game", "mirror", "mirror")
     steps = [Step("1", "consent", 2), *map(Step, ("2", "3", "4", "finalStep"), pages)]
     return studies.study(steps=steps, secret="the-project-secret-f00d", **changes)
@@ -90,7 +90,7 @@ def installed(**changes: object) -> FakePlatform:
 
 
 class _Tags(HTMLParser):
-    """All tags, attributes and scripts of a page."""
+    """Collects all tags, attributes and scripts of a page."""
 
     def __init__(self) -> None:
         super().__init__(convert_charrefs=True)
@@ -109,7 +109,7 @@ class _Tags(HTMLParser):
 
 
 def check_html(text: str, *, whole: bool = True) -> None:
-    """Nothing that a participant sent became markup, script, an address or a template."""
+    """Check that no input of a participant became markup, script, an address or a template."""
     page = _Tags()
     page.feed(text)
     page.close()
@@ -117,7 +117,7 @@ def check_html(text: str, *, whole: bool = True) -> None:
         assert "xss" not in tag, tag
         for name, value in attributes.items():
             assert "xss" not in name, (tag, name)
-            if name in ("action", "href", "src") and tag != "link":  # our icon is written in the page
+            if name in ("action", "href", "src") and tag != "link":  # the icon is a part of the page
                 assert value, (tag, name)
                 assert re.match(r"/(?![/\\])", value), (tag, name, value)
     for attributes, script in page.scripts:
@@ -131,14 +131,14 @@ def check_html(text: str, *, whole: bool = True) -> None:
 
 
 def body_of(answer: dict[str, Any]) -> bytes:
-    """The bytes that a browser would see."""
+    """The bytes that a browser would receive."""
     raw = answer["body"]
     data = base64.b64decode(raw, validate=True) if answer["isBase64Encoded"] else raw.encode()
     return gzip.decompress(data) if answer["headers"].get("Content-Encoding") == "gzip" else data
 
 
 def check_headers(headers: dict[str, str]) -> None:
-    """Plain names and plain values; no second header in either, and no way to another host."""
+    """Check the headers: plain names and values, no second header in a value, and no redirect to another host."""
     for name, value in headers.items():
         assert re.fullmatch(r"[A-Za-z-]{1,40}", name), name
         assert "xss" not in name.lower()
@@ -149,7 +149,7 @@ def check_headers(headers: dict[str, str]) -> None:
 
 
 def check_answer(answer: dict[str, Any]) -> int:
-    """Everything that must hold for any answer of an HTTP handler; its status."""
+    """Check all that must hold for any answer of an HTTP handler; returns its status."""
     status = answer["statusCode"]
     assert 200 <= status < 500, answer
     assert len(json.dumps(answer).encode()) < 6 * 1024 * 1024, "more than Lambda hands on"

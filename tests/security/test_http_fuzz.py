@@ -33,9 +33,7 @@ from testing.fake_platform import FakePlatform
 from tests.security import hostile
 from tests.security.hostile import MINE, PROJECT, TEXTS, VICTIM
 
-VISITS = (
-    150 if not exploration.TIMES else 460 * exploration.TIMES
-)  # of up to twelve requests each, by a visitor of their own
+VISITS = 150 if not exploration.TIMES else 460 * exploration.TIMES  # each of up to twelve requests, by a new visitor
 REQUESTS = 10 * VISITS  # at least
 RAW = 500
 PATIENCE = 2.0  # seconds; some requests promise more than they send
@@ -69,7 +67,7 @@ def _query(fields: list[tuple[str, str]], encode: Any) -> str:
     return "&".join(_field(name, value, encode) for name, value in fields)
 
 
-# Mostly what fits, so that the deeper rooms of the house are visited too.
+# Mostly valid values, so that the requests also reach code behind the first checks.
 pairs = st.tuples(st.sampled_from(FIELDS) | texts, st.sampled_from([PROJECT, MINE, "bob", "3"]) | texts)
 encodings = st.sampled_from(
     [quote_plus, quote, lambda text: text, lambda text: text.encode("utf-16", "replace").hex("%")]
@@ -189,7 +187,7 @@ whole = st.sampled_from([True, False, False, False, False])
 
 
 def _near(method: str, form: dict[str, Any] | str, header: dict[str, str], query: str, coded: bool) -> dict[str, Any]:
-    """A request that is what it should be but for what the visitor wrote."""
+    """A valid request, except for what the visitor wrote."""
     text = form if isinstance(form, str) else json.dumps(form) if header["content-type"] == JSON else _form(form)
     body = base64.b64encode(text.encode("utf-8", "surrogatepass")).decode() if coded else text
     return _event(method, "/next", query, header, body, coded)
@@ -229,7 +227,7 @@ STUDIES = st.sampled_from([{}, {}, LIMITS, {"signed_links": True}, {"signed_link
 
 
 def _world(**changes: Any) -> FakePlatform:
-    """The study, a participant with a running server, and one whom the attacker does not know."""
+    """A platform with the study, a participant with a running server, and another one whom the attacker does not know."""
     platform = hostile.installed(**changes)
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
         arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())
@@ -251,7 +249,7 @@ def _only_what_may_be_written(before: dict[str, Any], platform: FakePlatform) ->
 
 
 def _deliver(platform: FakePlatform) -> None:
-    """What the functions behind the queues make of the messages that the visit caused."""
+    """Deliver the messages of the visit to the functions behind the queues."""
     for topic, handler in ((Topic.START, start_server.handler), (Topic.STOP, stop_server.handler)):
         messages = [message for sent, message in platform.bus.sent if sent is topic]
         for message in messages:
@@ -278,8 +276,8 @@ def _put_back() -> Iterator[None]:
 @pytest.mark.usefixtures("_put_back")
 @pytest.mark.timeout(600)
 @pytest.mark.explores
-def test_thousands_of_hostile_requests(capsys: pytest.CaptureFixture[str]) -> None:
-    """No 5xx, no exception, nothing unescaped, no header of the attacker's, no document but the visitor's own."""
+def test_thousands_of_hostile_requests_have_no_effect(capsys: pytest.CaptureFixture[str]) -> None:
+    """There is no status 5xx, no exception, no unescaped text, no header of the attacker's, and no changed document but the visitor's own."""
     seen: Counter[str] = Counter()
     statuses: Counter[int] = Counter()
     said = io.StringIO()
@@ -313,7 +311,7 @@ def test_thousands_of_hostile_requests(capsys: pytest.CaptureFixture[str]) -> No
     log = said.getvalue()
     assert "request failed" not in log
     for line in log.splitlines():
-        json.loads(line)  # no line of the attacker's
+        json.loads(line)  # no line is the attacker's
     assert "xss" not in log
     assert MINE not in log
 
@@ -332,11 +330,11 @@ class Site:
         self.server.start()
 
     def ask(self, raw: bytes, patience: float = PATIENCE) -> bytes:
-        """Send bytes and read until the server has no more to say, or waits for more than it was sent."""
+        """Send bytes, and read until the server closes the connection or waits for more."""
         host, port = self.server.url.removeprefix("http://").split(":")
         got = b""
         with socket.create_connection((host, int(port)), timeout=patience) as asked, contextlib.suppress(OSError):
-            asked.sendall(raw)  # an error: it had heard enough
+            asked.sendall(raw)  # the server has answered with an error before it read all
             while more := asked.recv(65536):
                 got += more
         return got
@@ -351,7 +349,7 @@ def site() -> Iterator[Site]:
 
 
 def _raw(chance: random.Random) -> bytes:
-    """Bytes that are nearly an HTTP request."""
+    """Bytes that are almost an HTTP request."""
     text = chance.choice(TEXTS).encode("utf-8", "surrogatepass")
     other = quote(chance.choice(TEXTS).encode("utf-8", "surrogatepass")).encode()
     path = chance.choice([
@@ -380,8 +378,8 @@ def _raw(chance: random.Random) -> bytes:
 
 
 @pytest.mark.timeout(120)
-def test_hundreds_of_raw_requests_over_a_socket(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
-    """The same through a real HTTP server: whatever the bytes, an answer below 500 or a closed connection."""
+def test_hundreds_of_raw_requests_over_a_socket_have_no_effect(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    """Through a real HTTP server: any bytes get a status below 500 or a closed connection."""
     chance = random.Random(20261121)
     before = copy.copy(site.platform.documents.kept)
     statuses: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""What single hostile requests come to: paths, nesting, names, compression, other origins, guesses."""
+"""Single hostile requests have no effect: paths, nesting, names, compression, other origins, guesses."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def test_a_path_becomes_neither_a_header_nor_another_host(platform: FakePlatform
     location = send(query=f"projectId={PROJECT}", path=path)["headers"]["Location"]
     assert re.fullmatch(r"/([!-.0-\[\]-~][!-\[\]-~]*)?\?projectId=maze&userId=[0-9a-f]{24}", location)
     page = send(path=path)["body"]
-    assert re.search(r'action="(/[^"]*)"', page)  # `check_answer` has seen where it leads
+    assert re.search(r'action="(/[^"]*)"', page)  # `check_answer` has checked the address
 
 
-def test_a_link_with_half_a_character_is_refused(platform: FakePlatform) -> None:
-    """Half of a surrogate pair can be neither stored nor sent back."""
+def test_a_link_with_half_a_surrogate_pair_is_refused(platform: FakePlatform) -> None:
+    """One half of a surrogate pair can be neither stored nor sent back."""
     before = dict(platform.documents.kept)
     for query in (f"{LINK}&note=\ud800", f"projectId={PROJECT}&note=\ud800", f"{LINK}&note=%ed%a0%80"):
         assert send(query=query)["statusCode"] == 400
@@ -80,7 +80,7 @@ def test_a_link_with_half_a_character_is_refused(platform: FakePlatform) -> None
 
 
 def nested(depth: int, inside: str = "1") -> str:
-    """A JSON object with so many levels, itself included."""
+    """A JSON object with so many levels, including itself."""
     return '{"a":' + "[" * (depth - 1) + inside + "]" * (depth - 1) + "}"
 
 
@@ -93,7 +93,7 @@ def test_answers_nested_too_deeply_are_refused(platform: FakePlatform) -> None:
 
 
 def test_a_small_body_does_not_become_a_huge_document(platform: FakePlatform) -> None:
-    """Documents are indented: a line for each of these numbers, and a space in it for each level."""
+    """Documents are indented: each of these numbers has its own line, with a space for each level."""
     send()
     body = nested(MAX_DEPTH, "1" + ",1" * 120_000)
     assert len(body) < 256 * 1024
@@ -101,7 +101,7 @@ def test_a_small_body_does_not_become_a_huge_document(platform: FakePlatform) ->
     assert len(platform.documents.kept[f"{PROJECT}/users/{MINE}/answers/1.json"][0]) < 4_000_000
 
 
-def test_a_number_that_cannot_be_kept_is_refused(platform: FakePlatform) -> None:
+def test_a_number_that_cannot_be_stored_is_refused(platform: FakePlatform) -> None:
     send()
     for number in ("1e999", "-1e999", "NaN", "Infinity", "9" * 5_000):
         assert send("POST", body=f'{{"a": [{number}]}}', content_type=JSON)["statusCode"] == 400
@@ -109,7 +109,7 @@ def test_a_number_that_cannot_be_kept_is_refused(platform: FakePlatform) -> None
 
 
 def test_a_compressed_body_is_never_unpacked(platform: FakePlatform) -> None:
-    """So a zip bomb is a few bytes that are no form."""
+    """So a zip bomb is only a few bytes that are no form."""
     send()
     bomb = gzip.compress(b"a=" + b"0" * 30_000_000)
     for kind in (FORM, JSON):
@@ -141,7 +141,7 @@ def test_a_compressed_body_is_never_unpacked(platform: FakePlatform) -> None:
     ],
 )
 def test_no_path_leads_to_another_document(platform: FakePlatform, path: str) -> None:
-    """Keys that S3 would refuse (longer than 1,024 bytes) are not asked for either: the error would be ours."""
+    """Nor are keys requested that S3 would refuse (longer than 1,024 bytes): that would be an error in the function."""
     platform.documents.put("SSL/privkey.pem", b"secret")
     platform.documents.put(f"{PROJECT}/steps/.svg", b"<svg/>")
     asked = []
@@ -159,11 +159,11 @@ def test_a_picture_with_a_script_in_it_is_sandboxed(platform: FakePlatform) -> N
     assert answer["headers"]["X-Content-Type-Options"] == "nosniff"
 
 
-# Who one is
+# Identity
 
 
-def test_no_cookie_is_set_or_believed(platform: FakePlatform) -> None:
-    """What another site makes a browser send carries nothing that the site does not know itself."""
+def test_no_cookie_is_set_or_accepted(platform: FakePlatform) -> None:
+    """A request that another site makes a browser send contains nothing that the other site does not know."""
     send()
     cookie = f"userId={MINE}; projectId={PROJECT}"
     before = dict(platform.documents.kept)
@@ -175,8 +175,8 @@ def test_no_cookie_is_set_or_believed(platform: FakePlatform) -> None:
     assert platform.documents.kept == before
 
 
-def test_another_sites_form_answers_no_step_but_the_one_that_is_due(platform: FakePlatform) -> None:
-    """It has no ticket. Without somebody's id it reaches nobody; with it, it can do what the id's owner could do now."""
+def test_another_sites_form_answers_only_the_step_that_is_due(platform: FakePlatform) -> None:
+    """It has no ticket. Without an id it reaches no participant; with one it can do only what that participant could do now."""
     send()
     other = {"origin": "https://xss.example", "referer": "https://xss.example/"}
     for forged in ("", "0" * 32, ids.ticket("guessed", MINE, "4"), ids.ticket(hostile.study().secret, "bob", "4")):
@@ -196,7 +196,7 @@ def test_a_form_sent_again_later_changes_nothing(platform: FakePlatform) -> None
 
 
 def test_a_stop_sent_again_does_not_reach_the_next_server(platform: FakePlatform) -> None:
-    """A replayed relay with the token of a server that is gone proves nothing, and its message names its attempt."""
+    """A repeated request to the relay has the token of an ended server, which is no proof any more, and its message names the attempt."""
     keys = SecretCache(platform.documents)
     keys.get_or_create()
     earlier, claim = (
@@ -219,8 +219,8 @@ def _plain(record: Server) -> Any:
     return msgspec.to_builtins(record)
 
 
-def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatform) -> None:
-    """Tokens hold 192 bits, tickets 128, made-up ids 96, completion codes 50 of an HMAC."""
+def test_tokens_tickets_ids_and_codes_are_long_and_never_repeat(platform: FakePlatform) -> None:
+    """Tokens have 192 bits, tickets 128, generated ids 96, completion codes 50 of an HMAC."""
     tokens, made_up = set(), set()
     for number in range(20):
         batch = aws_events.sqs_event(
@@ -238,15 +238,15 @@ def test_what_must_not_be_guessed_is_long_and_never_the_same(platform: FakePlatf
     assert len(ids.completion_code("s", "u")) == 10
 
 
-def test_a_page_may_not_be_put_into_somebody_elses(platform: FakePlatform) -> None:
-    """So nobody can make participants click on what they do not see."""
+def test_a_page_may_not_be_framed_by_another_site(platform: FakePlatform) -> None:
+    """So no other site can make participants click on something that they do not see."""
     assert "frame-ancestors 'none'" in send()["headers"]["Content-Security-Policy"]
 
 
-# Strangers and money
+# Costs that strangers could cause
 
 
-def test_a_signed_link_lets_in_nobody_but_whom_it_was_made_for() -> None:
+def test_a_signed_link_lets_in_only_its_own_participant() -> None:
     platform = hostile.installed(signed_links=True)
     installed.use(platform)
     before = dict(platform.documents.kept)
@@ -269,7 +269,7 @@ def test_a_signed_link_lets_in_nobody_but_whom_it_was_made_for() -> None:
     installed.use(None)
 
 
-def test_a_thousand_made_up_ids_do_not_get_past_the_limit() -> None:
+def test_a_thousand_invented_ids_do_not_exceed_the_limit() -> None:
     platform = hostile.installed(max_participants=5)
     installed.use(platform)
     for number in range(1_000):
@@ -279,8 +279,8 @@ def test_a_thousand_made_up_ids_do_not_get_past_the_limit() -> None:
     installed.use(None)
 
 
-def test_those_who_only_look_cost_nothing(platform: FakePlatform) -> None:
-    """Crawlers, prefetching browsers, HEAD, and the previews of Mechanical Turk: nothing is written, nothing started."""
+def test_visitors_who_only_look_cost_nothing(platform: FakePlatform) -> None:
+    """Crawlers, prefetching browsers, HEAD, and Mechanical Turk's previews: nothing is written or started."""
     before = dict(platform.documents.kept)
     send("HEAD")
     send(sec_purpose="prefetch;prerender")
@@ -290,7 +290,7 @@ def test_those_who_only_look_cost_nothing(platform: FakePlatform) -> None:
     assert not platform.bus.sent
 
 
-# What is told
+# Logs and metrics
 
 
 def test_metrics_hold_no_id(
@@ -308,7 +308,7 @@ def test_metrics_hold_no_id(
     assert ids.server_label(PROJECT, MINE) not in line
 
 
-def test_an_error_of_ours_tells_neither_id_nor_answer_nor_place(platform: FakePlatform, log: io.StringIO) -> None:
+def test_an_internal_error_shows_no_id_no_answer_and_no_path(platform: FakePlatform, log: io.StringIO) -> None:
     def broken(*args: Any, **kwargs: Any) -> Any:
         raise RuntimeError(f"{MINE} answered xss-answer")
 

@@ -1,4 +1,4 @@
-"""An agent.py that means harm, on a real server: it knows all that its server knows, and gets nothing of anybody else's."""
+"""A malicious agent.py on a real server: it knows all that its server knows, and gets no data of other participants."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MALLORY, ALICE = "mallory", "alice"
 SECRETS = ("alice's answer", "the other project's answer", "alice's recording", "the master list", "alice's token")
 
-# Runs as the researcher's code does: imported by the trial, in its process. It writes what it got into a file.
+# It runs as the researcher's code does: the trial imports it into its process. It writes what it got into a file.
 ATTACK = r'''
 import gc, http.client, json, os, re, sys, urllib.parse
 from pathlib import Path
@@ -102,7 +102,7 @@ if "plan.json" in os.listdir(Path(__file__).parent):
 
 
 class Site(StrictS3):
-    """Two participants and another project, each with what nobody else may have."""
+    """Two participants and another project, each with data that no other may have."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -136,7 +136,7 @@ class Site(StrictS3):
 
     @property
     def others(self) -> list[str]:
-        """What is not Mallory's: documents that exist, and places where one could be planted."""
+        """Keys that are not Mallory's: of existing documents, and of documents that could be added."""
         warm_server = handover_key("maze", self.warm_server.name)
         planted = [
             "maze/users/alice/answers/3.json", "other/users/mallory/answers/3.json", "maze/users/mallory/answers/4.json",
@@ -157,7 +157,7 @@ def site() -> Iterator[Site]:
 
 @pytest.fixture
 def got(site: Site, tmp_path: Path) -> dict[str, Any]:
-    """What the agent got, on a server that was started as start_server starts them."""
+    """The data that the agent got, on a server that was started as start_server starts it."""
     (tmp_path / "agent.py").write_text(ATTACK)
     plan = {
         "bucket": BUCKET,
@@ -181,7 +181,7 @@ def got(site: Site, tmp_path: Path) -> dict[str, Any]:
     return found
 
 
-def test_an_agent_that_means_harm_gets_nothing_of_anybody_elses(site: Site, got: dict[str, Any]) -> None:
+def test_a_malicious_agent_gets_no_data_of_others(site: Site, got: dict[str, Any]) -> None:
     assert set(got["refused"].values()) <= {400, 403}
     assert len(got["refused"]) >= 5 * len(set(site.others))
     assert set(got["plain"].values()) == {403}
@@ -190,12 +190,12 @@ def test_an_agent_that_means_harm_gets_nothing_of_anybody_elses(site: Site, got:
     assert not any(secret in json.dumps(got) for secret in SECRETS)
 
 
-def test_its_own_requests_cannot_be_turned_to_anything_else(got: dict[str, Any]) -> None:
+def test_a_malicious_agents_own_requests_cannot_be_changed_to_others(got: dict[str, Any]) -> None:
     assert len(got["turned"]) == 10
     assert {name: status for name, status in got["turned"].items() if status != 403} == {}
 
 
-def test_it_may_store_its_own_answer_once(site: Site, got: dict[str, Any]) -> None:
+def test_a_malicious_agent_may_store_its_own_answer_once(site: Site, got: dict[str, Any]) -> None:
     assert got["own"] == [200, 412]
     assert got["read back"] == "{}"
     changed = {key for key, kept in site.documents.kept.items() if site.before.get(key) != kept}

@@ -27,7 +27,7 @@ odd = st.sampled_from([*TEXTS, None, 0, 1, -1, True, 2**63, 10**400, 1e308, [], 
 
 
 def disguised(text: str) -> list[str]:
-    """What might be taken for the text, or for something else, by who reads it less strictly."""
+    """Variants of the text that a less strict reader might take for it."""
     return [
         text, f"{text}\n", f"{text}\0", f" {text}", f"/{text}", f"{text}/", f"./{text}", text.upper(), text.replace("/", "//"), text.replace("/", "%2F"),
         text.replace("/", "\\"), text.replace("3", "\uff13"), text.replace("1", "01"), text.replace("-", "_"), f"{text}#", f"{text}?x", f"{text}/../{text}",
@@ -72,7 +72,7 @@ def send(body: str) -> dict[str, Any]:
 
 
 def check(body: str) -> int:
-    """Send it; nothing was signed but what a server may have. The status."""
+    """Send the body, and check that only the server's own documents were signed; returns the status."""
     answer = send(body)
     assert answer["statusCode"] in (200, 400, 403, 413)
     if answer["statusCode"] != 200:
@@ -93,11 +93,11 @@ def check(body: str) -> int:
 
 @settings(max_examples=BODIES, deadline=None)
 @given(bodies)
-def test_nobody_gets_anything_by_whatever_they_send(body: str) -> None:
+def test_no_body_gets_a_request_for_another_document(body: str) -> None:
     check(body)
 
 
-def test_a_key_that_looks_like_ones_own_is_not() -> None:
+def test_a_key_that_only_looks_like_the_servers_own_is_refused() -> None:
     wishes = [{"method": method, "key": key, "size": 1} for method in ("GET", "PUT") for key in NEAR]
     statuses = [check(_json({"server": OWN, "credential": CREDENTIAL, "requests": [wish]})) for wish in wishes]
     assert statuses.count(200) == len(READ) + len(CREATED)
@@ -105,6 +105,6 @@ def test_a_key_that_looks_like_ones_own_is_not() -> None:
 
 
 @pytest.mark.parametrize("name", [one for one in disguised(OWN) if one != OWN])
-def test_a_name_that_looks_like_ones_own_is_not(name: str) -> None:
+def test_a_name_that_only_looks_like_the_servers_own_is_refused(name: str) -> None:
     wish = {"method": "GET", "key": ANSWER}
     assert check(_json({"server": name, "credential": CREDENTIAL, "requests": [wish]})) == 403

@@ -49,7 +49,7 @@ def test_each_threat_has_a_test_that_exists(cells: list[str]) -> None:
         assert name in names_in(file), name
 
 
-def test_what_everybody_fears_is_there() -> None:
+def test_the_known_threats_are_listed() -> None:
     text = "\n".join(cells[0] for cells in THREATS).lower()
     assert len(THREATS) >= 40
     for word in (
@@ -60,8 +60,8 @@ def test_what_everybody_fears_is_there() -> None:
         assert word in text, word
 
 
-def test_nothing_of_this_folder_is_left_out() -> None:
-    """A test here that no threat names is either needless or missing in the page."""
+def test_the_page_names_every_test_of_these_files() -> None:
+    """A test in these files that no threat names is either unnecessary or missing in the page."""
     named = {name for cells in THREATS for _, name in NAMED.findall(cells[3])}
     for file in ("security/test_requests.py", "security/test_http_fuzz.py", "trial/test_trial_crowds.py"):
         assert names_in(file) <= named, names_in(file) - named

@@ -1,4 +1,4 @@
-"""What the tests of this folder share."""
+"""A fixture for the tests of this folder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from testing.quiet_log import quiet
 
 @pytest.fixture(autouse=True)
 def _quiet() -> Iterator[None]:
-    """Thousands of faults would be logged."""
+    """Log nothing: the tests cause thousands of faults."""
     with quiet():
         yield

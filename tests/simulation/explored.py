@@ -1,4 +1,4 @@
-"""Faults at the calls of a journey, and the same without what repairs them."""
+"""Faults at the calls of a journey, with and without the mechanisms that repair them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from testing.simulation.world import SimulatedWorld
 
 
 def assert_no_fault_does_harm(journey: SimulatedJourney, seed: int, tried: int | None = None) -> None:
-    """A fault at so many of the calls, at a thirtieth without a number: each run ends well."""
+    """Run the journey with a fault at so many of its calls (without a number, at a thirtieth of them): each run must end well."""
     points = faults.points(journey, seed)
     assert len(points) > 100
     tried = tried or max(24 * len(faults.FAULTS), len(points) // 30)
@@ -22,7 +22,7 @@ def assert_no_fault_does_harm(journey: SimulatedJourney, seed: int, tried: int |
 
 
 def assert_faults_do_harm_without_repair(journey: SimulatedJourney, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The exploration sees what it should: the same faults, without a sweep and a second delivery."""
+    """Check that the exploration notices damage: the same faults, without the sweep and without a second delivery."""
     monkeypatch.setattr(SimulatedWorld, "_sweep", lambda world: None)
     monkeypatch.setattr(SimulatedWorld, "RECEIVES", 1)
     assert any(not outcome.well for outcome in faults.explore(journey, seed))

@@ -1,7 +1,7 @@
 """A study that is registered again and again with other numbers of players, while participants wait and play.
 
-What happens, and in which order, is drawn from a seed: pages are loaded, polled and left, messages come late, twice or not
-at all, servers are lost, and half of the functions know a registration only some seconds later.
+The events and their order are drawn from a seed: pages are loaded, polled and left; messages come late, twice or not
+at all; servers are lost; and half of the functions know a registration only some seconds later.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from testing.studies import installed, study
 from testing.visitors import hidden
 from tests.hippodrome.servers.delivery import events
 
-RELOADED_AFTER = timedelta(seconds=240)  # of waiting, as web/game/main.js has it
-NOT_PLAYED = timedelta(minutes=10)  # after which a server ends by itself
-ABSENT = timedelta(minutes=2)  # for which a game waits for the other members
+RELOADED_AFTER = timedelta(seconds=240)  # a waiting page is loaded again after this time, as in web/game/main.js
+NOT_PLAYED = timedelta(minutes=10)  # a server without players ends by itself after this time
+ABSENT = timedelta(minutes=2)  # a game waits for other members for this time
 
 
 class World:
-    """Participants, two of each function with caches of their own, and the one who registers."""
+    """The participants, two instances of each function with their own caches, and the researcher."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)
@@ -51,14 +51,14 @@ class World:
         self.servers = [Servers(self.platform) for _ in range(2)]
         self.repository = Repository(self.platform.documents)
         self.people = [Participant(self, f"p{number}") for number in range(self.chance.randint(2, 5))]
-        self.played: dict[str, datetime] = {}  # by owner of a server, when somebody was there last
+        self.played: dict[str, datetime] = {}  # by owner of a server: when a player was last connected
 
     def _registration(self, players: int) -> Project:
         trial = {"game": "x", "players": {"abc"[n]: "human" for n in range(players)} if players > 1 else None}
         return study(players=players, trial=trial, **self.more)
 
     def happens(self, steps: int) -> None:
-        """Let so many seconds, or some more, pass with all that may go wrong."""
+        """Let so many steps of one to three seconds pass, with all kinds of faults."""
         for _ in range(steps):
             self.platform.wait(seconds=self.chance.choice([1, 2, 3]))
             for one in self.people:
@@ -75,7 +75,7 @@ class World:
                 Sweep(self.platform).run()
 
     def end(self) -> None:
-        """From now on everything works. AssertionError if a participant does not get to the end within an hour."""
+        """From now on there are no faults. AssertionError if a participant does not get to the end within an hour."""
         for step in range(1_800):
             self.platform.wait(seconds=2)
             for one in self.people:
@@ -90,7 +90,7 @@ class World:
         raise AssertionError([(one.user, one.step, one.state) for one in self.people])
 
     def left_over(self) -> list[str]:
-        """What is left of servers an hour after the end."""
+        """The servers, tasks and names that are left an hour after the end."""
         for _ in range(12):
             self.platform.wait(minutes=5)
             self._deliver()
@@ -102,7 +102,7 @@ class World:
         return [*opened, *(task.name for task in self.platform.tasks.running.values()), *self.platform.dns.records]
 
     def members(self) -> list[str]:
-        """The members of all sessions."""
+        """The participants in all sessions, once for each session."""
         entries = self.platform.documents.list(sessions_folder("maze"))
         found = [self.repository.session("maze", entry.key.split("/")[2]) for entry in entries]
         return [user for session in found if session for user in session.user_ids]
@@ -143,7 +143,7 @@ class World:
             what = self.chance.random() if may_fail else 1
             if what < 0.5:
                 bus.publish(topic, message)  # later, or twice
-            if what > 0.1 and not 0.5 < what < 0.53:  # else it is late or lost
+            if what > 0.1 and not 0.5 < what < 0.53:  # otherwise it is late or lost
                 self._handle(topic, message)
         changes = [messages.parse_dns_changed(json.loads(json.dumps(message))) for _, message in later]
         self.chance.choice(self.servers).dns_changed(*filter(None, changes))
@@ -176,14 +176,14 @@ class World:
                 continue
             owner = stored.server.user_id
             if stored.server.is_sessions and self.repository.session("maze", owner) is None:
-                continue  # it waits for its session
+                continue  # the server waits for its session
             since = max(stored.server.ready, self.played.get(owner, stored.server.ready))
             if self.platform.now() - since > NOT_PLAYED:
                 del self.platform.tasks.running[event.task]
                 self.chance.choice(self.servers).tasks_changed([event])
 
     def _play(self) -> None:
-        """The trials: who is connected plays, until the game is over for all members."""
+        """The trials: connected participants play, until the game is over for all members."""
         for owner in sorted({one.server for one in self.people if one.server}):
             there = [one for one in self.people if one.server == owner]
             record = self.repository.server_of("maze", owner)
@@ -202,7 +202,7 @@ class World:
 
 
 class Participant:
-    """A browser: the page that it shows, what that does by itself, and what people do with it."""
+    """A participant's browser: the page that it shows, the page's own requests, and the participant's actions."""
 
     def __init__(self, world: World, user: str) -> None:
         self.world, self.user, self.eager = world, user, world.chance.choice([0.2, 0.6, 0.9])
@@ -214,7 +214,7 @@ class Participant:
         self._polls: list[str] = []
 
     def act(self, *, may_stray: bool = False) -> None:
-        """What comes next."""
+        """Do the next action."""
         stray = self.world.chance.random() if may_stray and self.page else 1
         if stray < 0.03:
             if self.state == "lobby" and stray < 0.02:
@@ -246,7 +246,7 @@ class Participant:
             self._polls.append(urlsplit(self.data["poll"]).query)
 
     def _poll(self) -> None:
-        """As `web/game/main.js` and `lobby.js` do."""
+        """Poll as `web/game/main.js` and `lobby.js` do."""
         told = self._ask(urlsplit(self.data["poll"]).query)
         was, self.state, first = self.state, told["state"], self.data["state"]
         is_over = self.state in ("ended", "failed")

@@ -1,4 +1,4 @@
-"""Whatever number of players a study is registered with next: all participants get to the end, and no server is left."""
+"""A study is registered again with any number of players: all participants get to the end, and no server is left."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FOUND = {43, 85, 264}
 
 @pytest.mark.explores
 @pytest.mark.parametrize("seed", sorted({*sample(range(1_000), 25), *FOUND}))
-def test_all_get_to_the_end_and_no_server_is_left(seed: int) -> None:
+def test_all_participants_get_to_the_end_and_no_server_is_left(seed: int) -> None:
     world = World(seed)
     world.happens(steps=(20, 60, 150)[seed % 3])
     world.end()

@@ -1,4 +1,4 @@
-"""The simulated AWS does to its users what AWS's documents and public reports say: each fact by itself."""
+"""The simulated AWS behaves as AWS's documents and public reports say: one test for each fact."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def sends_itself(small, bodies):
     small.again(bodies[0])
 
 
-def test_the_invocation_after_the_sixteenth_of_a_chain_is_dropped_and_its_message_ends_as_a_dead_letter():
+def test_lambda_drops_the_seventeenth_invocation_of_a_chain_and_its_message_becomes_a_dead_letter():
     small = Small(sends_itself)
     small.queue.send({})
     small.clock.run(30)
@@ -74,7 +74,7 @@ def test_the_invocation_after_the_sixteenth_of_a_chain_is_dropped_and_its_messag
     assert small.cloud.dropped == {"one": RECEIVES}, "each receive of it is refused"
 
 
-def test_a_function_that_may_loop_goes_on():
+def test_a_function_that_may_loop_is_not_dropped():
     small = Small(sends_itself, loops=True)
     small.queue.send({})
     small.clock.run(60)
@@ -82,7 +82,7 @@ def test_a_function_that_may_loop_goes_on():
     assert not small.cloud.dropped
 
 
-def test_a_batch_has_the_highest_count_of_its_messages_and_hands_it_on():
+def test_a_batch_has_the_highest_count_of_its_messages_and_passes_it_on():
     small = Small(lambda small, bodies: small.again("old") if "old" in bodies else None, BATCH)
     small.queue.send("old")
     for second in range(2, 40, 2):
@@ -92,7 +92,7 @@ def test_a_batch_has_the_highest_count_of_its_messages_and_hands_it_on():
     assert small.queue.waiting > 1, "messages of other chains are refused with it"
 
 
-def test_messages_that_are_sent_by_nobody_begin_a_chain():
+def test_messages_that_no_function_sends_begin_a_chain():
     seen: list[Lineage] = []
     small = Small(lambda small, bodies: seen.append(lineage()))
     small.queue.send({}, lineage={"other": 3})
@@ -102,7 +102,7 @@ def test_messages_that_are_sent_by_nobody_begin_a_chain():
     assert lineage() == {}
 
 
-def test_an_event_of_ecs_begins_a_chain_also_when_a_function_has_caused_it():
+def test_an_event_of_ecs_begins_a_chain_even_if_a_function_has_caused_it():
     world = SimulatedWorld(1)
     sent = []
     world.platform.tasks.changed = lambda *sending: sent.append(sending)
@@ -113,7 +113,7 @@ def test_an_event_of_ecs_begins_a_chain_also_when_a_function_has_caused_it():
     assert all(len(sending) == 2 for sending in sent), "the event and its delay, no lineage"
 
 
-def test_who_may_loop_stands_in_the_template():
+def test_the_template_allows_a_loop_only_to_task_changed():
     assert {"task_changed"} == LOOPS
 
 
@@ -143,7 +143,7 @@ def test_messages_that_are_throttled_at_every_receive_are_dead_letters():
     assert [held.body for held in small.queue.dead] == ['"never"']
 
 
-def test_a_mapping_fetches_no_more_than_it_may_hand_on():
+def test_a_mapping_receives_only_messages_that_it_can_pass_on():
     small = Small(sleeps, ONE, concurrency=2)
     for _ in range(20):
         small.queue.send({})
@@ -152,7 +152,7 @@ def test_a_mapping_fetches_no_more_than_it_may_hand_on():
     assert small.cloud.throttled["lambda:Invoke"] == 0
 
 
-def test_what_a_timer_invokes_waits_for_room():
+def test_an_invocation_by_a_timer_waits_for_free_executions():
     small = Small(lambda small, bodies: None, concurrency=0)
     small.clock.spawn(lambda: small.function.later({"Records": []}))
     small.clock.run(20)
@@ -162,7 +162,7 @@ def test_what_a_timer_invokes_waits_for_room():
     assert len(small.seen) == 1
 
 
-def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
+def test_the_gateway_answers_a_page_request_without_a_free_execution():
     world = SimulatedWorld(1, concurrency=0)
     answers = []
     world.clock.spawn(lambda: answers.append(world.ask("GET", "projectId=study&userId=a")))
@@ -174,7 +174,7 @@ def test_a_page_for_which_there_is_no_room_is_answered_by_the_gateway():
 
 
 def told(conditions, seconds=300.0):
-    """The events of one task on Spot, as they come."""
+    """The events of one task on Spot, in the order in which they come."""
     world = SimulatedWorld(2, conditions)
     found = []
     world.platform.tasks.changed = lambda event, delay: found.append(event["detail"])
@@ -195,12 +195,12 @@ def test_events_of_an_interruption_may_lack_their_stop_code():
         assert {event["stoppedReason"] for event in ending} == {"Your Spot Task was interrupted."}
 
 
-def test_events_may_never_come():
+def test_events_may_be_lost():
     assert told(Conditions(lost=1.0)) == []
     assert told(Conditions()) != []
 
 
-def test_an_address_may_be_seen_later_than_its_task():
+def test_ec2_may_show_an_address_later_than_its_task():
     world = SimulatedWorld(3, Conditions(late_addresses=1.0, address_late=(10.0, 10.0)))
     tasks, found = world.platform.tasks, []
     request = TaskRequest("s1", "family", "cluster", 1, 2, {"DEADLINE": str(EPOCH.timestamp() + 3600)})
@@ -218,7 +218,7 @@ def test_an_address_may_be_seen_later_than_its_task():
     assert all(there for after, there in found if after > 10)
 
 
-def test_route_53_is_slow_for_a_while_and_then_for_everybody():
+def test_route_53_is_slow_in_some_periods_for_all_changes():
     chance, slow = GreenletClock(1).random, 0
     for span in range(400):
         spreads = [propagation(chance, Conditions(slow_zone=0.1), 7, span * SLOW_FOR + second) for second in range(5)]
@@ -228,7 +228,7 @@ def test_route_53_is_slow_for_a_while_and_then_for_everybody():
     assert 20 <= propagation(chance, Conditions(slow_zone=0.0), 7, 0.0) <= 60
 
 
-def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
+def test_changes_of_names_are_limited_and_an_upsert_counts_twice():
     names = SimulatedWorld(7, Conditions(busy_zone=(0.0, 0.0))).platform.dns
     batch = [DnsRecord(f"s{number}.example.org", "198.18.0.1") for number in range(BATCH_OF_NAMES)]
     names.changed(add=batch)  # 800 of the 1,500
@@ -240,7 +240,7 @@ def test_changes_of_names_are_rationed_and_an_upsert_counts_twice():
     names.changed(add=batch[:150])
 
 
-def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
+def test_the_limit_of_changes_refills_by_a_hundred_a_second():
     ration = TokenBucket(*QUOTAS["route53:changes"])
     assert ration.take(0.0, 1500)
     assert not ration.take(1.0, 101)
@@ -248,7 +248,7 @@ def test_the_ration_of_changes_fills_up_by_a_hundred_a_second():
     assert ration.take(60.0, 1500)
 
 
-def test_the_bound_meets_the_same_slow_zone_and_late_addresses():
+def test_the_time_of_aws_alone_includes_a_slow_zone_and_late_addresses():
     asked = [second / 10 for second in range(600)]
     usual = aws_alone(asked, 7, Conditions(slow_zone=0.0, late_addresses=0.0))
     slow = aws_alone(asked, 7, Conditions(slow_zone=1.0, late_addresses=0.0))
@@ -257,8 +257,8 @@ def test_the_bound_meets_the_same_slow_zone_and_late_addresses():
     assert 25 < mean(late) - mean(usual) < 35
 
 
-def test_the_bound_of_groups_is_that_of_their_servers_and_of_the_last_who_comes():
-    """One server for each two who are under way; a group is there when its last member is."""
+def test_the_time_of_groups_depends_on_their_servers_and_their_last_member():
+    """There is one server for each two participants who are under way; a group is complete when its last member has come."""
     usual = Conditions(slow_zone=0.0, late_addresses=0.0)
     server = min(aws_alone([0.0, 0.0], 7, usual))
     waits = aws_alone_together([0.0] * 4, [1.0, 2.0, 3.0, 500.0], 2, 7, usual)
@@ -270,7 +270,7 @@ def mean(values):
     return sum(values) / len(values)
 
 
-def test_a_change_takes_as_long_as_its_second_says():
+def test_a_change_takes_the_time_that_its_second_determines():
     world = SimulatedWorld(7, Conditions(slow_zone=1.0))
     made = []
 
@@ -294,7 +294,7 @@ def of_s3(act):
     return found[0]
 
 
-def test_a_write_without_a_condition_takes_the_place_of_what_there_is():
+def test_a_write_without_a_condition_replaces_the_document():
     def act(world, documents):
         documents.create("a", b"first")
         documents.put("a", b"second")
@@ -304,8 +304,8 @@ def test_a_write_without_a_condition_takes_the_place_of_what_there_is():
     assert of_s3(act) == ([b"second", b"new"], 3)
 
 
-def test_an_etag_is_of_the_content_so_a_document_that_is_as_it_was_before_is_the_same_version():
-    """S3 API Reference, "Object": an ETag is an MD5 of what was put. So compare-and-swap does not see A, B, A."""
+def test_a_document_with_an_earlier_content_has_the_earlier_etag():
+    """S3 API Reference, "Object": an ETag is an MD5 of the content. So compare-and-swap does not notice a change from A to B and back to A."""
 
     def act(world, documents):
         etag = documents.create("a", b"A")
@@ -316,7 +316,7 @@ def test_an_etag_is_of_the_content_so_a_document_that_is_as_it_was_before_is_the
     assert of_s3(act)[1] == b"C"
 
 
-def test_a_version_that_was_replaced_is_no_version_any_more():
+def test_replace_with_an_old_etag_raises_conflict():
     def act(world, documents):
         etag = documents.create("a", b"first")
         documents.put("a", b"second")
@@ -327,7 +327,7 @@ def test_a_version_that_was_replaced_is_no_version_any_more():
     assert of_s3(act) == 1
 
 
-def test_a_listing_shows_every_write_and_deletion_that_was_answered_before():
+def test_a_listing_shows_all_earlier_writes_and_deletions():
     def act(world, documents):
         for name in ("in/b", "in/a", "in/c", "out/a"):
             documents.put(name, b"")
@@ -338,7 +338,7 @@ def test_a_listing_shows_every_write_and_deletion_that_was_answered_before():
     assert of_s3(act) == ["in/a", "in/c"]
 
 
-def test_the_time_of_a_document_has_whole_seconds_that_are_cut():
+def test_the_time_of_a_document_is_cut_to_whole_seconds():
     def act(world, documents):
         world.clock.sleep(7.9 - world.clock.seconds - 0.06)
         documents.put("a", b"")
@@ -349,7 +349,7 @@ def test_the_time_of_a_document_has_whole_seconds_that_are_cut():
     assert modified == EPOCH + timedelta(seconds=7)
 
 
-def test_a_listing_is_a_call_for_every_thousand_keys_and_sees_what_is_written_between_its_pages():
+def test_a_listing_makes_a_call_per_thousand_keys_and_shows_writes_between_its_pages():
     def act(world, documents):
         for number in range(PAGE):
             documents.keep(f"in/{number:04d}", b"")
@@ -363,13 +363,13 @@ def test_a_listing_is_a_call_for_every_thousand_keys_and_sees_what_is_written_be
     assert of_s3(act) == ((1000, 1), "in/0000", 1001, 3)
 
 
-# What is printed
+# Printed assumptions
 
 
 @pytest.mark.parametrize(
     "what", ["loops", "Route 53 is slow", "addresses seen late", "events lost", "batches that are throttled"]
 )
-def test_each_fact_stands_among_the_assumptions(what):
+def test_each_fact_is_among_the_assumptions(what):
     assert what in assumptions(Conditions())
 
 
@@ -383,12 +383,12 @@ WORSE = {
 
 @pytest.mark.parametrize("what", [field.name for field in dataclasses.fields(Conditions)])
 def test_each_condition_is_printed(what):
-    """Some of an interruption say nothing where there are none."""
+    """Some conditions of interruptions are printed only if there are interruptions."""
     usual = Conditions(interrupted=0.2)
     assert assumptions(dataclasses.replace(usual, **{what: WORSE[what]})) != assumptions(usual)
 
 
-def test_a_world_settles_when_nobody_is_there_and_nothing_is_left():
+def test_a_world_settles_when_all_participants_have_gone_and_nothing_is_left():
     world = SimulatedWorld(5)
     world.clock.spawn(SimulatedParticipant(world, 0).walk)
     world.settle(7200)

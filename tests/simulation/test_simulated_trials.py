@@ -1,4 +1,4 @@
-"""The simulated trials of sessions do what the real ones do, as far as the control plane can tell."""
+"""The simulated trials of sessions behave like real ones, as far as the control plane can notice."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAIR = ("alice", "bob")
 
 
 class Played:
-    """A world with the server of one session, which runs; `at` lets things happen at a second of its run."""
+    """A world with the running server of one session."""
 
     def __init__(self, **conditions):
         self.world = SimulatedWorld(
@@ -31,7 +31,7 @@ class Played:
         self.task = self.serve("a-1")
 
     def serve(self, name):
-        """The task of a server of the session, as soon as it runs."""
+        """Start a server of the session; its task when it runs."""
         tasks, made = self.world.platform.tasks, []
         until = str(EPOCH.timestamp() + 7200)
         variables = {"DEADLINE": until, "TOKEN": f"token of {name}", "SESSION": SESSION}
@@ -57,7 +57,7 @@ class Played:
         self.world.run(self.world.clock.seconds + seconds)
 
     def play(self, seconds):
-        """Both members come, and play for so long."""
+        """Let both members connect and play for so long."""
         self.form(*PAIR)
         for user in PAIR:
             self.connect(user)
@@ -76,7 +76,7 @@ def test_there_is_no_trial_before_the_session_is_formed():
     assert played.trial() is played.trial()
 
 
-def test_members_alone_are_let_in_each_with_their_own_token():
+def test_only_members_are_admitted_each_with_their_own_token():
     played = Played()
     played.form(*PAIR)
     token = played.task.request.environment["TOKEN"]
@@ -86,7 +86,7 @@ def test_members_alone_are_let_in_each_with_their_own_token():
     assert played.connect("alice")
 
 
-def test_the_game_waits_for_all_and_then_each_has_an_answer():
+def test_the_game_waits_for_all_members_and_then_each_has_an_answer():
     played = Played()
     played.form(*PAIR)
     played.connect("alice")
@@ -99,7 +99,7 @@ def test_the_game_waits_for_all_and_then_each_has_an_answer():
     assert played.task.last is Life.STOPPED
 
 
-def test_who_stays_away_ends_the_game_for_all():
+def test_a_member_who_stays_away_ends_the_game_for_all():
     played = Played()
     played.play(10)
     played.trial().disconnect("bob")
@@ -109,7 +109,7 @@ def test_who_stays_away_ends_the_game_for_all():
     assert played.outcomes() == {"alice": "partnerLeft", "bob": "left"}
 
 
-def test_who_comes_back_in_time_goes_on():
+def test_a_member_who_comes_back_in_time_goes_on():
     played = Played()
     played.play(10)
     played.trial().disconnect("bob")
@@ -119,7 +119,7 @@ def test_who_comes_back_in_time_goes_on():
     assert played.outcomes() == {"alice": "finished", "bob": "finished"}
 
 
-def test_another_server_goes_on_where_the_first_was_lost():
+def test_the_next_server_goes_on_where_the_first_was_lost():
     played = Played()
     played.play(PLAY / 2)
     lost = played.trial()

@@ -1,4 +1,4 @@
-"""The functions on a simulated AWS: nobody is stranded and nothing is left, whatever goes wrong and whenever."""
+"""The functions on a simulated AWS: after any fault at any time, no participant is stranded and nothing is left."""
 
 from __future__ import annotations
 
@@ -39,11 +39,13 @@ def test_the_same_seed_is_the_same_run():
 
 
 @pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
-def test_a_journey_without_faults_ends_as_it_should(journey):
+def test_a_journey_without_faults_ends_as_expected(journey):
     _, outcome = faults.run(journey, SEED)
     assert outcome.well, outcome
     everybody = (outcome.visit, *outcome.others)
-    room = min(len(everybody), journey.limits.get("max_servers", len(everybody)))  # who of them gets it is chance
+    room = min(
+        len(everybody), journey.limits.get("max_servers", len(everybody))
+    )  # chance decides which of them get a slot
     finished = sum(visit.finished is not None for visit in everybody)
     assert finished == (room if journey.finishes else 0), outcome
 
@@ -51,11 +53,11 @@ def test_a_journey_without_faults_ends_as_it_should(journey):
 @pytest.mark.explores
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
-def test_a_fault_at_any_call_strands_nobody_and_leaves_nothing(journey):
+def test_a_fault_at_any_call_strands_no_participant_and_leaves_nothing(journey):
     assert_no_fault_does_harm(journey, SEED, tried=8 * len(faults.FAULTS))
 
 
-def test_without_the_sweep_and_with_one_delivery_faults_would_leave_things_behind(monkeypatch):
+def test_without_the_sweep_and_with_one_delivery_faults_leave_something_behind(monkeypatch):
     assert_faults_do_harm_without_repair(faults.JOURNEYS[0], SEED, monkeypatch)
 
 
@@ -71,7 +73,7 @@ def test_an_interrupted_server_is_replaced_twice_and_the_last_is_on_demand():
     assert outcome.visit.interruptions == 2
 
 
-def test_under_bad_conditions_everybody_is_served_and_nothing_is_left():
+def test_under_bad_conditions_all_participants_are_served_and_nothing_is_left():
     conditions = Conditions(repeated=0.5, late=0.5, interrupted=0.2, no_spot=lambda seconds: 60 < seconds < 90)
     world, visits = crowd(11, 120, 60, conditions)
     assert not any(world.left().values()), world.story()
@@ -87,7 +89,7 @@ def test_under_bad_conditions_everybody_is_served_and_nothing_is_left():
     ],
     ids=["a zone busy for 5 to 15 s", "Spot sold out", "10 % interruptions"],
 )
-def test_under_worse_assumptions_everybody_is_served_before_they_give_up(conditions):
+def test_under_worse_assumptions_all_participants_are_served_before_they_give_up(conditions):
     world, visits = crowd(11, 150, 10, conditions)
     assert not any(world.left().values()), world.story()
     assert all(visit.finished is not None for visit in visits), world.story()
@@ -104,7 +106,7 @@ def served_and_gone(world, visits):
     assert not world.cloud.dropped, "no chain of messages is taken for a loop"
 
 
-def test_names_are_known_soon_though_route_53_is_slow_all_the_time():
+def test_names_are_known_soon_even_if_route_53_is_always_slow():
     conditions = Conditions(slow_zone=1.0)
     world, visits = crowd(7, 60, 20, conditions)
     served_and_gone(world, visits)
@@ -120,20 +122,20 @@ def test_an_address_that_is_seen_late_costs_seconds_and_no_visibility_timeout():
     assert (sum(waits(visits)) - sum(alone)) / len(visits) < 20 < WIRES["task_changed"].visibility
 
 
-def test_nobody_is_blamed_for_what_spot_took_back_without_a_stop_code():
+def test_servers_that_spot_took_back_without_a_stop_code_have_the_cause_spot():
     world, visits = crowd(7, 60, 20, Conditions(interrupted=0.5, interrupted_after=(5.0, 120.0), untold=1.0))
     served_and_gone(world, visits)
     assert any(task.interrupted for task in world.platform.tasks.tasks.values())
     assert world.blamed() == 0
 
 
-def test_events_that_are_lost_strand_nobody_and_leave_nothing():
+def test_lost_events_strand_no_participant_and_leave_nothing():
     world, visits = crowd(7, 60, 20, Conditions(lost=0.15))
     served_and_gone(world, visits)
 
 
-def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_servers_start():
-    """As `deploy` sets the mappings there. What finds no room at the first try does at the next."""
+def test_pages_are_served_in_an_account_with_ten_executions_while_two_hundred_servers_start():
+    """The mappings are set as by `deploy`. A page without a free execution at the first try gets one at the next."""
     small = {"start_server": WIRES["start_server"]._replace(concurrency=starts(10))}
     world, visits = crowd(7, 200, 60, concurrency=10, wires=WIRES | small)
     served_and_gone(world, visits)
@@ -142,7 +144,7 @@ def test_pages_find_room_in_an_account_of_ten_executions_while_two_hundred_serve
     assert not any("no answer" in visit.reason for visit in visits)
 
 
-def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
+def test_a_function_beyond_its_timeout_is_ended_and_its_message_comes_again():
     world = SimulatedWorld(SEED)
     person = SimulatedParticipant(world, 0)
     slow = world.platform.documents
@@ -162,18 +164,18 @@ def test_a_function_that_lasts_too_long_is_ended_and_its_message_comes_again():
     assert person.visit.ready - person.visit.asked > WIRES["start_server"].visibility
 
 
-def test_each_task_runs_for_somebody_once():
-    """However often messages are repeated: one task per attempt, on Spot or on demand."""
+def test_each_attempt_has_one_task():
+    """There is one task for each attempt, on Spot or on demand, however often messages are repeated."""
     world, visits = crowd(5, 60, 30, Conditions(repeated=0.9))
     assert len(world.platform.tasks.tasks) == len(visits)
 
 
-def test_a_fault_happens_at_the_call_it_is_meant_for():
+def test_a_fault_occurs_at_the_chosen_call():
     _, outcome = faults.run(faults.JOURNEYS[0], SEED, FaultAt(5, PortFault.CRASH_AFTER))
     assert str(PortFault.CRASH_AFTER) in outcome.story
 
 
-def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_told_otherwise():
+def test_an_answer_to_a_closed_study_is_refused_and_the_participant_sees_that():
     world = SimulatedWorld(SEED)
     person = SimulatedParticipant(world, 0, read=100.0)
     world.clock.spawn(person.walk)
@@ -184,15 +186,15 @@ def test_an_answer_that_comes_when_the_study_is_closed_is_refused_and_nobody_is_
     assert person.visit.asked is None
 
 
-def test_a_run_that_is_watched_is_the_same_run():
-    """The calls are counted in one run and meet their faults in others."""
+def test_a_watched_run_is_the_same_run():
+    """The calls are counted in one run, and the faults are injected in others."""
     journey = next(j for j in faults.JOURNEYS if j.limits.get("warm_servers"))
     (one, outcome), (other, again) = (faults.run(journey, SEED, watched=watched) for watched in (True, False))
     assert one.cloud.timeline == other.cloud.timeline
     assert outcome == again
 
 
-def test_time_passes_only_when_somebody_waits():
+def test_time_passes_only_when_all_processes_wait():
     clock, seen = GreenletClock(1), []
 
     def wait(name, seconds):

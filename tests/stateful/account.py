@@ -1,7 +1,7 @@
-"""An AWS account in memory in which nothing happens by itself: tasks start, names settle and timers fire when told to.
+"""An AWS account in memory in which nothing happens by itself: the test starts tasks, settles names and fires timers.
 
 Every call of a function goes through `Account.call`, where it may fail, be the function's last, lose its reply, or wait
-there while other functions go on.
+while other functions go on.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Port:
-    """A port each of whose methods is one call of the account."""
+    """A port: each of its methods is one call to the account."""
 
     def __init__(self, name: str, port: Any, call: Callable[[str, Sequence[Any], Callable[[], Any]], Any]) -> None:
         self._name, self._port, self._call = name, port, call
@@ -44,7 +44,7 @@ class Port:
 
 @dataclass(repr=False)
 class ListedTask(Task):
-    """A task that lists find from `listed` on."""
+    """A task that listings show from the time `listed` on."""
 
     listed: datetime = datetime.min
 
@@ -52,7 +52,7 @@ class ListedTask(Task):
         return f"<task {self.number}, {self.user or 'a warm server'}: {self.last}{'' if self.alive else ', to stop'}>"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """What hypothesis prints."""
+        """Print the object in hypothesis's output."""
         printer.text(repr(self))
 
 
@@ -63,8 +63,8 @@ class Fleet:
         self._account = account
         self.tasks: dict[str, ListedTask] = {}
         self.own_clusters: set[str] = set()
-        self.spot = self.demand = "room"  # or "full", or "refused"
-        self.lag = 0  # seconds until a new task is found by lists
+        self.spot = self.demand = "room"  # "room", "full" or "refused"
+        self.lag = 0  # seconds until listings show a new task
         self.addresses_known = True
         self._by_token: dict[tuple[str, str, bool, str], str] = {}
 
@@ -123,10 +123,10 @@ class Fleet:
         now = self._account.now()
         return [task for task in self.tasks.values() if task.alive and task.listed <= now]
 
-    # What AWS and trials do
+    # Actions of AWS and of trials
 
     def go_on(self, task: Task) -> None:
-        """The task runs from now on; or its container has ended; or it has stopped."""
+        """Move the task on: it runs, or its container has ended, or it has stopped."""
         if task.alive:
             task.last = Life.RUNNING
         else:
@@ -134,14 +134,14 @@ class Fleet:
         self._changed(task)
 
     def end(self, task: Task, code: str, reason: str, exit_code: int | None = None) -> None:
-        """The task is told to stop, or begins to by itself; `go_on` does the rest."""
+        """Let the task begin to stop, by itself or on request; `go_on` does the rest."""
         if task.alive:
             task.stop(code, reason, exit_code)
             self._account.tell(f"ECS: task {task.number} is to stop: {reason or code}")
             self._changed(task)
 
     def _changed(self, task: Task) -> None:
-        """EventBridge's rule lets these through."""
+        """Send the event, if EventBridge's rule selects it."""
         if task.last is not Life.PROVISIONING:
             self._account.send("tasks", task.event())
 
@@ -161,7 +161,7 @@ class Bus:
 
 
 class Account(FakePlatform):
-    """The platform that functions see (`documents`, `tasks` …), and what stands behind it (`kept`, `fleet`, `zone` …)."""
+    """The platform that functions use (`documents`, `tasks` …), and the state behind it (`kept`, `fleet`, `zone` …)."""
 
     def __init__(
         self,

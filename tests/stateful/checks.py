@@ -1,4 +1,4 @@
-"""What must hold after every step, and what must come of everything in the end."""
+"""Conditions that must hold after every step, and at the end of a run."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hippodrome.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, Se
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 
-STEP = 5  # seconds between two looks at what is to be done
+STEP = 5  # seconds between two checks whether something is left to do
 MAX_LOOKS = 400
-CACHES = 11  # seconds that functions may see what was
-PATIENCE = timedelta(minutes=75)  # of a participant who comes back again and again
+CACHES = 11  # seconds for which functions may read old data in their caches
+PATIENCE = timedelta(minutes=75)  # the time for which a participant tries again
 
 
 def always(world: World) -> None:
-    """Cheap; after every step."""
+    """Check what must hold after every step; it costs little time."""
     assert not world.wrong, world.wrong
     answers_stay(world)
     strangers_stay(world)
@@ -37,14 +37,14 @@ def always(world: World) -> None:
 
 
 def answers_stay(world: World) -> None:
-    """An answer once stored never changes, nor goes."""
+    """A stored answer is never changed or deleted."""
     for key, body in world.kept.items():
         assert world.account.kept.get(key, (b"",))[0] == body, f"an answer changed: {key}"
     world.kept.update({key: kept[0] for key, kept in world.account.kept.items() if "/answers/" in key})
 
 
 def strangers_stay(world: World) -> None:
-    """What is not ours stands as it stood in the beginning."""
+    """Resources of others are as they were at the beginning."""
     account, there = world.account, world.strangers
     assert any(task.name == STRANGER and task.alive for task in account.fleet.tasks.values())
     assert there["names"] <= set(account.zone.records)
@@ -68,7 +68,7 @@ def places_hold(world: World) -> None:
 
 
 def warm_servers_are_given_once(world: World) -> None:
-    """A warm server is one participant's, for good; and the trial on it is told so."""
+    """A warm server is assigned to one participant for good, and its trial is told so."""
     plays = Counter(
         record.warm_server_name
         for record in world.records()
@@ -88,7 +88,7 @@ def tasks_of(world: World, record: Server) -> list[Task]:
 
 
 def one_task(world: World, record: Server) -> None:
-    """A second task for the same server is stopped as soon as its event comes; the first is recorded."""
+    """The first task of a server is recorded; a second one is stopped as soon as its event comes."""
     running = [task for task in tasks_of(world, record) if task.alive and task.last == "RUNNING"]
     for task in running:
         told = record.label in world.unheard or any(
@@ -100,10 +100,10 @@ def one_task(world: World, record: Server) -> None:
 
 
 def owned(world: World, record: Server) -> None:
-    """Nothing is on its way to this server: all that it owns is there, or its end will be seen by the sweep.
+    """No message is on its way to this server: it has all its resources, or the sweep will notice its end.
 
-    Who comes back right after they were erased has a server of the same name: a late event of the earlier one's end may
-    cost it its timer or its place. The sweep ends it after its deadline.
+    A participant who comes back right after an erasure has a server of the same name: a late event of the earlier server's end
+    may remove its timer or its slot. The sweep ends it after its deadline.
     """
     if record.label in world.erased:
         return
@@ -121,16 +121,16 @@ def owned(world: World, record: Server) -> None:
         assert record.name in account.due, f"{name} runs without a timer"
         if (
             record.counted and not record.warm_server_name
-        ):  # two deliveries, one of which is refused while the other is given a warm server
+        ):  # one of two deliveries is refused while the other gets a warm server
             held = from_json(account.kept[server_slots_key(record.project_id)][0], ServerSlots).slots
             assert record.label in held, f"{name} runs without a place"
 
 
-# In the end
+# At the end
 
 
 def settle(world: World) -> None:
-    """Deliver everything until nothing is left to do, nothing going wrong any more. Time passes as it has to."""
+    """Deliver all messages, without faults, until nothing is left to do. Time passes meanwhile."""
     account = world.account
     fleet = account.fleet
     fleet.spot = fleet.demand = "room"
@@ -153,7 +153,7 @@ def settle(world: World) -> None:
 
 
 def _deliver(world: World, queue: str) -> None:
-    """All of a queue; what fails comes again after a while, and is a dead letter in the end."""
+    """Deliver all messages of a queue; those that fail come again after a while, and become dead letters in the end."""
     there, now = world.visible(queue), world.account.now()
     for batch in [[one] for one in there] if queue == "start" else [there] if there else []:
         world.deliver(batch)
@@ -165,12 +165,12 @@ def _deliver(world: World, queue: str) -> None:
 
 
 def ends_well(world: World) -> None:
-    """Everybody finishes or is told how things are; then nothing is left."""
+    """Check that every participant finishes or sees why not, and that nothing is left."""
     for waiting in [*world.functions.waiting]:
         world.functions.go_on(waiting)
     for message in world.queued:
         message.failed = 0
-    for _ in range(RECEIVES):  # the command says: run it again
+    for _ in range(RECEIVES):  # the command says that it must be repeated
         if world.excused:
             world.excused.clear()
             world.stop_all()
@@ -184,11 +184,11 @@ def ends_well(world: World) -> None:
     nothing_left(world)
     for user in world.people:
         page = world.ask(user)
-        assert told(world, user, page), f"in the end {user} sees {page}"
+        assert is_last_or_true(world, user, page), f"in the end {user} sees {page}"
 
 
 def nothing_left(world: World) -> None:
-    """Beyond all deadlines and two sweeps, zero of everything; where servers wait, once the study is closed."""
+    """Check that after all deadlines and two sweeps nothing is left. A study with warm servers is closed first."""
     if world.project.warm_servers:
         world.open(False, heard=False)
     for _ in range(AUTOMATIC_ATTEMPTS + 1):
@@ -207,7 +207,7 @@ def nothing_left(world: World) -> None:
 
 
 def walk(world: World, user: str) -> None:
-    """The participant goes on to the end, wherever they are, as long as there is a way."""
+    """Let the participant go on from any step to the end, as far as possible."""
     until, swept, restarts = world.account.now() + PATIENCE, world.account.now(), Counter[str]()
     while world.account.now() < until:
         page = world.ask(user)
@@ -229,7 +229,7 @@ def walk(world: World, user: str) -> None:
         if world.account.now() - swept > timedelta(minutes=5):
             world.sweep()
             swept = world.account.now()
-    assert told(world, user, page), f"{user} waits for ever: {page}"
+    assert is_last_or_true(world, user, page), f"{user} waits for ever: {page}"
     if not world.project.limits_servers:
         assert not page.get("again"), f"{user} asks again and again: {page}"
 
@@ -249,8 +249,8 @@ def running_at(world: World, url: str) -> list[Task]:
     return [task for task in world.tasks if task.host == host and task.last == "RUNNING" and task.alive]
 
 
-def told(world: World, user: str, page: dict[str, object]) -> bool:
-    """Whether this is the last page, or one that says truly how things are and what can be done."""
+def is_last_or_true(world: World, user: str, page: dict[str, object]) -> bool:
+    """Whether this is the last page, or one that correctly says why the participant cannot go on."""
     if page.get("step") == world.project.final.key:
         return True
     if "message" in page:

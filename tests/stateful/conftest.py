@@ -1,4 +1,4 @@
-"""What the tests of this folder share."""
+"""Fixtures for the tests of this folder."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from tests.stateful.sessions import numbered_id
 
 @pytest.fixture(autouse=True)
 def _quiet() -> Iterator[None]:
-    """Thousands of faults would be logged."""
+    """Log nothing: the tests cause thousands of faults."""
     with quiet():
         yield
 
 
 @pytest.fixture
 def numbered_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ids of sessions are numbers, so that a run that is repeated has the same ones."""
+    """Number the ids of sessions, so that a repeated run has the same ids."""
     monkeypatch.setattr(ids, "new_session_id", numbered_id)

@@ -1,6 +1,6 @@
-"""Lambda functions one line of which may wait while others run: each invocation is a greenlet.
+"""Lambda functions that may wait at a call while others run: each invocation is a greenlet.
 
-Containers keep what `lambdas.installed` makes between invocations, as on AWS, and are lost in a crash.
+Containers keep between invocations what `lambdas.installed` makes, as on AWS, and are lost in a crash.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from testing import port_faults
 from testing.port_faults import Crash, FaultAt, PortFault
 
 T = TypeVar("T")
-TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds; the template's
+TIMEOUTS = {"next_step": 29, "relay": 29, "sweep": 240}  # seconds, as in the template
 USUAL = 60
 
 
@@ -46,7 +46,7 @@ class Invocation:
         return f"<{self.function} ({self.about}) before {self.waits_at}>"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """What hypothesis prints."""
+        """Print the object in hypothesis's output."""
         printer.text(repr(self))
 
 
@@ -69,7 +69,7 @@ class Functions:
         done: Callable[[Invocation], None],
         fault: FaultAt | None = None,
     ) -> None:
-        """Run a handler until it ends or waits; `done` is told once it has ended."""
+        """Run a handler until it ends or waits; `done` is called when it has ended."""
         free = self._containers.setdefault(function, [])
         made = free.pop() if free else {}
         invocation = Invocation(function, about, act, done, made, self._now(), fault)
@@ -78,18 +78,18 @@ class Functions:
         self._switch(invocation)
 
     def go_on(self, invocation: Invocation, fault: FaultAt | None = None) -> None:
-        """Let a function that waits make its call; `fault` counts the calls after that one."""
+        """Let a waiting function make its call; `fault` counts the calls after that one."""
         self.waiting.remove(invocation)
         invocation.calls, invocation.fault = 0, fault
         self._switch(invocation)
 
     def kill(self, invocation: Invocation) -> None:
-        """A function that waits ends here and now."""
+        """End a waiting function."""
         self.waiting.remove(invocation)
         self._switch(invocation, Crash("timeout"))
 
     def time_out(self) -> None:
-        """End the functions that have run for longer than they may."""
+        """End the functions that have run longer than their timeout."""
         for invocation in [*self.waiting]:
             age = (self._now() - invocation.began).total_seconds()
             if age >= TIMEOUTS.get(invocation.function, USUAL):
@@ -97,7 +97,7 @@ class Functions:
                 self.kill(invocation)
 
     def cool(self) -> None:
-        """What functions keep between invocations is forgotten."""
+        """Remove all containers, with what functions keep between invocations."""
         self._containers.clear()
 
     def call(self, action: str, given: Any, effect: Callable[[], T]) -> T:

@@ -1,4 +1,4 @@
-"""Faults of the product's own, put in on purpose: a state machine has to see each of them."""
+"""Deliberate faults in the product: a state machine must notice each of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from testing.fake_platform import FakeDocuments
 
 
 class Mutation(NamedTuple):
-    """What is put in the place of an attribute, and what the machine must say: another failure is not this fault seen."""
+    """The replacement of an attribute, and the message with which the machine must fail; another failure does not count."""
 
     owner: object
     name: str
@@ -23,25 +23,25 @@ class Mutation(NamedTuple):
 
 
 def written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = "") -> str:
-    """A write that asks nothing of what stands there."""
+    """A write that does not check the present version."""
     return documents._write(key, body)
 
 
-def assert_seen(
+def assert_noticed(
     mutation: Mutation,
     machine: type[RuleBasedStateMachine],
     profile: settings,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Run the machine with this fault; it must fail, and say what is wrong."""
+    """Run the machine with this fault; it must fail with the mutation's message."""
     monkeypatch.setattr(mutation.owner, mutation.name, mutation.mutant)  # type: ignore[arg-type]
     with pytest.raises((AssertionError, ExceptionGroup)) as seen:
         run_state_machine_as_test(machine, settings=profile)
-    assert any(re.search(mutation.sentence, text) for text in _said(seen.value)), _said(seen.value)
+    assert any(re.search(mutation.sentence, text) for text in messages_of(seen.value)), messages_of(seen.value)
 
 
-def _said(error: BaseException) -> list[str]:
-    """The texts of all assertions that failed, of one example or of several."""
+def messages_of(error: BaseException) -> list[str]:
+    """The messages of all failed assertions, of one example or of several."""
     if isinstance(error, BaseExceptionGroup):
-        return [text for one in error.exceptions for text in _said(one)]
+        return [text for one in error.exceptions for text in messages_of(one)]
     return [str(error)] if isinstance(error, AssertionError) else []

@@ -1,4 +1,4 @@
-"""The state machine of `state_machine.py` for participants who play together: they also wait in a lobby, and leave it."""
+"""The state machine of `state_machine.py`, for participants who play together: they also wait in a lobby, and leave it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SessionMachine(Machine):
         limits=st.sampled_from(LIMITS), own_clusters=st.booleans(), stands=st.lists(BEGINNINGS, min_size=3, max_size=3)
     )
     def the_study(self, limits: dict[str, Any], own_clusters: bool, stands: list[str]) -> None:  # type: ignore[override]
-        """How far each of them has come."""
+        """`stands`: the step at which each participant begins."""
         cluster = "participant" if own_clusters else "installation"
         self.world = SessionWorld(pairs(cluster=cluster, **limits))
         self.world.listener = lambda line: note(f"    {line}")
@@ -53,7 +53,7 @@ class SessionMachine(Machine):
 
     @rule(users=st.permutations(USERS), rounds=st.integers(1, 4), fault=MAYBE)
     def they_wait_in_the_lobby(self, users: list[str], rounds: int, fault: FaultAt | None) -> None:
-        """Their pages ask, in any order; something may go wrong for one."""
+        """Their pages ask, in any order; one request may have a fault."""
         for _ in range(rounds):
             for number, user in enumerate(users):
                 self.world.poll(user, fault if number == 0 else None)
@@ -84,7 +84,7 @@ class SessionMachine(Machine):
 
     @rule(name=st.just("lobby"))
     def the_lobbys_document_is_lost(self, name: str) -> None:
-        """It cannot be read any more; the decisions that it held are lost, and nobody is in two sessions."""
+        """It becomes unreadable, and its decisions are lost; no participant may come into two sessions."""
         if not self.world.functions.waiting and not self.world.decisions().formed:
             self.world.spoil_the_lobby()
 

@@ -29,7 +29,7 @@ from tests.stateful import checks
 from tests.stateful.world import World
 
 USERS = ("alice", "bob", "carol")
-TOGETHER = 3  # seconds between two questions of those who wait in the lobby
+TOGETHER = 3  # seconds between two requests of a page in the lobby
 
 
 def pairs(**changes: Any) -> Project:
@@ -38,12 +38,12 @@ def pairs(**changes: Any) -> Project:
 
 
 def numbered_id() -> str:
-    """In place of `ids.new_session_id`, which is random: a run that is repeated has the same ids."""
+    """Replaces `ids.new_session_id`, which is random, so that a repeated run has the same ids."""
     return f"s.{next(SessionWorld.numbers):020x}"
 
 
 class SessionWorld(World):
-    """The installation, and participants who play together."""
+    """The installation, and participants who play in pairs."""
 
     numbers = itertools.count(1)
 
@@ -52,7 +52,7 @@ class SessionWorld(World):
         super().__init__(project, users)
         self.written: dict[str, bytes] = {}  # documents of sessions and of memberships, which never change
 
-    # What is there
+    # State
 
     def documents(self) -> dict[str, bytes]:
         """The documents of sessions and of memberships."""
@@ -70,7 +70,7 @@ class SessionWorld(World):
         return from_json(found[0], Membership) if found else None
 
     def record_of(self, user: str) -> Server | None:
-        """That of their session's server."""
+        """The record of the server of their session."""
         membership = self.membership(user)
         session = membership.session if membership else None
         return self.record(ids.server_label(self.project.id, session)) if session else None
@@ -80,7 +80,7 @@ class SessionWorld(World):
         found = self.account.kept.get(lobby_key(self.project.id))
         try:
             return from_json(found[0], Decisions) if found else Decisions()
-        except ValueError:  # it was spoilt
+        except ValueError:  # the test has made it unreadable
             return Decisions()
 
     def session_of(self, task: Task) -> SessionDocument | None:
@@ -90,7 +90,7 @@ class SessionWorld(World):
         return next((one for one in self.sessions() if one.id == session_id), None)
 
     def left(self) -> dict[str, list[str]]:
-        """As for studies of one; and what lobbies hold."""
+        """Leftovers as for studies of one, and leftovers in lobbies."""
         there = self.decisions()
         decided = [*there.open, *there.proposed, *there.formed, *there.unmatched]
         return {
@@ -114,13 +114,13 @@ class SessionWorld(World):
         self.ask(user, "POST", fields, fault)
 
     def spoil_the_lobby(self) -> None:
-        """The lobby's document is none any more."""
+        """Make the lobby's document unreadable."""
         self.tell("the lobby's document is spoilt")
         self.calm = False
         self.account.put(lobby_key(self.project.id), b"{")
 
     def played(self, task: Task, answers: int = 16) -> None:
-        """The trial stores its members' answers; only the first ones, if it is lost after so many."""
+        """The trial stores its members' answers; with a number, only so many, and then it is lost."""
         session, step = self.session_of(task), self.project.game_steps[0]
         for member in session.members[:answers] if session else ():
             key = answer_key(self.project.id, member.user_id, step)
@@ -160,7 +160,7 @@ def always(world: SessionWorld) -> None:
 
 
 def ends_well(world: SessionWorld) -> None:
-    """All are matched and play, or are told how things are; then nothing is left."""
+    """Check that all are matched and play, or see why not, and that nothing is left."""
     for waiting in [*world.functions.waiting]:
         world.functions.go_on(waiting)
     for message in world.queued:
@@ -173,11 +173,11 @@ def ends_well(world: SessionWorld) -> None:
     always(world)
     for user in world.people:
         page = world.ask(user)
-        assert checks.told(world, user, page), f"in the end {user} sees {page}"
+        assert checks.is_last_or_true(world, user, page), f"in the end {user} sees {page}"
 
 
 def walk(world: SessionWorld) -> None:
-    """They go on to the end, all at the same time, wherever they are, as long as there is a way."""
+    """Let all go on to the end at the same time, from any step, as far as possible."""
     until, swept, restarts = world.account.now() + checks.PATIENCE, world.account.now(), Counter[str]()
     there, pages = set(world.people), dict[str, dict[str, Any]]()
     while there and world.account.now() < until:
@@ -193,11 +193,11 @@ def walk(world: SessionWorld) -> None:
             world.sweep()
             swept = world.account.now()
     for user, page in pages.items():
-        assert checks.told(world, user, page), f"{user} waits for ever: {page}"
+        assert checks.is_last_or_true(world, user, page), f"{user} waits for ever: {page}"
 
 
 def go_on(world: SessionWorld, user: str, page: dict[str, Any], restarts: Counter[str]) -> bool:
-    """Do the next thing that this participant can do; whether there is more to do."""
+    """Do the next thing that this participant can do; whether there is more to do for them."""
     state, step = page.get("state"), page.get("step")
     if state == "ready":
         play(world, user, page)

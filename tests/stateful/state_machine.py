@@ -1,4 +1,4 @@
-"""The state machine: hypothesis chooses what happens next, and to which message, participant, task or function."""
+"""The state machine: hypothesis chooses the next event, and its message, participant, task or function."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BEGINNINGS = st.sampled_from(["nowhere", "at the game", "starting", "running", "
 
 
 def project(limits: dict[str, int], own_clusters: bool, warm: int) -> Project:
-    """The study in question."""
+    """The study, with the chosen settings."""
     return study(cluster="participant" if own_clusters else "installation", warm_servers=warm, **limits)
 
 
@@ -48,7 +48,7 @@ class Machine(RuleBasedStateMachine):
     def the_study(
         self, limits: dict[str, int], own_clusters: bool, warm: int, waiting: bool, alice: str, bob: str
     ) -> None:
-        """`warm` servers wait for a participant, or will; `alice` and `bob` have come so far."""
+        """`warm`: the number of warm servers; `alice` and `bob`: the steps at which these two begin."""
         self.world = World(project(limits, own_clusters, warm), USERS)
         self.world.listener = lambda line: note(f"    {line}")
         if warm and waiting:
@@ -73,7 +73,7 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: self.world.visible())
     @rule(data=st.data(), fault=MAYBE)
     def messages_are_delivered(self, data: Any, fault: FaultAt | None) -> None:
-        """One, or several of a queue in any order; only some may succeed."""
+        """Deliver one message, or several of a queue in any order; some may fail."""
         first = data.draw(st.sampled_from(self.world.visible()))
         others = [message for message in self.world.visible(first.queue) if message is not first]
         more = st.lists(st.sampled_from(others), max_size=3, unique_by=lambda m: m.number) if others else st.just([])
@@ -87,7 +87,7 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: self.world.queued or self.world.in_flight or self.world.done)
     @rule(data=st.data())
     def a_message_is_repeated(self, data: Any) -> None:
-        """One that is waiting, being dealt with, or long done."""
+        """Repeat a message that waits, is being handled, or was handled before."""
         there = [*self.world.queued, *self.world.in_flight, *self.world.done]
         self.world.repeat(data.draw(st.sampled_from(there)))
 
@@ -97,9 +97,9 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: self.unheard())
     @rule(data=st.data())
     def a_message_is_lost(self, data: Any) -> None:
-        """An event that never came: the sweep, the timers and reloads have to make up for it.
+        """A message that never arrives: the sweep, timers and reloads have to repair that.
 
-        Not one that failed half-way: those come again until they are dead letters, which call the administrator.
+        Messages whose handling failed are not lost: they come again until they are dead letters, which alarm the administrator.
         """
         self.world.lose(data.draw(st.sampled_from(self.unheard())))
 
@@ -136,14 +136,14 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: self.forms())
     @rule(word=st.sampled_from(["yes", "no"]), data=st.data(), fault=MAYBE)
     def somebody_submits(self, word: str, data: Any, fault: FaultAt | None) -> None:
-        """From any tab they ever opened."""
+        """The form may be from any tab that they have opened."""
         user, step = data.draw(st.sampled_from(self.forms()))
         self.world.answer(user, step, word, fault)
 
     @precondition(lambda self: any(person.saw_the_game for person in self.world.people.values()))
     @rule(data=st.data(), fault=MAYBE)
     def somebody_asks_for_another_server(self, data: Any, fault: FaultAt | None) -> None:
-        """From an old tab, too."""
+        """The page may be that of an old tab."""
         there = [user for user, person in self.world.people.items() if person.saw_the_game]
         self.world.restart(data.draw(st.sampled_from(there)), fault)
 
@@ -159,7 +159,7 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: self.world.moving())
     @rule(data=st.data())
     def a_task_goes_on(self, data: Any) -> None:
-        """It runs, or its container has ended, or it has stopped."""
+        """It begins to run, or its container ends, or it stops."""
         self.world.account.fleet.go_on(data.draw(st.sampled_from(self.world.moving())))
 
     @precondition(lambda self: self.alive("RUNNING"))
@@ -198,7 +198,7 @@ class Machine(RuleBasedStateMachine):
         known=st.booleans(),
     )
     def aws_is_as_it_is(self, spot: str, demand: str, lag: int, known: bool) -> None:
-        """Room on Spot and on demand; seconds until ECS lists a new task; whether EC2 knows addresses."""
+        """Set the capacity on Spot and on demand, the seconds until ECS lists a new task, and whether EC2 knows addresses."""
         fleet = self.world.account.fleet
         fleet.spot, fleet.demand = "refused" if demand == "refused" else spot, demand
         fleet.lag, fleet.addresses_known = lag, known
@@ -210,7 +210,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([16, 1, 35, 65, 300, 660, 1900]), cold=st.booleans())
     def time_passes(self, seconds: int, cold: bool) -> None:
-        """Functions may have lost what they keep between invocations."""
+        """`cold`: functions lose what they keep between invocations."""
         self.world.wait(seconds)
         if cold:
             self.world.functions.cool()
@@ -220,7 +220,7 @@ class Machine(RuleBasedStateMachine):
     def a_timer_fires(self, data: Any) -> None:
         self.world.fire(data.draw(st.sampled_from(self.world.timers_due())))
 
-    # Those who clean up
+    # The sweep and the administrator
 
     @rule(fault=MAYBE)
     def the_sweep_runs(self, fault: FaultAt | None) -> None:
@@ -232,7 +232,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(closed=st.booleans(), heard=st.booleans())
     def the_study_is_registered_anew(self, closed: bool, heard: bool) -> None:
-        """Whether warm servers hear of it, or the sweep has to see to them."""
+        """`heard`: warm servers are adapted at once, or only by the sweep."""
         self.world.open(not closed, heard)
 
     @rule(user=PEOPLE)
@@ -240,7 +240,7 @@ class Machine(RuleBasedStateMachine):
         if self.world.may_erase(user):
             self.world.erase(user)
 
-    # What must hold
+    # Invariants
 
     @invariant()
     def all_is_as_it_should_be(self) -> None:

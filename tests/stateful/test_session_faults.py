@@ -1,4 +1,4 @@
-"""Each call of a pair's journey fails, is the last, or loses its reply: the end is the same."""
+"""Each call of a pair's journey fails, is the last, or loses its reply: still no participant is stranded, and nothing is left."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Counted:
 
 
 def come(world: SessionWorld, *users: str) -> None:
-    """To the page before the game, where the server is started ahead."""
+    """Bring a pair to the page before the game, where the server is started ahead."""
     for user in users:
         world.ask(user)
         world.answer(user, "1")
@@ -67,7 +67,7 @@ def meet(world: SessionWorld) -> None:
 
 
 def a_pair(world: SessionWorld) -> None:
-    """The lobby, the game, and each by themselves to the end."""
+    """The pair meets in the lobby, plays, and each goes on to the end alone."""
     meet(world)
     for task in [task for task in world.tasks if task.alive]:
         world.played(task)
@@ -88,7 +88,7 @@ def a_pair_without_a_server_ahead(world: SessionWorld) -> None:
 
 
 def a_pair_whose_server_is_lost(world: SessionWorld) -> None:
-    """Between the answers of its two members."""
+    """The server is lost between the answers of the two members."""
     meet(world)
     for task in [task for task in world.tasks if task.alive]:
         world.played(task, answers=1)
@@ -99,11 +99,11 @@ def a_pair_whose_server_is_lost(world: SessionWorld) -> None:
 
 
 def one_alone(world: SessionWorld) -> None:
-    """No other comes: unmatched, and the server that was started ahead is stopped."""
+    """No other participant comes: this one is unmatched, and the server that was started ahead is stopped."""
     come(world, "alice")
     world.go_on()
     world.answer("alice", "2")
-    for _ in range(14):  # more than their patience, which is a minute
+    for _ in range(14):  # longer than their patience, which is a minute
         world.poll("alice")
         world.wait(5)
     world.ask("alice")
@@ -113,7 +113,7 @@ def one_alone(world: SessionWorld) -> None:
 
 
 def one_who_never_comes(world: SessionWorld) -> None:
-    """Under way, and away: the server is stopped after half an hour, and no other starts once they are forgotten."""
+    """A participant is under way and does not come: the server is stopped after half an hour, and no other starts after that."""
     come(world, "alice")
     world.go_on()
     for _ in range(3):
@@ -124,7 +124,7 @@ def one_who_never_comes(world: SessionWorld) -> None:
 
 
 def with_a_warm_server(world: SessionWorld) -> None:
-    """The pair is handed a server that waits."""
+    """The pair gets a warm server."""
     world.go_on()
     meet(world)
 
@@ -161,7 +161,7 @@ def begin(name: str, at: tuple[int, FaultAt] | None = None) -> tuple[SessionWorl
 
 @functools.cache
 def places(name: str) -> list[tuple[int, FaultAt]]:
-    """Every call of every invocation of the journey, with every fault."""
+    """All calls of all invocations of the journey, each with every fault."""
     _, counted = begin(name)
     return [
         (number, FaultAt(call, fault))
@@ -172,7 +172,7 @@ def places(name: str) -> list[tuple[int, FaultAt]]:
 
 
 @pytest.mark.parametrize("name", JOURNEYS)
-def test_each_journey_ends_well_if_nothing_fails(name: str) -> None:
+def test_each_journey_without_faults_ends_well(name: str) -> None:
     world, _ = begin(name)
     members = [len(session.members) for session in world.sessions()]
     unmatched = [user for user in PAIR if (membership := world.membership(user)) and membership.unmatched]
@@ -182,7 +182,7 @@ def test_each_journey_ends_well_if_nothing_fails(name: str) -> None:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("name", JOURNEYS)
-def test_whatever_call_fails_nobody_is_stranded_and_nothing_is_left(name: str) -> None:
+def test_a_fault_at_any_call_strands_no_participant_and_leaves_nothing(name: str) -> None:
     wrong: list[str] = []
     for number, fault in sample(places(name), 12, seed=len(name)):
         world: SessionWorld | None = None

@@ -1,4 +1,4 @@
-"""Whatever comes in whatever order, however often, and whatever fails, for participants who play together."""
+"""Messages and faults in any order and number, for participants who play together."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis.stateful import run_state_machine_as_test
 from hippodrome.servers.sweep import Sweep, SweepResult
 from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
-from tests.stateful.mutations import Mutation, assert_seen, written_unread
+from tests.stateful.mutations import Mutation, assert_noticed, written_unread
 from tests.stateful.session_machine import SessionMachine
 
 pytestmark = pytest.mark.usefixtures("numbered_sessions")
@@ -24,13 +24,13 @@ MUTATED = settings(PROFILE, max_examples=400, derandomize=True, phases=[Phase.ge
 
 @pytest.mark.explores
 @pytest.mark.timeout(0)
-def test_nobody_is_stranded_split_or_merged_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
+def test_no_participant_is_stranded_and_no_group_split_or_merged_by_any_messages_and_faults() -> None:
     run_state_machine_as_test(SessionMachine, settings=PROFILE)
 
 
 @seed(1)
 class SeededMachine(SessionMachine):
-    """With a seed that sees every mutation within the first examples."""
+    """The machine with a seed that notices every mutation within the first examples."""
 
 
 MUTATIONS = {
@@ -48,5 +48,5 @@ MUTATIONS = {
 
 
 @pytest.mark.parametrize("what", MUTATIONS)
-def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_seen(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)
+def test_the_machine_notices_the_mutation(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_noticed(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)

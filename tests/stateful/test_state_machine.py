@@ -1,7 +1,7 @@
-"""Whatever comes in whatever order, however often, and whatever fails: the end is the same.
+"""Messages and faults in any order and number: no participant is stranded, and nothing is left.
 
-A stateful machine over participants, servers, those that wait, and the sweep. The tests play the same examples every
-time; `make hunt` plays others, and more of them. A run that fails prints its story.
+A stateful machine over participants, servers, warm servers and the sweep. The tests play the same examples every time; `make hunt`
+plays others, and more of them. A run that fails prints its story.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
 from testing.port_faults import FaultAt, PortFault
 from testing.studies import study
-from tests.stateful.mutations import Mutation, assert_seen, written_unread
+from tests.stateful.mutations import Mutation, assert_noticed, written_unread
 from tests.stateful.state_machine import Machine
 from tests.stateful.world import World
 
@@ -36,23 +36,23 @@ MUTATED = settings(PROFILE, max_examples=600, derandomize=True, phases=[Phase.ge
 
 @seed(3)
 class SeededMachine(Machine):
-    """With a seed that sees every mutation within the first examples."""
+    """The machine with a seed that notices every mutation within the first examples."""
 
 
 @pytest.mark.explores
 @pytest.mark.timeout(0)
-def test_nobody_is_stranded_and_nothing_is_left_whatever_comes_in_whatever_order() -> None:
+def test_no_participant_is_stranded_and_nothing_is_left_by_any_messages_and_faults() -> None:
     run_state_machine_as_test(Machine, settings=PROFILE)
 
 
-def test_who_was_given_a_warm_server_keeps_the_place_though_another_delivery_cannot_start_a_server() -> None:
+def test_an_assigned_warm_server_keeps_its_slot_if_another_delivery_cannot_start_a_server() -> None:
     world = World(study(max_servers=2, warm_servers=1), ("alice", "bob"))
     world.go_on()
     world.ask("bob")
     world.answer("bob", "1")
     start = next(message for message in world.queued if message.text == "start bob")
     world.repeat(start)
-    world.deliver([start], FaultAt(3, PortFault.WAIT))  # the record is written, and no place taken
+    world.deliver([start], FaultAt(3, PortFault.WAIT))  # the record is written, and no slot taken
     world.deliver_all("start")
     assert world.functions.waiting[0].waits_at == "documents.get"
     world.account.fleet.spot = world.account.fleet.demand = "refused"
@@ -94,5 +94,5 @@ MUTATIONS = {
 
 
 @pytest.mark.parametrize("what", MUTATIONS)
-def test_the_machine_sees(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_seen(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)
+def test_the_machine_notices_the_mutation(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_noticed(MUTATIONS[what], SeededMachine, MUTATED, monkeypatch)

@@ -1,4 +1,4 @@
-"""An installation whose messages lie in their queues until the test delivers them: now, later, again, or with others."""
+"""An installation whose messages stay in their queues until the test delivers them: now, later, again, or with others."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ from tests.stateful.functions import Functions, Invocation
 
 QUEUES = {"start": start_server.handler, "stop": stop_server.handler, "tasks": task_changed.handler}
 RELAYS = {"start": send_start_server_message.handler, "stop": send_stop_server_message.handler}
-RECEIVES = 8  # deliveries that fail, although nothing goes wrong any more, before a message is a dead letter
-VISIBILITY = 90  # seconds until a message that failed comes again, once nothing goes wrong any more
+RECEIVES = 8  # failed deliveries before a message is a dead letter, when no faults are injected any more
+VISIBILITY = 90  # seconds until a failed message comes again, when no faults are injected any more
 STRANGER = ids.server_name(ids.server_label("maze", "of-another-installation"), 1)
 
 
@@ -64,21 +64,21 @@ class Message:
         return f"<{self.number}: {self.text}>"
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """What hypothesis prints."""
+        """Print the object in hypothesis's output."""
         printer.text(repr(self))
 
 
 @dataclass
 class Person:
-    """A participant with all the tabs they ever opened."""
+    """A participant, with all tabs that they have opened."""
 
     user: str
     pages: list[dict[str, Any]] = field(default_factory=list, repr=False)
-    page: dict[str, Any] = field(default_factory=dict)  # the last that came
+    page: dict[str, Any] = field(default_factory=dict)  # the last page that came
 
     @property
     def forms(self) -> list[str]:
-        """The steps that they could answer, from an old tab too."""
+        """The steps that they can answer, also from an old tab."""
         return list(dict.fromkeys(str(page["step"]) for page in self.pages if "ticket" in page))
 
     @property
@@ -90,24 +90,28 @@ SECRET = Secret("0" * 64)
 
 
 class World:
-    """The installation, its participants, and resources of others, which must stay."""
+    """The installation, its participants, and resources of others, which must not change."""
 
     def __init__(self, project: Project, users: Sequence[str] = ("alice", "bob", "carol")) -> None:
         self.project = project
         self.story: list[str] = []
         self.listener: Callable[[str], None] = lambda line: None
-        self.wrong: list[str] = []  # what was seen while it happened and should not have
+        self.wrong: list[str] = []  # violations that were noticed while they happened
         self.queued: list[Message] = []
         self.in_flight: list[Message] = []
         self.done: list[Message] = []
         self.dead: list[Message] = []
-        self.kept: dict[str, bytes] = {}  # answers that a participant has seen stored
+        self.kept: dict[str, bytes] = {}  # answers that participants have seen as stored
         self.given: dict[str, str] = {}  # warm servers by name, and the label of the participant who has or had it
-        self.erased: set[str] = set()  # labels: their next server is called like the one that was erased
-        self.unheard: set[str] = set()  # labels of servers a message about which was lost
-        self.lost = 0  # messages
-        self.calm = True  # whether nothing has gone wrong so far
-        self.excused: set[str] = set()  # labels of servers that an administrator's command, cut off, stopped half-way
+        self.erased: set[str] = (
+            set()
+        )  # labels of erased participants, whose next servers have the names of the erased ones
+        self.unheard: set[str] = set()  # labels of servers about which a message was lost
+        self.lost = 0  # the number of lost messages
+        self.calm = True  # whether no fault has occurred so far
+        self.excused: set[str] = (
+            set()
+        )  # labels of servers that an interrupted command of the administrator's has stopped only partly
         self._numbers = itertools.count(1)
         self._labels = {ids.server_label(project.id, user): user for user in users}
         self.people = {user: Person(user) for user in users}
@@ -116,8 +120,8 @@ class World:
         self.functions.platform = self.account
         self.functions.watch = self._watch
         self.functions.disturbed = self._disturbed
-        self._listed: set[str] = set()  # by the sweep that runs
-        self._run: set[str] = set()  # those of the listed tasks that ran
+        self._listed: set[str] = set()  # the resources that the running sweep has listed
+        self._run: set[str] = set()  # the listed tasks that ran
         self.register(project)
         for file, source in PAGES.items():
             self.account.put(step_key(project.id, file), source.encode())
@@ -130,7 +134,7 @@ class World:
         self.calm = False
 
     def register(self, project: Project, heard: bool = True) -> None:
-        """Put the project on the master list, as another version; whether its warm servers hear of it."""
+        """Put the project on the master list, as another version. `heard`: its warm servers are adapted at once."""
         entry = msgspec.structs.replace(project, version=str(next(self._numbers)), salt="s", secret="")
         self.project = msgspec.structs.replace(entry, secret=SECRET.project_secret(entry))
         self.account.put(KEY, to_json(SECRET))
@@ -139,7 +143,7 @@ class World:
             self.send("start", to_message(KeepWarm(project.id)))
 
     def tell(self, line: str) -> None:
-        """One line of the story."""
+        """Add one line to the story."""
         line = f"{self.account.now():%H:%M:%S} {line}"
         self.story.append(line)
         self.listener(line)
@@ -156,7 +160,7 @@ class World:
         label = ids.server_label(self.project.id, user_id)
         return self._labels.setdefault(label, f"spare{len(self._labels)}")
 
-    # What is there
+    # State
 
     @property
     def tasks(self) -> list[Task]:
@@ -182,7 +186,7 @@ class World:
         return heir if heir and heir.name == name else record
 
     def handovers(self) -> dict[str, Handover]:
-        """Whose the warm servers were told to be, by the warm servers' names."""
+        """The handovers, by the warm servers' names."""
         prefix, kept = handovers_folder(self.project.id), self.account.kept
         found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
         return {name: handover.parse(kept[key][0]) for name, key in found.items()}
@@ -197,7 +201,7 @@ class World:
         return from_json(found[0], Pool) if found else Pool()
 
     def left(self) -> dict[str, list[str]]:
-        """What would stay on the bill or in the way."""
+        """Resources and documents that are left, by kind."""
         account = self.account
         return {
             "tasks": [self.who(task.name) for task in self.tasks if task.last != "STOPPED"],
@@ -217,12 +221,12 @@ class World:
         }
 
     def _hopeless(self, message: Message) -> bool:
-        """An event that waits for one that was lost, or is of before an erasure and called like a new server's."""
+        """Whether an event needs one that was lost, or is from before an erasure and names a new server."""
         name = str(message.body.get("detail", {}).get("startedBy", ""))
         return bool(name) and (self.lost > 0 or name.partition("-")[0] in self.erased)
 
     def _strangers(self) -> None:
-        """Things in the account that are not ours, though some are called like ours."""
+        """Make resources of others in the account; some have names like ours."""
         account = self.account
         account.fleet.run(TaskRequest(STRANGER, "d", "hippodrome", 1, 2, {}))
         names = [DnsRecord(f"{STRANGER}.example.org", "192.0.2.1"), DnsRecord("www.example.org", "192.0.2.2")]
@@ -250,12 +254,12 @@ class World:
         return [message for message in self.queued if message.visible <= now and queue in (None, message.queue)]
 
     def repeat(self, message: Message) -> None:
-        """At least once: it comes again, also where it is being dealt with or has been."""
+        """Deliver the message once more later, as SQS may do, even if it is being handled or was handled."""
         copy = Message(next(self._numbers), message.queue, message.body, self.account.now(), message.text + ", again")
         self.queued.append(copy)
 
     def lose(self, message: Message) -> None:
-        """It failed too often, or was never sent: it never arrives."""
+        """Remove the message: it never arrives."""
         self.tell(f"lost: {message.text}")
         self.queued.remove(message)
         self.lost += 1
@@ -280,14 +284,14 @@ class World:
         self.functions.invoke(queue, about, partial(QUEUES[queue], event, None), partial(self._delivered, batch), fault)
 
     def deliver_all(self, queue: str) -> None:
-        """Each message of a queue by itself."""
+        """Deliver each message of a queue by itself."""
         for message in self.visible(queue):
             self.deliver([message])
 
     def go_on(self) -> None:
-        """The usual course of things: what was asked for runs and is ready."""
+        """The usual course: servers that were asked for run and become ready."""
         self.deliver_all("start")
-        self.deliver_all("start")  # what the first ones asked for
+        self.deliver_all("start")  # the messages that the first ones have sent
         self.move_all()
         self.deliver_all("tasks")
         self.account.zone.settle()
@@ -310,7 +314,7 @@ class World:
                 self.done = [*self.done[-30:], message]
 
     def pending(self, record: Server) -> bool:
-        """Whether a message or a function on its way will go on with this server, or end it."""
+        """Whether a queued message or a running function will still change this server."""
         label = record.label
         if any(self._concerns(message, record) for message in [*self.queued, *self.in_flight]):
             return True
@@ -347,7 +351,7 @@ class World:
     # Participants
 
     def request(self, user: str, method: str, fields: Mapping[str, str] | None = None, **query: str) -> dict[str, Any]:
-        """The HTTP API's event of a program's request."""
+        """The HTTP API's event for a program's request."""
         return aws_events.program_event(method, {"projectId": self.project.id, "userId": user, **query}, fields or {})
 
     def ask(
@@ -358,7 +362,7 @@ class World:
         fault: FaultAt | None = None,
         **query: str,
     ) -> dict[str, Any]:
-        """A participant's request; the page if it came at once, else {}."""
+        """Make a participant's request; the page if it comes at once, else {}."""
         came: list[dict[str, Any]] = []
         act = partial(next_step.handler, self.request(user, method, fields, **query), None)
         about = " ".join([user, method, *query, *(f"{k}={v}" for k, v in (fields or {}).items() if "ticket" not in k)])
@@ -370,7 +374,7 @@ class World:
         return came[0] if came else {}
 
     def _came(self, user: str, fields: Mapping[str, str], invocation: Invocation) -> dict[str, Any]:
-        """What the browser shows. A page that does not come is no page."""
+        """Take the answer as the page that the browser shows; a page that does not come changes nothing."""
         if not invocation.well or invocation.answer["statusCode"] >= 500:
             self.tell(f"{user} sees no page")
             return {}
@@ -383,7 +387,7 @@ class World:
         state = f", {page['state']} {page.get('reason') or ''}" if "state" in page else ""
         self.tell(f"{user} sees {page.get('message') or 'step ' + str(page.get('step')) + state}")
         step = fields.get("hippodrome-step")
-        shown = page.get("step")  # a message, such as that the study is closed, has none
+        shown = page.get("step")  # a message page, such as that of a closed study, has none
         if "answer" in fields and page.get("page") and shown not in (None, step):
             key = answer_key(self.project.id, user, str(step))
             if key not in self.account.kept:
@@ -391,20 +395,20 @@ class World:
         return page
 
     def answer(self, user: str, step: str, word: str = "yes", fault: FaultAt | None = None) -> dict[str, Any]:
-        """They send a step's form."""
+        """Send a step's form."""
         ticket = ids.ticket(self.project.secret, user, step)
         fields = {"hippodrome-step": step, "hippodrome-ticket": ticket, "answer": word}
         return self.ask(user, "POST", fields, fault)
 
     def restart(self, user: str, fault: FaultAt | None = None) -> dict[str, Any]:
-        """They press the game page's button."""
+        """Press the button of the game page."""
         game = self.project.game_steps[0]
         ticket = ids.ticket(self.project.secret, user, game)
         fields = {"hippodrome-step": game, "hippodrome-ticket": ticket, "hippodrome-action": "restart"}
         return self.ask(user, "POST", fields, fault)
 
     def relay(self, which: str, user: str, delay: int = 0, fault: FaultAt | None = None) -> None:
-        """A request to one of the relays, with the proof of the first page."""
+        """Make a request to one of the relays, with the proof of the first page."""
         step = self.project.steps[0].key
         fields = {"hippodrome-step": step, "hippodrome-ticket": ids.ticket(self.project.secret, user, step)}
         event = self.request(user, "POST", {**fields, **({"delay": str(delay)} if delay else {})})
@@ -413,18 +417,18 @@ class World:
         )
 
     def moving(self) -> list[Task]:
-        """Tasks that are about to run, or to have stopped."""
+        """Tasks that are about to run or to stop."""
         return [t for t in self.tasks if t.last == "PROVISIONING" or (t.last != "STOPPED" and not t.alive)]
 
     def move_all(self) -> list[Task]:
-        """Every one of them goes on; those."""
+        """Let all of them go on; these tasks."""
         moving = self.moving()
         for task in moving:
             self.account.fleet.go_on(task)
         return moving
 
     def played(self, task: Task) -> None:
-        """The trial stores its answer."""
+        """Let the trial store its answer."""
         step = self.project.game_steps[0]
         user = self.player(task)
         key = answer_key(self.project.id, user, step)
@@ -436,7 +440,7 @@ class World:
     # Functions without a queue, and people with rights
 
     def sweep(self, fault: FaultAt | None = None) -> None:
-        """One sweep."""
+        """Run a sweep."""
         self.functions.invoke("sweep", "", partial(sweep.handler, {}, None), self._swept, fault)
 
     def _swept(self, invocation: Invocation) -> None:
@@ -447,7 +451,7 @@ class World:
                 self.wrong.append("sweep: nothing has gone wrong, and there are names that were left over")
 
     def stop_all(self, fault: FaultAt | None = None) -> None:
-        """What `deploy stop` does: all open servers at once, from the administrator's machine."""
+        """Stop all open servers at once from the administrator's machine, as `deploy stop` does."""
         self.calm = False
         wanted = [r for r in self.records() if not r.is_closed]
         stops = [StopServer(r.project_id, r.user_id, r.attempt, Reason.STOPPED) for r in wanted]
@@ -459,13 +463,13 @@ class World:
         self.functions.invoke("administrator", "stop all", lambda: installed.shared(Servers).stop(stops), done, fault)
 
     def may_erase(self, user: str) -> bool:
-        """`deploy erase` waits for what is on its way."""
+        """Whether `deploy erase` may begin: no message of the participant is being handled, no function waits, listings show all tasks."""
         busy = any(m.body.get("userId") == user for m in self.in_flight) or bool(self.functions.waiting)
         now = self.account.now()
         return not busy and all(task.listed <= now for task in self.tasks)
 
     def erase(self, user: str) -> None:
-        """What `deploy erase` does, when it has come to its end."""
+        """Erase the participant, as `deploy erase` does when it is not interrupted."""
         self.tell(f"{user} is erased")
         self.calm = False
         account, label = self.account, ids.server_label(self.project.id, user)
@@ -497,14 +501,14 @@ class World:
         self.erased |= {label, *(name.partition("-")[0] for name in had)}
 
     def open(self, live: bool, heard: bool = True) -> None:
-        """The researcher registers the project anew, open or closed."""
+        """Register the project again, open or closed."""
         self.tell(f"the study is registered anew, {'open' if live else 'closed'}")
         self.register(msgspec.structs.replace(self.project, live=live), heard)
 
     # Time
 
     def wait(self, seconds: float) -> None:
-        """Time passes; functions that take too long are ended."""
+        """Let time pass; end functions that run too long."""
         self.account.wait(seconds=seconds)
         self.functions.time_out()
 
@@ -513,15 +517,15 @@ class World:
         return sorted(name for name, (at, _) in self.account.due.items() if at <= now)
 
     def fire(self, name: str) -> None:
-        """A timer fires, and is forgotten."""
+        """Fire a timer, and remove it."""
         _, body = self.account.due.pop(name)
         self.tell(f"the timer of {self.who(name)} fires")
         self.send("stop", body)
 
-    # What a sweep removes
+    # Resources that a sweep removes
 
     def _watch(self, invocation: Invocation, action: str, given: Sequence[Any]) -> None:
-        """Judge what a sweep is about to remove."""
+        """Check a resource that a sweep is about to remove."""
         if invocation.function != "sweep":
             return
         if action == "tasks.list":

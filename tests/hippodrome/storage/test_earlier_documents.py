@@ -64,15 +64,15 @@ def test_a_handover_is_read_and_written_back_unchanged() -> None:
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-def test_a_message_is_understood(name: str) -> None:
+def test_a_message_is_parsed(name: str) -> None:
     said = json.loads(document(name))
     found = MESSAGES[name](said)
     assert found is not None
-    if name != "message_task_seen":  # it becomes the event that it stands for
+    if name != "message_task_seen":  # it becomes the event that it replaces
         assert json.loads(json.dumps(to_message(found))) == said
 
 
-def test_what_the_records_say_is_what_was_meant() -> None:
+def test_records_of_an_earlier_version_are_read_with_their_meaning() -> None:
     draining, taken = (from_json(document(f"server_spare_{name}"), Server) for name in ("leaving", "taken"))
     assigned, second = (from_json(document(f"server_{name}"), Server) for name in ("with_spare", "second_attempt"))
     assert draining.state is ServerState.DRAINING

@@ -11,7 +11,7 @@ Parsed = tuple[str, MasterList]
 
 
 class Raced(ProjectCache):
-    """Whenever a list is kept, another thread, which has read the one before it, keeps that at once."""
+    """A cache in which, after each list that is kept, another thread at once keeps the list before it."""
 
     _before: Parsed = ("before", MasterList())
     _kept: Parsed | None = None
@@ -25,7 +25,7 @@ class Raced(ProjectCache):
         self._kept = parsed and self._before
 
 
-def test_a_request_gets_the_list_that_it_has_read_whatever_other_requests_keep() -> None:
+def test_a_request_uses_the_list_that_it_has_read_even_if_another_request_keeps_an_older_one() -> None:
     platform = FakePlatform()
     platform.documents.put(MASTER_LIST, write_list(MasterList([study(id="new")])))
     assert Raced(platform).project("new") is not None

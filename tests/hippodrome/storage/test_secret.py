@@ -1,6 +1,6 @@
-"""What proves something to us is derived from one secret; documents that researchers read hold none of it.
+"""Tokens, tickets and signatures are derived from one secret, and documents that researchers read hold none of them.
 
-Documents that earlier versions wrote hold tokens and secrets: those stay valid for who was given them.
+Documents that earlier versions wrote hold tokens and secrets: these stay valid.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def document(platform: FakePlatform, key: str) -> Any:
 
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
-    """What signs the project's tickets and links, as a function sees it that has just begun."""
+    """The secret that signs the project's tickets and links, as a new function reads it."""
     project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret
@@ -74,7 +74,7 @@ def entry(project_id: str, its_secret: str) -> Any:
 
 
 def playing(platform: FakePlatform, **changes: object) -> Server:
-    """Alice's server is ready. The record is put there with these changes."""
+    """Write the record of alice's ready server, with these changes."""
     record = server.new_attempt(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
     record = server.ready(server.naming(record, "task", Address("192.0.2.1", 443), platform.now()), platform.now())
     record = msgspec.structs.replace(record, **changes)
@@ -85,7 +85,7 @@ def playing(platform: FakePlatform, **changes: object) -> Server:
 # What documents hold
 
 
-def test_neither_the_list_nor_a_record_holds_anything_that_opens_something(platform: FakePlatform) -> None:
+def test_neither_the_list_nor_a_record_holds_a_secret_or_a_token(platform: FakePlatform) -> None:
     steps = [{"key": "1", "page": "consent", "variants": 2}, {"key": "2", "page": "game", "variants": 0}]
     register(steps=[*steps, {"key": "finalStep", "page": "bye", "variants": 0}], trial={"game": "G"}, events={})
     Servers(platform).start(StartServer("maze", "alice"))
@@ -105,7 +105,7 @@ def test_neither_the_list_nor_a_record_holds_anything_that_opens_something(platf
     assert document(platform, server.key(LABEL))["token"] == ""
 
 
-def test_each_project_server_and_attempt_has_its_own() -> None:
+def test_each_project_server_and_attempt_has_its_own_secret() -> None:
     kept = Secret("0" * 64)
     projects = [study(secret="", salt=salt, id=name) for name in ("maze", "other") for salt in ("a", "b")]
     settings, now = FakePlatform().settings, FakePlatform().now()
@@ -132,7 +132,7 @@ def test_a_project_that_was_removed_and_is_registered_again_has_another_secret(p
 
 
 def test_another_salt_makes_another_secret(platform: FakePlatform) -> None:
-    """How an administrator renews one that has leaked, be it derived or of an earlier version."""
+    """In this way an administrator replaces a leaked secret, whether derived or of an earlier version."""
     register()
     as_earlier(platform, *document(platform, MASTER_LIST)["projects"], entry("other", "of-old"))
     register()
@@ -155,14 +155,14 @@ def test_another_salt_makes_another_secret(platform: FakePlatform) -> None:
 def test_a_function_reads_the_secret_once(platform: FakePlatform) -> None:
     register()
     place.use(platform)
-    reads = looks(platform)
+    reads = reads_of_secret(platform)
     for user in ("alice", "alice", "bob"):
         assert Browser(platform, f"projectId=maze&userId={user}").send()["statusCode"] == 200
     assert reads == [KEY]
 
 
-def looks(platform: FakePlatform) -> list[str]:
-    """Reads of the secret from now on."""
+def reads_of_secret(platform: FakePlatform) -> list[str]:
+    """A list to which each read of the secret from now on is added."""
     reads: list[str] = []
     get = platform.documents.get
 
@@ -195,7 +195,7 @@ def test_links_are_signed_by_the_function_that_has_the_secret(platform: FakePlat
         {"projectId": ["maze"], "userIds": ["a"]},
     ],
 )  # fmt: skip
-def test_what_asks_for_no_links_gets_none(platform: FakePlatform, asked: object) -> None:
+def test_a_malformed_request_for_links_gets_none(platform: FakePlatform, asked: object) -> None:
     register()
     answer = update_project_master_list.handler({"links": asked}, None)
     assert list(answer) == ["problems"]
@@ -206,7 +206,7 @@ def test_what_asks_for_no_links_gets_none(platform: FakePlatform, asked: object)
 
 
 def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: FakePlatform) -> None:
-    """While nothing is registered anew, then when another project is, and when it is itself."""
+    """Before any new registration, after that of another project, and after that of the project itself."""
     link = ids.link_signature("of-old", "maze", "alice")
     as_earlier(platform, entry("maze", "of-old") | {"signedLinks": True}, entry("other", "others-of-old"))
     browser = Browser(platform, f"projectId=maze&userId=alice&signature={link}")
@@ -226,8 +226,8 @@ def test_signed_links_and_open_pages_of_an_earlier_version_stay_valid(platform: 
     assert b"of-old" not in platform.documents.kept[MASTER_LIST][0]
 
 
-def test_a_list_that_is_put_back_as_it_was_takes_nothing_from_anybody(platform: FakePlatform) -> None:
-    """Somebody restores an old version of the list: secrets stand in it once more."""
+def test_after_an_old_list_is_restored_all_secrets_stay_valid(platform: FakePlatform) -> None:
+    """An administrator restores an old version of the list, so that it holds secrets again."""
     as_earlier(platform, entry("maze", "of-old"))
     before = platform.documents.kept[MASTER_LIST][0]
     register("other")
@@ -239,8 +239,8 @@ def test_a_list_that_is_put_back_as_it_was_takes_nothing_from_anybody(platform: 
 
 
 @pytest.mark.parametrize("done", [0, 1, 2])
-def test_registering_that_is_cut_off_loses_no_secret(platform: FakePlatform, done: int) -> None:
-    """Before the secret is made, before it takes over, and before the list is written without."""
+def test_an_interrupted_registration_loses_no_secret(platform: FakePlatform, done: int) -> None:
+    """It ends before the secret is made, before it takes the projects' secrets over, or before the list is written without them."""
     as_earlier(platform, entry("maze", "of-old"))
 
     def cut() -> None:
@@ -256,7 +256,7 @@ def test_registering_that_is_cut_off_loses_no_secret(platform: FakePlatform, don
     assert b"of-old" not in platform.documents.kept[MASTER_LIST][0]
 
 
-def test_two_that_take_over_at_once_lose_nothing(platform: FakePlatform) -> None:
+def test_two_functions_that_take_secrets_over_at_once_lose_none(platform: FakePlatform) -> None:
     SecretCache(platform.documents).get_or_create()
     other = SecretCache(platform.documents)
     platform.documents.before_write = [lambda: other.add_project_secrets({"b": "2"})]
@@ -264,7 +264,7 @@ def test_two_that_take_over_at_once_lose_nothing(platform: FakePlatform) -> None
     assert document(platform, KEY)["projects"] == {"a": "1", "b": "2"}
 
 
-def test_what_never_settles_is_told(platform: FakePlatform) -> None:
+def test_repeated_conflicts_raise_conflict(platform: FakePlatform) -> None:
     SecretCache(platform.documents).get_or_create()
 
     def fails(*_: Any) -> str:
@@ -275,8 +275,8 @@ def test_what_never_settles_is_told(platform: FakePlatform) -> None:
         SecretCache(platform.documents).add_project_secrets({"a": "1"})
 
 
-def test_an_entry_without_either_has_a_secret_nonetheless(platform: FakePlatform) -> None:
-    """An earlier version, put back for a while, drops what it does not know."""
+def test_an_entry_without_secret_and_salt_still_has_a_secret(platform: FakePlatform) -> None:
+    """An earlier version that is installed again for a while drops fields that it does not know."""
     register()
     as_earlier(platform, entry("maze", ""))
     assert len(secret(platform)) == 64
@@ -286,7 +286,7 @@ def test_an_entry_without_either_has_a_secret_nonetheless(platform: FakePlatform
     assert secret(platform) == before
 
 
-def test_without_the_document_nothing_is_signed_with_nothing(platform: FakePlatform) -> None:
+def test_without_the_document_of_the_secret_no_page_is_shown(platform: FakePlatform) -> None:
     register()
     platform.documents.delete(KEY)
     with pytest.raises(LookupError, match=f"{KEY} is gone"):
@@ -295,8 +295,8 @@ def test_without_the_document_nothing_is_signed_with_nothing(platform: FakePlatf
 
 
 @pytest.mark.parametrize("body", [b'{"secret": ""}', b'{"secret": "short"}', b"{}", b"[]", b"", b"[" * 9_999])
-def test_with_a_document_that_holds_no_secret_nothing_is_signed(platform: FakePlatform, body: bytes) -> None:
-    """Whoever knows the rules of `secret.py` could derive the same from an empty text."""
+def test_with_a_document_that_holds_no_secret_no_page_is_shown(platform: FakePlatform, body: bytes) -> None:
+    """Otherwise anyone who knows the rules of `secret.py` could derive the same proofs from an empty text."""
     register()
     platform.documents.put(KEY, body)
     with pytest.raises((ValueError, RecursionError)):
@@ -304,14 +304,14 @@ def test_with_a_document_that_holds_no_secret_nothing_is_signed(platform: FakePl
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 500
 
 
-def test_a_server_that_an_earlier_version_started_goes_on(platform: FakePlatform) -> None:
-    """Its page is told the token that the server knows, and the relays take it; no secret is read for that."""
+def test_a_server_that_an_earlier_version_started_keeps_its_token(platform: FakePlatform) -> None:
+    """Its page gets the token that the server knows, and the relays accept it; the secret is not read for that."""
     as_earlier(platform, entry("maze", "of-old"))
     for key in "12":
         platform.documents.put(f"maze/users/alice/answers/{key}.json", b"{}")
     platform.documents.put(participant_key("maze", "alice"), b"{}")
     playing(platform, token="the-old-token")
-    reads = looks(platform)
+    reads = reads_of_secret(platform)
     assert poll(Browser(platform))["token"] == "the-old-token"
     assert ask(send_start_server_message, token="the-old-token") == 202
     assert ask(send_stop_server_message, token="the-old-token") == 202
@@ -319,8 +319,8 @@ def test_a_server_that_an_earlier_version_started_goes_on(platform: FakePlatform
     assert reads == []
 
 
-def test_a_start_that_an_earlier_version_began_is_finished_as_the_same_task(platform: FakePlatform) -> None:
-    """RunTask may have been called already, with the token in the client token: another one would be a second task."""
+def test_a_start_that_an_earlier_version_began_runs_the_same_task(platform: FakePlatform) -> None:
+    """RunTask may have been called already with this token in its client token; another token would start a second task."""
     as_earlier(platform, entry("maze", "of-old"))
     begun = server.new_attempt(study(), "alice", 1, nonce="n", settings=platform.settings, now=platform.now())
     platform.documents.put(server.key(LABEL), to_json(msgspec.structs.replace(begun, token="the-old-token")))
@@ -329,7 +329,7 @@ def test_a_start_that_an_earlier_version_began_is_finished_as_the_same_task(plat
     assert (request.environment["TOKEN"], request.nonce) == ("the-old-token", "the-old-token")
 
 
-def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token() -> None:
+def test_a_warm_server_that_an_earlier_version_started_is_assigned_with_its_token() -> None:
     platform = FakePlatform()
     settings, now = platform.settings, platform.now()
     warm_server = server.new_attempt(
@@ -341,7 +341,7 @@ def test_a_warm_server_that_an_earlier_version_started_is_given_with_its_token()
     assert given.state is ServerState.READY
 
 
-def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
+def test_an_assigned_warm_server_has_the_token_of_its_task() -> None:
     platform = FakePlatform()
     secrets = SecretCache(platform.documents)
     settings, now = platform.settings, platform.now()
@@ -352,14 +352,14 @@ def test_the_token_of_a_warm_server_is_the_one_that_its_task_was_told() -> None:
     assert secrets.token(given) == told != secrets.token(mine)
 
 
-def test_a_record_that_was_stopped_before_it_began_is_opened_by_nothing(platform: FakePlatform) -> None:
+def test_a_server_that_was_stopped_before_its_start_has_no_token(platform: FakePlatform) -> None:
     register()
     stone = server.stopped_before_start("maze", "alice", 1, platform.now())
     assert SecretCache(platform.documents).token(from_json(to_json(stone), Server)) == ""
 
 
-def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platform: FakePlatform) -> None:
-    """By `apply`. Nothing else of the list changes, entries that cannot be read included."""
+def test_secrets_are_taken_out_of_an_earlier_versions_list_on_request(platform: FakePlatform) -> None:
+    """`apply` asks for it. Nothing else in the list changes, not even entries that cannot be read."""
     links = {"signedLinks": True}
     as_earlier(
         platform, entry("maze", "1-of-old") | links, entry("other", "2-of-old"), UNREADABLE | {"secret": "3-of-old"}
@@ -377,7 +377,7 @@ def test_secrets_go_out_of_a_list_of_before_at_once_when_that_is_asked_for(platf
     assert secret(platform, "broken") == "3-of-old"
 
 
-def test_two_that_clear_the_list_at_once_lose_nothing(platform: FakePlatform) -> None:
+def test_a_registration_during_the_removal_of_secrets_is_not_lost(platform: FakePlatform) -> None:
     as_earlier(platform, entry("maze", "of-old"))
     SecretCache(platform.documents).get_or_create()
     platform.documents.before_write = [lambda: None, lambda: register("other")]
@@ -386,7 +386,7 @@ def test_two_that_clear_the_list_at_once_lose_nothing(platform: FakePlatform) ->
     assert secret(platform) == "of-old"
 
 
-def test_where_there_is_no_list_there_is_nothing_to_take_over(platform: FakePlatform) -> None:
+def test_without_a_list_no_secret_is_taken_over(platform: FakePlatform) -> None:
     assert update_project_master_list.handler({"takeOver": True}, None) == {"takenOver": 0}
     assert KEY not in platform.documents.kept
     platform.documents.put(MASTER_LIST, b"{")
@@ -400,7 +400,7 @@ UNREADABLE = {"id": "broken", "live": True, "steps": {"2": "consent.html"}}  # s
 HIPPOS = UNREADABLE | {"steps": {"1": "consent.html"}}
 
 
-def test_the_secret_of_an_entry_that_cannot_be_read_is_taken_over_and_waits_for_its_mending(
+def test_the_secret_of_an_unreadable_entry_is_taken_over_and_used_when_the_project_is_registered_again(
     platform: FakePlatform,
 ) -> None:
     as_earlier(platform, UNREADABLE | {"secret": "of-old", "odd": [1.50, "é"]})
@@ -425,7 +425,7 @@ def test_an_entry_in_hippos_form_keeps_its_secret_and_its_salt(platform: FakePla
     assert salt != "ab12"
 
 
-def test_an_entry_that_cannot_be_read_keeps_its_salt_for_its_mending(platform: FakePlatform) -> None:
+def test_an_unreadable_entry_keeps_its_salt_until_the_project_is_registered_again(platform: FakePlatform) -> None:
     register("broken")
     before, salt = secret(platform, "broken"), document(platform, MASTER_LIST)["projects"][0]["salt"]
     as_earlier(platform, UNREADABLE | {"salt": salt})
@@ -434,23 +434,23 @@ def test_an_entry_that_cannot_be_read_keeps_its_salt_for_its_mending(platform: F
     assert secret(platform, "broken") == before
 
 
-def test_nobody_registers_a_salt_or_a_secret_of_their_own(platform: FakePlatform) -> None:
+def test_a_registration_cannot_set_a_salt_or_a_secret(platform: FakePlatform) -> None:
     for key, meant in (("salt", "did you mean seats?"), ("secret", "docs/config.md lists all keys")):
         answer = update_project_master_list.handler({"project": registration() | {key: "mine"}}, None)
         assert answer["problems"] == [f"{key}: unknown key; {meant}"]
 
 
-def test_a_study_whose_list_is_of_an_earlier_version_needs_no_secret_at_all() -> None:
-    """During an upgrade a function may not read the secret yet."""
+def test_a_study_in_an_earlier_versions_list_does_not_read_the_secret() -> None:
+    """During an upgrade a function may not be allowed to read the secret yet."""
     platform = installed()
     place.use(platform)
-    reads = looks(platform)
+    reads = reads_of_secret(platform)
     assert Browser(platform, "projectId=maze&userId=alice").send()["statusCode"] == 200
     assert reads == []
 
 
 class Before(msgspec.Struct, rename="camel"):
-    """What the version before needed of a server's record to stop the server and to remove what it has."""
+    """The fields that the version before needs of a server's record, to stop the server and to remove its resources."""
 
     project_id: str
     user_id: str
@@ -462,16 +462,16 @@ class Before(msgspec.Struct, rename="camel"):
     cluster: str
 
 
-def test_the_version_before_can_read_the_records_of_this_one(platform: FakePlatform) -> None:
-    """An update that fails is rolled back while servers run that it has started: those must come to their end."""
+def test_the_version_before_can_read_the_records_of_this_version(platform: FakePlatform) -> None:
+    """A failed update is rolled back while servers run that it has started: the version before must be able to end them."""
     for record in (playing(platform), server.stopped_before_start("maze", "alice", 1, platform.now())):
         assert msgspec.json.decode(to_json(record), type=Before).token == ""
 
 
-def test_another_secret_is_known_to_every_function_within_the_hour(
+def test_every_function_reads_a_new_secret_within_an_hour(
     platform: FakePlatform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An administrator has deleted one that leaked. Else some functions would use the old one for as long as they live."""
+    """An administrator has deleted a leaked secret. Otherwise some functions would use it as long as they run."""
     clock = 0.0
     monkeypatch.setattr("hippodrome.storage.secret.monotonic", lambda: clock)
     register()
