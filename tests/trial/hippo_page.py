@@ -1,6 +1,6 @@
-"""HIPPO's React front end as a trial server meets it: each message word for word, and what its page makes of the answers.
+"""HIPPO's React front end as a trial server sees it: its messages, word for word, and how its page reads the answers.
 
-Read in its src/components/Game/game.js (2022-04) and src/utils/getKeyInput.js.
+Source: its src/components/Game/game.js (2022-04) and src/utils/getKeyInput.js.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ KEYS = {"ArrowLeft": ("leftArrow", "left"), "ArrowRight": ("rightArrow", "right"
 
 
 class HippoPage(TakesMessages):
-    """The page's state, and what its buttons and keys send."""
+    """The page's state, and the messages that its buttons and keys send."""
 
     def __init__(self, websocket: ClientConnection, user_id: str, project_id: str) -> None:
         self.websocket = websocket
@@ -36,7 +36,7 @@ class HippoPage(TakesMessages):
         self.said: list[dict[str, Any]] = []
 
     async def send(self, **data: Any) -> None:
-        """Its sendMessage."""
+        """Send as its sendMessage does."""
         data |= {"frameCount": self.frame_count, "frameId": self.frame_id}
         await self.websocket.send(json.dumps(data))
 
@@ -44,7 +44,7 @@ class HippoPage(TakesMessages):
         await self.send(userId=self.user_id, projectId=self.project_id)
 
     async def command(self, name: str) -> None:
-        """A click on a button: the ones of HIPPO and those of the project's own."""
+        """A click on one of HIPPO's buttons, or of the project's own."""
         browser = {"system": "Linux", "systemVersion": "", "browser": "Chrome", "browserVersion": "141"}
         await self.send(command=name, **(browser if name == "start" else {}))
 
@@ -75,7 +75,7 @@ class HippoPage(TakesMessages):
         await self.send(info="mouse move", pos=place, rel=moved, buttons=[0, 0, 0], button=0)
 
     async def take(self) -> None:
-        """One message, as its onmessage reads it."""
+        """Receive one message, as its onmessage reads it."""
         data = await self.websocket.recv()
         assert isinstance(data, str), "its page knows text alone"
         if data == "done":
@@ -90,7 +90,7 @@ class HippoPage(TakesMessages):
             self.frame_id = message["frameId"]
 
     async def wait_until_heard(self) -> None:
-        """Return when the server has heard all that was said so far; the next picture but one is of a later step."""
+        """Return when the server has read all messages so far. The picture after the next one shows a later step."""
         self.ui = []
         await self.command("requestUI")
         await self.until(lambda: self.ui)
@@ -100,7 +100,7 @@ class HippoPage(TakesMessages):
         await self.until(lambda: self.frame_count >= until)
 
     async def closed(self, seconds: float = 15) -> int | None:
-        """Take messages until the connection is closed, which opens the window, too; the code."""
+        """Take messages until the connection is closed, which also opens the window; return the code."""
         code = await super().closed(seconds)
         self.ended = True
         return code
@@ -126,7 +126,7 @@ async def hippo_page(
     host: str | None = None,
     project_id: str = "study",
 ) -> AsyncIterator[HippoPage]:
-    """Open it at a server's address. It sends its hello as soon as it is connected."""
+    """Open the page at a server's address. It sends its hello as soon as it is connected."""
     place = {"host": host} if host else {}
     async with connect(
         address,
@@ -145,5 +145,5 @@ async def hippo_page(
 
 
 def new_user_id() -> str:
-    """As its constants.js makes one at each load of the page."""
+    """A user id, as its constants.js makes one at each load of the page."""
     return str(uuid.uuid4())

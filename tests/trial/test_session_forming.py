@@ -280,7 +280,7 @@ def test_a_server_does_not_wait_gather_seconds_for_members_who_all_left_before_t
 # ---- its environment
 
 
-def test_the_settings_of_a_session():
+def test_a_server_of_a_session_reads_its_settings():
     settings = TrialSettings.from_env({**ENV, "USER_ID": "", "GROUP": "7", "PLAIN_ORIGINS": "https://a.example"})
     assert (settings.session, settings.user_id, settings.group, settings.assigned) == (SID, "", None, False)
     assert settings.plain_origins == frozenset()

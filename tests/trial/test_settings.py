@@ -17,7 +17,7 @@ ENV = {
 }
 
 
-def test_settings_from_the_environment():
+def test_settings_are_read_from_the_environment():
     found = TrialSettings.from_env(
         {**ENV, "TRIAL": json.dumps({"ui": {"left": True, "up": False}, "actionSpace": ["NOOP", "Left"]})}
     )
@@ -29,7 +29,7 @@ def test_settings_from_the_environment():
     assert [TrialSettings.from_env({**ENV, "GROUP": text}).group for text in ("", "0", "12")] == [None, 0, 12]
 
 
-def test_trial_section_of_config_yml(tmp_path, monkeypatch):
+def test_the_trial_section_of_config_yml_is_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert TrialSettings.from_env(ENV).trial == trial_section({})
     (tmp_path / "config.yml").write_text(

@@ -403,7 +403,7 @@ def test_a_program_without_a_token_is_closed_and_told_what_is_missing(launch):
     assert "sends no token" in reason
 
 
-def test_a_warm_server_lets_nobody_in_without_the_token():
+def test_a_warm_server_lets_no_page_in_without_the_token():
     env = {
         "PROJECT_ID": "a",
         "SERVER": "c",

@@ -54,7 +54,7 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing
 
 
 def container(port: str) -> dict[str, Any]:
-    """What a study's task definition says of its container, in an installation with that ServerPort."""
+    """The container in a study's task definition, in an installation with that ServerPort."""
     names = ("TaskExecutionRole", "TaskRole", "TrialLogGroup")
     installation = Installation(
         "hippodrome", "us-east-1", "CREATE_COMPLETE", {**dict.fromkeys(names, "x"), "ServerPort": port}
@@ -64,7 +64,7 @@ def container(port: str) -> dict[str, Any]:
 
 
 def run(folder: Path, said: dict[str, Any]) -> list[str]:
-    """A trial server as this container runs it: the status of its /healthz, its capabilities, its exit status."""
+    """Run a trial server as this container does; return the status of its /healthz, its capabilities and its exit status."""
     (folder / "agent.py").write_text(grid_agent())
     port = said["portMappings"][0]["containerPort"]
     sets = [

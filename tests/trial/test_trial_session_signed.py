@@ -1,4 +1,4 @@
-"""The server of a session on AWS has no rights: what it reads and stores goes through presigned requests, as for one participant."""
+"""The server of a session on AWS has no rights: it reads and stores by presigned requests, as for one participant."""
 
 import asyncio
 import json
@@ -30,7 +30,7 @@ def recordings(town, name):
 
 
 def play(launched, open_client, *, frames=10, stop=True):
-    """Both members play; then one of them stops the game, or the server is told to end."""
+    """Let both members play; then one of them stops the game, or the server is told to end."""
 
     async def run():
         async with open_client(launched.address) as anna, open_client(launched.address) as bert:

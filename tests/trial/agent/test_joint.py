@@ -60,7 +60,7 @@ def play_episode(adapter: JointAdapter, seed: int = 3) -> list[Joint]:
 # ---- PettingZoo
 
 
-def test_a_parallel_environment_by_the_name_of_its_module(tmp_path: Path) -> None:
+def test_a_parallel_environment_is_made_by_the_name_of_its_module(tmp_path: Path) -> None:
     adapter = joint_adapter(tmp_path, game=PONG)
     assert adapter.players == ("paddle_0", "paddle_1")
     assert adapter.action_spaces == {"paddle_0": ("0", "1", "2"), "paddle_1": ("0", "1", "2")}
@@ -207,7 +207,7 @@ class Agent:
 """
 
 
-def test_five_methods_with_dictionaries_whose_names_are_numbers(tmp_path: Path) -> None:
+def test_five_methods_may_use_dictionaries_whose_keys_are_numbers(tmp_path: Path) -> None:
     adapter = joint_adapter(tmp_path, OWN, names=("left", "right"))
     assert adapter.players == ("0", "1")
     assert adapter.action_spaces == {"0": ("left", "right"), "1": ("left", "right")}
@@ -290,7 +290,7 @@ def test_a_mask_may_be_in_the_info(tmp_path: Path) -> None:
     assert adapter.step({}).masks == {"0": (False, True)}
 
 
-def test_an_environment_that_gives_dictionaries_by_a_key_of_config(tmp_path: Path) -> None:
+def test_trial_players_names_the_players_if_neither_agent_nor_environment_does(tmp_path: Path) -> None:
     """Where neither agent nor environment say who plays, `trial.players` does."""
     source = OWN.replace("possible_agents = [0, 1]", "")
     adapter = joint_adapter(

@@ -43,7 +43,7 @@ def make_without_warnings(gym: Any, name: str, **how: Any) -> Any:
 # ---- make
 
 
-def test_the_old_interface(gym: Any) -> None:
+def test_an_environment_has_the_old_interface(gym: Any) -> None:
     env = gym.make("CartPole-v0")
     assert env.seed(3) == [3]
     first = env.reset()
@@ -58,7 +58,7 @@ def test_the_old_interface(gym: Any) -> None:
     env.close()
 
 
-def test_later_versions_of_the_old_interface(gym: Any) -> None:
+def test_reset_also_takes_the_arguments_of_later_versions(gym: Any) -> None:
     env = gym.make("CartPole-v1")
     first, info = env.reset(seed=5, return_info=True)
     assert info == {}
@@ -103,7 +103,7 @@ def test_the_wrapped_environment_can_be_reached(gym: Any) -> None:
         ("ALE/MsPacman-v5", (210, 160, 3)),
     ],
 )
-def test_atari_by_its_old_ids(gym: Any, name: str, shape: tuple[int, ...]) -> None:
+def test_atari_games_are_made_by_their_old_ids(gym: Any, name: str, shape: tuple[int, ...]) -> None:
     env = gym.make(name)
     env.seed(0)
     assert env.reset().shape == env.observation_space.shape == shape
@@ -115,7 +115,7 @@ def test_atari_by_its_old_ids(gym: Any, name: str, shape: tuple[int, ...]) -> No
     env.close()
 
 
-def test_an_id_that_gymnasium_has_in_a_newer_version(gym: Any) -> None:
+def test_an_old_id_makes_gymnasiums_newer_version(gym: Any) -> None:
     with pytest.warns(UserWarning, match=r"no Pendulum-v0 any more; Pendulum-v1 is used instead"):
         env = gym.make("Pendulum-v0")
     assert env.spec.id == "Pendulum-v1"
@@ -185,7 +185,7 @@ def corridor(gym: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("my_corridor")
 
 
-def test_an_environment_of_ones_own(gym: Any, corridor: Any) -> None:
+def test_an_agents_own_environment_keeps_the_old_interface(gym: Any, corridor: Any) -> None:
     env = corridor.Corridor()
     assert isinstance(env, gym.Env)
     assert env.seed(4) == [4]
@@ -197,7 +197,7 @@ def test_an_environment_of_ones_own(gym: Any, corridor: Any) -> None:
     assert env.unwrapped is env
 
 
-def test_registered_environments(gym: Any, corridor: Any) -> None:
+def test_registered_environments_are_made(gym: Any, corridor: Any) -> None:
     gym.envs.registration.register(
         id="Corridor-v7", entry_point="my_corridor:Corridor", max_episode_steps=4, kwargs={"length": 50}
     )
@@ -214,14 +214,16 @@ def test_registered_environments(gym: Any, corridor: Any) -> None:
         gym.make("Corridor-v7")
 
 
-def test_a_module_that_registers_when_it_is_imported(gym: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_may_register_environments_when_it_is_imported(
+    gym: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = ENV + "gym.register(id='Hall-v0', entry_point=Corridor)\n"
     (tmp_path / "my_hall.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert gym.make("my_hall:Hall-v0").length == 5
 
 
-def test_wrappers_of_ones_own(gym: Any, corridor: Any) -> None:
+def test_an_agents_own_wrappers_work(gym: Any, corridor: Any) -> None:
     class Half(gym.ObservationWrapper):
         def observation(self, observation: Any) -> Any:
             return observation / 2
@@ -244,7 +246,7 @@ def test_wrappers_of_ones_own(gym: Any, corridor: Any) -> None:
     assert env.render("rgb_array").shape == (4, 4, 3)
 
 
-def test_wrappers_of_gym(gym: Any, corridor: Any) -> None:
+def test_gyms_own_wrappers_work(gym: Any, corridor: Any) -> None:
     env = gym.wrappers.FrameStack(gym.wrappers.TimeLimit(corridor.Corridor(), 3), num_stack=2)
     assert np.array(env.reset()).shape == (2, 1)
     assert [env.step(1)[2] for _ in range(3)] == [False, False, True]
@@ -257,7 +259,7 @@ def test_wrappers_of_gym(gym: Any, corridor: Any) -> None:
     assert env.reset().shape == (4,)
 
 
-def test_random_numbers_by_their_old_names(gym: Any) -> None:
+def test_random_numbers_have_their_old_names(gym: Any) -> None:
     random, seed = gym.utils.seeding.np_random(8)
     assert seed == 8
     assert (random.rand(2).shape, random.randn(3).shape, random.random_sample(4).shape) == ((2,), (3,), (4,))
@@ -267,7 +269,7 @@ def test_random_numbers_by_their_old_names(gym: Any) -> None:
         gym.utils.seeding.np_random(-1)
 
 
-def test_the_names_that_agents_import() -> None:
+def test_the_names_that_agents_import_exist() -> None:
     names = """
     import gym, gym.spaces, gym.wrappers, gym.envs, gym.envs.registration, gym.utils, gym.utils.seeding, gym.error
     import gym.core, gym.logger, gym.spaces.utils, gym.version, gym.vector
@@ -331,7 +333,7 @@ class Agent():
 """As HIPPO's sample agent is written."""
 
 
-def test_an_agent_like_hippos_sample(tmp_path: Path) -> None:
+def test_an_agent_like_hippos_sample_plays(tmp_path: Path) -> None:
     (tmp_path / "agent.py").write_text(SAMPLE)
     player = AgentAdapter(tmp_path, "MsPacman-v0", None)
     player.start()

@@ -78,7 +78,7 @@ def started_agent(folder: Path, old: str = "", new: str = "", source: str = AGEN
         ("start(self, game)", "start(self, game, *more)"),
     ],
 )
-def test_methods_with_and_without_the_environment(tmp_path: Path, old: str, new: str) -> None:
+def test_methods_are_called_with_or_without_the_environment(tmp_path: Path, old: str, new: str) -> None:
     player = started_agent(tmp_path, old, new)
     player.reset(1)
     player.step(1)
@@ -118,7 +118,7 @@ def test_reset_gets_a_seed_if_it_takes_one(tmp_path: Path) -> None:
     assert started_agent(tmp_path).reset(7)[2] is False
 
 
-def test_functions_without_a_class(tmp_path: Path) -> None:
+def test_functions_without_a_class_are_an_agent(tmp_path: Path) -> None:
     player = started_agent(
         tmp_path,
         source="""

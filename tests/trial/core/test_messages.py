@@ -39,7 +39,7 @@ def test_very_deep_or_long_json_is_read_or_refused(text):
         messages.parse(text)
 
 
-def test_messages_of_the_wire():
+def test_messages_have_the_form_of_docs_wire():
     message = messages.parse('{"command": "start", "action": "LEFT", "held": true, "changeFrameRate": 40, "ack": 3}')
     assert message == messages.Message("start", "left", True, 40.0, 3)
     assert "ack" not in message.record()

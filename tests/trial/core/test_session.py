@@ -1,4 +1,4 @@
-"""A session's trial, event by event: who is waited for, when the game begins, is held and ends, and what each is told."""
+"""A session's trial, event by event: for whom it waits, when the game begins, is held and ends, and what each member is told."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_game_begins_by_itself_when_all_are_here_and_have_counted_down():
     driver.wait(0.1)
     assert len(driver.taken) == 1
     assert [driver.state_seen_by(number)["state"] for number in (0, 1)] == ["playing", "playing"]
-    assert "turnOf" not in driver.state_seen_by(0), "in real time it is all players' turn"
+    assert "turnOf" not in driver.state_seen_by(0), "in real time it is the turn of all players"
 
 
 def test_the_start_of_one_member_does_not_begin_the_game_without_the_other():
@@ -245,7 +245,7 @@ def test_another_tab_of_a_member_takes_their_own_place():
     assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}
 
 
-# ---- who does what
+# ---- each member's own actions
 
 
 def test_a_members_keys_move_their_own_player_alone():

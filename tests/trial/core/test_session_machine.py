@@ -207,7 +207,7 @@ class Machine(RuleBasedStateMachine):
         assert self.over or now > before, "the game goes on when nobody is waited for"
 
     @invariant()
-    def nobody_is_waited_for_too_long(self) -> None:
+    def no_member_is_waited_for_too_long(self) -> None:
         if hasattr(self, "driver"):
             self.check_effects()
             late = [number for number in self.missing() if self.missed[number] > self.allowed[number] + NEARLY]

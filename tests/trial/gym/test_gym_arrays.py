@@ -54,7 +54,7 @@ def test_make_describes_the_environment(client: TextClient) -> None:
     assert (said["num_envs"], said["autoreset_mode"], said["render_mode"]) == (0, "NextStep", None)
 
 
-def test_one_step(client: TextClient) -> None:
+def test_a_step_answers_with_arrays(client: TextClient) -> None:
     made = Made(client, "Odd/Calm-v0")
     observation, infos = made.reset(seed=4)
     assert (observation.tolist(), infos) == ([[0.0, 0.5]], [(0, {"seed": 4})])
@@ -77,7 +77,7 @@ def test_steps_give_the_same_results_as_in_json(server: GymServerProcess, client
     assert steps.terminated.any()
 
 
-def test_a_vector(client: TextClient) -> None:
+def test_a_vector_answers_for_all_its_environments(client: TextClient) -> None:
     made = Made(client, "Odd/Calm-v0", num_envs=3)
     observations, _ = made.reset(seed=[1, 2, 3])
     assert observations.tolist() == [[0.0, 0.5]] * 3
@@ -88,7 +88,7 @@ def test_a_vector(client: TextClient) -> None:
     assert steps.infos[0][1]["action"].tolist() == [1, 1, 1]
 
 
-def test_a_vector_with_continuous_actions(client: TextClient) -> None:
+def test_a_vector_takes_continuous_actions(client: TextClient) -> None:
     made = Made(client, "Odd/Continuous-v0", num_envs=2)
     made.reset()
     steps = made.steps([np.array([0.25, 0.5], np.float32), np.array([-1, 1], np.float32)])

@@ -50,7 +50,7 @@ def test_make_answers_the_bare_id(gymie: GymieClient) -> None:
     assert re.fullmatch("[0-9a-f]{32}", gymie.make("CartPole-v1"))
 
 
-def test_an_episode(gymie: GymieClient) -> None:
+def test_an_episode_is_played_to_its_end(gymie: GymieClient) -> None:
     gymie.make("CartPole-v1")
     state = gymie.command("reset")
     assert len(state) == 4
@@ -64,7 +64,7 @@ def test_an_episode(gymie: GymieClient) -> None:
     assert gymie.command("close") is True
 
 
-def test_spaces_in_gymies_form(gymie: GymieClient) -> None:
+def test_spaces_have_gymies_form(gymie: GymieClient) -> None:
     gymie.make("CartPole-v1")
     found = gymie.command("action_space")
     assert (found["name"], found["n"]) == ("Discrete", 2)
@@ -79,7 +79,7 @@ def test_bounds_that_are_infinite_are_json(gymie: GymieClient) -> None:
 
 
 @pytest.mark.parametrize(("env_id", "kind"), [("CartPole-v1", int), ("MountainCarContinuous-v0", list)])
-def test_action_sample(gymie: GymieClient, env_id: str, kind: type) -> None:
+def test_an_action_is_sampled(gymie: GymieClient, env_id: str, kind: type) -> None:
     gymie.make(env_id)
     assert isinstance(gymie.command("action_sample"), kind)
 
@@ -183,7 +183,7 @@ def test_infinity_is_sent_although_json_has_no_such_number(gymie: GymieClient) -
 # The other forms
 
 
-def test_the_documented_form(server: GymServerProcess) -> None:
+def test_answers_have_the_documented_form(server: GymServerProcess) -> None:
     with TextClient(server.url + "?form=documented") as client:
         said = client.ask("make", env_id="CartPole-v1")
         assert list(said) == ["instance_id"]
@@ -191,7 +191,7 @@ def test_the_documented_form(server: GymServerProcess) -> None:
         assert len(client.ask("step", **said, action=0)) == 4
 
 
-def test_gymnasiums_form(asking: TextClient) -> None:
+def test_answers_have_gymnasiums_form(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", cut=2)
     assert asking.ask("reset", instance_id=made, seed=3, options={"a": 1}) == [[0.0, 0.5], {"seed": 3, "a": 1}]
     assert asking.ask("step", instance_id=made, action=1) == [[1.0, 0.5], 1.0, False, False, {"action": 1}]
@@ -236,7 +236,7 @@ def test_step_many_in_the_mode_disabled_stops_at_the_end(asking: TextClient) -> 
     assert [len(column) for column in asking.ask("step_many", instance_id=made, actions=[0] * 9)] == [5] * 5
 
 
-def test_a_vector_of_environments(asking: TextClient) -> None:
+def test_a_vector_of_environments_is_stepped(asking: TextClient) -> None:
     made = asking.make("CartPole-v1", num_envs=3, seed=1)
     observations, _ = asking.ask("reset", instance_id=made)
     assert len(observations) == 3
@@ -247,7 +247,7 @@ def test_a_vector_of_environments(asking: TextClient) -> None:
     assert [len(column) for column in columns] == [2] * 5
 
 
-def test_a_picture(asking: TextClient) -> None:
+def test_a_picture_is_answered(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0", render_mode="rgb_array")
     asking.ask("reset", instance_id=made)
     assert asking.ask("render", instance_id=made)["shape"] == [4, 6, 3]

@@ -273,7 +273,7 @@ def test_pages_of_other_sites_may_not_connect(server: GymServerProcess) -> None:
     assert found.value.response.status_code == 403
 
 
-def test_pages_of_this_machine_may(server: GymServerProcess) -> None:
+def test_pages_of_this_machine_may_connect(server: GymServerProcess) -> None:
     with connect(server.url, origin="http://localhost:3000"):
         pass
 

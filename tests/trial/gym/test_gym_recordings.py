@@ -86,7 +86,7 @@ def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
     assert (last["terminated"], end["why"], end["steps"], end["score"]) == (True, "terminated", 5, 15.0)
 
 
-def test_a_client_that_goes_leaves_a_whole_recording_and_one_that_is_killed_all_but_the_last_second(
+def test_a_recording_is_whole_after_the_client_leaves_and_lacks_a_second_after_a_kill(
     tmp_path: Path,
 ) -> None:
     with gym_server("--record", str(tmp_path)) as server:

@@ -150,7 +150,7 @@ def test_many_requests_at_once_are_answered_in_order(wire: Wire) -> None:
 
 
 @pytest.mark.parametrize("size", [2, 8])
-def test_a_length_in_more_bytes_than_it_needs(wire: Wire, size: int) -> None:
+def test_a_length_in_more_bytes_than_it_needs_is_read_or_refused(wire: Wire, size: int) -> None:
     """RFC 6455, 5.2, wants the least number of bytes; either way, the server must not misread what follows."""
     wire.send(frame(TEXT, UNKNOWN, size=size) + frame(PING, b"after"))
     opcode, _ = wire.frame()
@@ -160,14 +160,14 @@ def test_a_length_in_more_bytes_than_it_needs(wire: Wire, size: int) -> None:
         assert opcode == CLOSE
 
 
-def test_a_message_of_the_greatest_length(wire: Wire) -> None:
+def test_a_message_of_the_greatest_length_is_read(wire: Wire) -> None:
     message = b'{"method": "' + b"x" * (100_000 - 28) + b'", "params": {}}'
     assert len(message) == 100_000
     wire.send(frame(TEXT, message))
     assert refused(wire) == "MethodNotFound"
 
 
-def test_an_empty_message(wire: Wire) -> None:
+def test_an_empty_message_gets_an_error(wire: Wire) -> None:
     wire.send(frame(TEXT) + frame(BINARY))
     assert refused(wire) == "InvalidMessage"
     assert refused(wire) == "InvalidMessage"

@@ -170,7 +170,7 @@ def test_an_object_that_was_changed_in_place_is_seen() -> None:
     assert first.objects["path"]["points"][0] == [0, 0]
 
 
-def test_an_object_whose_number_becomes_an_array_is_checked() -> None:
+def test_an_object_is_checked_again_when_its_number_becomes_an_array() -> None:
     first = as_scene([BALL])
     scene = as_scene([BALL | {"x": np.zeros(3)}], first)
     assert scene.problems == ("the object 'ball' cannot be drawn: its x is no number",)
@@ -255,7 +255,7 @@ def test_an_object_that_raises_is_left_out_with_a_sentence(fields: dict[str, Any
         as_scene({"objects": [], "hud": fields["text"]})
 
 
-def test_the_other_objects_are_drawn() -> None:
+def test_beside_a_wrong_object_the_others_are_drawn() -> None:
     scene = as_scene([BALL | {"id": "lost", "x": float("nan")}, BALL])
     assert list(scene.objects) == ["ball"]
 
@@ -325,7 +325,7 @@ def test_texts_that_grow_are_too_many_at_last() -> None:
     assert (len(grown.objects), grown.problems) == (100, TOO_MUCH_TEXT)
 
 
-def test_texts_that_stay_count_too() -> None:
+def test_texts_that_stay_count_for_the_limit_too() -> None:
     scene = as_scene(text_objects(90, permanent=True))
     shown = as_scene([{**each, "id": f"more {each['id']}"} for each in text_objects(20)], scene)
     assert len(shown.objects) == 100

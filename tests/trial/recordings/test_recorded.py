@@ -178,7 +178,7 @@ def test_without_an_earlier_recording_there_is_no_past(server):
     assert load_recorded(MemoryStore(), "f", server, "3") is None
 
 
-def test_a_recording_without_lines_is_a_past_all_the_same():
+def test_a_recording_without_lines_counts_as_an_earlier_recording():
     assert load_recorded(MemoryStore(**{"f/s-1/3-trial.jsonl.gz": []}), "f", "s-2", "3") == RecordedTrial()
 
 

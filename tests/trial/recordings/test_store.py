@@ -58,7 +58,7 @@ def test_nothing_is_overwritten(opened: OpenedStore) -> None:
     assert opened.store.get(ANSWER) == b"first"
 
 
-def test_of_many_writers_one_wins(tmp_path: Path) -> None:
+def test_one_of_many_writers_creates_the_file(tmp_path: Path) -> None:
     store = open_store(str(tmp_path))
     with ThreadPoolExecutor(8) as pool:
         won = list(pool.map(lambda n: store.create("k/x.json", str(n).encode()), range(50)))

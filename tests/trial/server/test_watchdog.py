@@ -1,4 +1,4 @@
-"""When a server ends because nobody plays, or at its deadline."""
+"""When the watchdog ends a server: without a participant who plays, or at its deadline."""
 
 from trial.server.watchdog import Watchdog
 
