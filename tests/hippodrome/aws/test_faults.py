@@ -223,7 +223,7 @@ def erasing(installation: TimedInstallation) -> list[VisitorOnMoto]:
     installation.promised[f"{PROJECT}/users/{OTHER}/answers/1.json"] = {"said": "stays"}
 
     def administrator() -> Iterator[float]:
-        yield 200  # a start message that failed comes again after 90 seconds, and would begin what was erased anew
+        yield 200  # a failed start message comes again after 90 seconds, and would make the erased documents again
         for _ in range(VisitorOnMoto.TRIES):
             try:
                 left = installation.erase(PROJECT, USER)

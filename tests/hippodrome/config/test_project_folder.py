@@ -14,7 +14,7 @@ from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, only_
 __all__ = ["folder"]
 
 
-# What is accepted
+# Accepted folders
 
 
 def test_pages_in_the_game_are_found_with_their_groups(folder: Path) -> None:

@@ -100,7 +100,7 @@ def test_checking_does_not_change_the_message(registration: dict[str, Any]) -> N
     assert registration == before
 
 
-def test_what_a_message_leaves_out_has_its_default() -> None:
+def test_keys_that_a_message_leaves_out_have_their_defaults() -> None:
     found = parse_registration({"id": "a", "steps": [{"key": "1", "page": "consent"}]})
     assert (found["live"], found["cluster"], found["trial"]["maxEpisodes"]) == (True, "installation", 20)
     assert found["steps"] == [{"key": "1", "page": "consent", "variants": 0}]
@@ -215,7 +215,7 @@ def test_a_message_is_an_object(data: object) -> None:
     assert refused(data) == ["message: a registration must be a JSON object"]
 
 
-def test_an_empty_message_lacks_what_is_needed() -> None:
+def test_an_empty_message_gets_a_message_for_each_necessary_key() -> None:
     assert refused({}) == [
         "message: id: missing; give the project an id of letters, digits, dashes and underscores",
         "message: steps: must be a list of 1 to 500 steps",

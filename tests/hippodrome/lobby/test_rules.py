@@ -78,7 +78,7 @@ def test_the_participant_who_came_first_is_proposed_first_and_named_first() -> N
     assert groups(decide(lobby(*people))) == ["bd", "ca"]
 
 
-def test_the_label_decides_between_two_who_came_in_the_same_millisecond() -> None:
+def test_the_label_decides_between_two_participants_who_came_in_the_same_millisecond() -> None:
     assert groups(decide(lobby(one("c"), one("b"), one("a")))) == ["ab"]
 
 
@@ -299,7 +299,7 @@ def test_members_of_a_fallen_proposal_keep_their_turn() -> None:
         "cd",
     ]  # the proposal was made after the listing: it stays
     fallen = decide(entries, document)
-    assert groups(fallen) == ["cd"]  # a and b are proposed by the next run, which lists anew
+    assert groups(fallen) == ["cd"]  # a and b are proposed by the next run, which lists again
     assert groups(decide(entries, Decisions())) == ["bc"]
 
 
@@ -469,7 +469,7 @@ def here(label: str, *people: Waiting, document: Decisions | None = None, **chan
     return rules.number_here(document or Decisions(), lobby(*people), pairs(**{"players": 3, **changes}), label, NOW)
 
 
-def test_the_number_who_are_there_counts_those_who_could_play_together() -> None:
+def test_the_number_of_participants_who_are_there_counts_those_with_whom_one_could_play() -> None:
     assert here("a") == 1
     assert here("a", one("a")) == 1
     assert here("a", one("a"), one("b")) == 2
@@ -483,7 +483,7 @@ def test_the_number_who_are_there_counts_those_who_could_play_together() -> None
     assert here("a", *in_turn("abc", "111"), matching="mixed") == 2
 
 
-def test_the_number_who_are_there_includes_all_members_of_a_proposal_or_session() -> None:
+def test_the_number_of_participants_who_are_there_includes_all_members_of_a_proposal_or_session() -> None:
     assert here("a", document=Decisions(proposed=(proposal("ab"),))) == 2
     assert here("a", document=Decisions(formed=(formed("ab"),))) == 2
 

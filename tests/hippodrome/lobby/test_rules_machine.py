@@ -71,7 +71,7 @@ class World:
     # The document
 
     def change(self, settle: Callable[[Decisions], Decisions], listed: Entries = NONE_LISTED) -> Iterator[None]:
-        """Change the document as a run does that has listed these entries; write it if nobody else has."""
+        """Change the document as a run does that has listed these entries; write it if no other run has."""
         came = {**self.came, **{label: one.joined for label, one in listed.waiting.items()}}
         for _ in range(8):
             before, writes = self.document, self.writes

@@ -48,7 +48,7 @@ def test_a_step_with_variants_shows_the_file_of_the_participants_group() -> None
     assert study(steps=[]).group("alice") is None
 
 
-def test_a_size_that_nobody_chose_is_the_smallest_for_a_game() -> None:
+def test_the_default_size_is_the_smallest_for_a_game() -> None:
     assert (study(aws_setup=None).size.cpu, study(aws_setup=None).size.memory) == (1, 2)
     assert study(aws_setup=AwsSetup(cpu=4, memory=8)).size == AwsSetup(cpu=4, memory=8)
 
@@ -122,7 +122,7 @@ def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
 # ---- another number of players
 
 
-def test_a_registration_keeps_what_was_registered_last_for_each_other_number_of_players() -> None:
+def test_a_registration_keeps_the_last_registration_for_each_other_number_of_players() -> None:
     two = study(players=2, trial={"game": "two"}, task_definition="two:1", server_port=443)
     three = study(players=3, trial={"game": "three"}, warm_servers=2).following(two)
     again = study(players=3, trial={"game": "three, mended"}).following(three)

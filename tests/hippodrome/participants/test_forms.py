@@ -26,7 +26,7 @@ def test_every_input_of_a_form_is_kept(fields: dict[str, list[str]]) -> None:
 
 
 @given(st.dictionaries(names, values | st.integers() | st.booleans() | st.none() | st.lists(values), max_size=8))
-def test_a_json_object_is_kept_as_it_is(answers: dict[str, object]) -> None:
+def test_a_json_object_is_kept_unchanged(answers: dict[str, object]) -> None:
     assert forms.read(posted(json.dumps(answers).encode(), "application/json")).answers == answers
 
 

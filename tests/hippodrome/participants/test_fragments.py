@@ -76,7 +76,7 @@ def test_no_tag_or_comment_is_left_open_to_swallow_the_frame(text: str) -> None:
 
 
 @given(st.text(alphabet=st.characters(exclude_characters="<{\0", exclude_categories=["Cs"])))
-def test_text_without_tags_stays_as_it_is(text: str) -> None:
+def test_text_without_tags_is_unchanged(text: str) -> None:
     assert prepare(text, BASE).render({}) == text
 
 
@@ -183,7 +183,7 @@ def test_scripts_of_the_page_get_the_nonce() -> None:
     assert text == '<script nonce="N">a()</script><script nonce="N" src="/steps/demo/b.js"></script>'
 
 
-def test_scripts_from_elsewhere_get_it_only_if_the_project_allows_the_host() -> None:
+def test_scripts_of_other_hosts_get_the_nonce_only_if_the_project_allows_the_host() -> None:
     hosts = ("https://good.example",)
     addresses = [
         "https://good.example/a.js",

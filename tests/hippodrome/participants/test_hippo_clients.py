@@ -114,7 +114,7 @@ def test_every_refusal_has_a_page(platform: FakePlatform, query: str, form: Any,
 @pytest.mark.parametrize(("method", "content_type", "body", "status"), [
     ("POST", JSON, json.dumps({"a": "x" * 300_000}), 413), ("POST", "text/plain", "a=1", 415), ("DELETE", JSON, "", 405),
 ])  # fmt: skip
-def test_a_front_end_gets_a_status_for_which_it_shows_the_message(
+def test_a_front_end_gets_a_status_with_which_it_shows_the_message(
     platform: FakePlatform, method: str, content_type: str, body: str, status: int
 ) -> None:
     """It acts on statuses 200 and 400 only. Its button then gets the page that is due; other programs get the real status."""

@@ -37,7 +37,7 @@ def servers(platform: FakePlatform) -> Servers:
 
 
 def token(platform: FakePlatform) -> str:
-    """What the page is told."""
+    """The token that the page gets."""
     return SecretCache(platform.documents).token(record(platform))
 
 
@@ -453,7 +453,7 @@ def test_a_lost_message_for_a_replacement_is_sent_again(platform: FakePlatform, 
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
-# The end of a task is told twice
+# Two events tell the end of a task
 
 
 def test_a_server_taken_by_spot_is_replaced_as_soon_as_its_container_has_ended(

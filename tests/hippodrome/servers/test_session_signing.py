@@ -102,7 +102,7 @@ def test_no_answer_of_a_member_whose_data_were_erased_is_stored(world: World) ->
     assert ask(world, put(answer(""))) == 403
 
 
-def test_the_next_server_of_the_session_reads_what_the_earlier_ones_recorded(world: World) -> None:
+def test_the_next_server_of_the_session_may_read_the_recordings_of_the_earlier_ones(world: World) -> None:
     form(world, "alice", "bob")
     lost = server.close(claim(world), Reason.LOST, world.now())
     second = world.keep(server.replacing(lost, claim(world, attempt=2)))

@@ -688,7 +688,7 @@ def test_a_function_with_an_old_registration_reads_the_new_one_for_a_session_of_
 
 
 def test_a_session_of_another_number_gets_no_warm_server() -> None:
-    """Warm servers run what is registered now."""
+    """Warm servers run the present registration."""
     platform = installed(pairs(**TWO))
     servers = Servers(platform)
     servers.start(StartServer("maze", SESSION, players=2))

@@ -272,7 +272,7 @@ def test_a_lost_and_replaced_server_may_still_store_its_recordings(world: World)
     assert world.ask(put(f"{TRIALS}/3-trial.jsonl.gz"))[0] == 403
 
 
-def test_the_next_server_reads_what_the_earlier_ones_recorded(world: World) -> None:
+def test_the_next_server_may_read_the_recordings_of_the_earlier_ones(world: World) -> None:
     second = world.keep(server.replacing(server.close(world.claim(), Reason.LOST, world.now()), world.claim(attempt=2)))
     theirs = {"server": second.name, "credential": world.credential(second)}
     assert world.ask(get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{TRIALS}/3-episode-0001.jsonl.gz"), **theirs)[0] == 200

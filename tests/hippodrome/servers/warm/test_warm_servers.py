@@ -611,7 +611,7 @@ def waiting_writes(platform: FakePlatform, *acts: object) -> None:
 def test_a_stop_during_a_handover_leaves_nothing() -> None:
     """The participant's server is stopped before the handover is written: the function undoes what it has done."""
     platform = warmed(1)
-    # The participant's record, the pool, the warm server's name in the record, the warm server's record, what its trial is told.
+    # The participant's record, the pool, the warm server's name in the record, the warm server's record, its handover.
     waiting_writes(platform, None, None, None, None, lambda: Servers(platform).stop([STOP]))
     Servers(platform).start(START)
     assert record(platform).is_closed
