@@ -375,8 +375,8 @@ def test_two_tabs_that_open_at_once_are_one_participant() -> None:
     assert len([key for key in crossing.platform.documents.kept if key.startswith("_lobby/")]) == 1
 
 
-def test_two_game_steps_have_one_lobby_and_one_session(room: WaitingRoom) -> None:
-    """A project has one lobby: a participant who polls at two steps is in it once, and plays both games in one session."""
+def test_a_participant_with_two_pages_is_in_one_session(room: WaitingRoom) -> None:
+    """A request to the lobby names no step: so pages at two game steps are the same to it as two tabs."""
     room.poll("ann", "ann", "bob", seconds=6)
     assert room.together("ann", "bob")
     assert room.visit("ann") == room.membership("ann")
