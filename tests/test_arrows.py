@@ -73,7 +73,7 @@ def test_nothing_imports_uphill(package: str) -> None:
     assert {other: file for other, file in packages(package).items() if other not in MAY[package]} == {}
 
 
-def test_only_what_tests_the_bench_imports_it() -> None:
+def test_only_tests_of_the_bench_import_it() -> None:
     importing = {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "tests").rglob("*.py")
@@ -86,12 +86,12 @@ def test_only_what_tests_the_bench_imports_it() -> None:
     }
 
 
-def test_every_folder_of_deploy_is_a_room() -> None:
+def test_every_folder_of_deploy_has_its_rank() -> None:
     assert {path.parent.name for path in (ROOT / "deploy").glob("*/__init__.py")} == set(ROOMS["deploy"])
 
 
 @pytest.mark.parametrize(("package", "room"), [(package, room) for package, rooms in ROOMS.items() for room in rooms])
-def test_no_room_imports_from_one_above(package: str, room: str) -> None:
+def test_no_folder_of_deploy_imports_from_one_above(package: str, room: str) -> None:
     rooms, place = ROOMS[package], ROOT / package / room
     may = rooms[: rooms.index(room) + 1]
     wrong = {

@@ -86,7 +86,7 @@ def test_a_file_that_has_moved_is_noticed() -> None:
     assert {"docs/config.md", "servers/dns.py"} <= named
 
 
-def test_what_the_tables_of_failures_quote_is_what_the_program_says() -> None:
+def test_the_tables_of_failures_quote_messages_of_the_program() -> None:
     quoted = [
         (page.name, message)
         for page in PAGES

@@ -32,7 +32,7 @@ def test_every_command_is_run_by_a_test() -> None:
     assert sorted(first_hour.shown()) == sorted(run), "each once"
 
 
-def test_nothing_else_has_to_be_typed_but_who_one_is() -> None:
+def test_only_the_newcomers_own_values_have_to_be_typed() -> None:
     """The newcomer of the tests has these in the environment."""
     kinds = re.findall(r"(?m)^```(\w+)\n(.*?)^```", first_hour.text(), re.DOTALL)
     assert {kind for kind, _ in kinds} == {"console", "sh"}
@@ -41,7 +41,7 @@ def test_nothing_else_has_to_be_typed_but_who_one_is() -> None:
     assert [line.partition("=")[0] for line in typed] == [f"export {name}" for name in names]
 
 
-def test_commands_in_sentences_are_run_as_well() -> None:
+def test_commands_in_sentences_are_run_by_tests_too() -> None:
     told = first_hour.inline() - set(MENTIONED)
     targets = {" ".join(command.split()[:2]) for command in first_hour.shown()}
     assert {command for command in told if command not in targets} == set()
@@ -68,13 +68,13 @@ ELSEWHERE = {
 """Failures that other tests bring about, and where."""
 
 
-def test_every_failure_is_brought_about_by_a_test() -> None:
+def test_every_failure_is_caused_by_a_test() -> None:
     here = {*STOPS, *GOES_ON, IN_THE_WAY, NOTHING_LIVE, *(said for _, said in FAILURES), *(said for *_, said in OF_DNS)}
     assert sorted(first_hour.failures()) == sorted([*here, *ELSEWHERE]), "each once"
 
 
 @pytest.mark.parametrize("message", ELSEWHERE)
-def test_a_failure_that_others_bring_about_is_looked_for_there(message: str) -> None:
+def test_a_failure_that_another_test_causes_is_checked_there(message: str) -> None:
     """Three words of it in a row stand in an expectation of that test."""
     test = (first_hour.ROOT / "tests" / ELSEWHERE[message]).read_text()
     said = [part.split() for part in message.rstrip(".").split(first_hour.GAP)]
@@ -162,5 +162,5 @@ def test_there_are_failures_and_words_that_the_program_does_not_say() -> None:
         (["1 person"], "one person", "1 person"),
     ],
 )
-def test_what_is_shown_is_held_against_what_is_printed(shown: list[str], printed: str, line: str) -> None:
+def test_the_comparison_finds_output_that_differs_from_the_page(shown: list[str], printed: str, line: str) -> None:
     assert first_hour.differs(shown, printed) == line

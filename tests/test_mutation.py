@@ -66,11 +66,11 @@ def test_each_mutant_is_one_small_change_of_what_runs() -> None:
 
 
 @pytest.mark.parametrize("line", ['Size = Literal["small", "large"]', 'self._emit(Log(20, "small"))'])
-def test_types_and_what_is_logged_are_left_as_they_are(line: str) -> None:
+def test_types_and_log_calls_are_not_mutated(line: str) -> None:
     assert len(Mutants("core.py", line)) == 0
 
 
-def test_what_a_test_notices_is_killed_and_what_none_notices_survives(project: Path) -> None:
+def test_a_mutant_that_a_test_notices_is_killed_and_another_survives(project: Path) -> None:
     mutants = Mutants("core.py", CORE)
     judged = Runner(project).judge([mutants[1], mutants[2]], {"core.py": ["test_core.py"]})
     assert {mutant.becomes: killed for mutant, killed in judged} == {
@@ -80,12 +80,12 @@ def test_what_a_test_notices_is_killed_and_what_none_notices_survives(project: P
     assert (project / "core.py").read_text() == CORE
 
 
-def test_a_mutant_without_tests_is_no_killed_one(project: Path) -> None:
+def test_a_module_without_tests_is_an_error(project: Path) -> None:
     with pytest.raises(Fails, match=r"no test of core\.py"):
         list(Runner(project).judge([Mutants("core.py", CORE)[0]], {"core.py": ["test_nothing.py"]}))
 
 
-def test_tests_that_fail_without_a_mutation_judge_none(
+def test_tests_that_fail_without_a_mutation_are_reported(
     project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They pass when they run for the first time, and not where their libraries are loaded."""

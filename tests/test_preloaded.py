@@ -66,7 +66,7 @@ def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     signal.signal(signal.SIGINT, before)
 
 
-def test_it_has_what_it_was_given_and_nothing_else(begin: Any, tmp_path: Path) -> None:
+def test_a_forked_process_has_only_its_own_arguments_and_variables(begin: Any, tmp_path: Path) -> None:
     process = begin("7", stderr=subprocess.STDOUT, start_new_session=True)
     assert process.stdout.read() == "out\nerr\n"
     assert process.wait(20) == process.returncode == 7
@@ -84,7 +84,7 @@ def test_it_has_what_it_was_given_and_nothing_else(begin: Any, tmp_path: Path) -
     }
 
 
-def test_its_output_is_held_back_unless_it_is_told_not_to(tmp_path: Path) -> None:
+def test_the_output_of_a_forked_process_is_buffered_by_default(tmp_path: Path) -> None:
     (tmp_path / "says.py").write_text("import time; print('out'); open('said', 'w').close(); time.sleep(60)")
     seen = []
     for told in ("", "1"):
@@ -103,7 +103,7 @@ def test_its_output_is_held_back_unless_it_is_told_not_to(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_it_ends_by_a_signal_and_is_waited_for(begin: Any, number: signal.Signals) -> None:
+def test_a_forked_process_ends_by_a_signal_and_can_be_waited_for(begin: Any, number: signal.Signals) -> None:
     process = begin(stderr=subprocess.STDOUT)
     assert process.stdout.readline() == "out\n"
     assert process.poll() is None
@@ -114,7 +114,7 @@ def test_it_ends_by_a_signal_and_is_waited_for(begin: Any, number: signal.Signal
     process.send_signal(number)  # and nothing happens
 
 
-def test_one_that_ends_as_a_signal_is_sent_is_no_error(begin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_to_a_process_that_is_ending_is_no_error(begin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     process = begin("0", stderr=subprocess.STDOUT)
     if isinstance(process, preloaded.Forked):
         monkeypatch.setattr(process, "poll", lambda: [process.wait(20), None][1])  # it ends meanwhile
@@ -122,7 +122,7 @@ def test_one_that_ends_as_a_signal_is_sent_is_no_error(begin: Any, monkeypatch: 
     assert process.wait(20) in (0, -signal.SIGKILL)
 
 
-def test_each_has_variables_and_memory_of_its_own(begin: Any) -> None:
+def test_each_forked_process_has_its_own_variables_and_memory(begin: Any) -> None:
     first, second = begin(stderr=subprocess.STDOUT), begin(stderr=subprocess.STDOUT)
     assert first.pid != second.pid
     first.kill()
@@ -130,7 +130,7 @@ def test_each_has_variables_and_memory_of_its_own(begin: Any) -> None:
     assert second.poll() is None
 
 
-def test_all_that_it_says_is_read_and_its_end_awaited(begin: Any) -> None:
+def test_all_output_of_a_forked_process_is_read_and_its_end_awaited(begin: Any) -> None:
     process = begin("3", stderr=subprocess.STDOUT)
     assert process.communicate(timeout=20)[0] == "out\nerr\n"
     assert process.returncode == 3
@@ -153,7 +153,7 @@ print(json.dumps([said, f"{os.getppid()} {before}\\n", second.returncode]))
 """
 
 
-def test_one_that_starts_another_has_it_forked_by_the_same(tmp_path: Path) -> None:
+def test_a_forked_process_starts_others_by_the_same_forking_process(tmp_path: Path) -> None:
     """And in the environment of neither is anything of it."""
     (tmp_path / "starts.py").write_text(STARTS)
     env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT)}
@@ -172,9 +172,7 @@ PART = "import os; WORD, PID, WIDTH = {word!r}, os.getpid(), os.environ['COLUMNS
 WHOLE = "import os, part, sys; print(part.WORD, part.WIDTH, part.PID, part.PID == os.getpid(), sys.argv[1:])"
 
 
-def test_of_a_copy_of_the_project_the_code_is_loaded_as_it_is_now(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_copy_of_the_project_the_present_code_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(preloaded.OTHERS, "whole", (("part",), {}))
     (tmp_path / "whole.py").write_text(WHOLE)
     loaded_by = []
@@ -210,7 +208,9 @@ class Agent:
 """
 
 
-def test_what_make_check_tries_an_agent_in_is_the_same_forked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_process_in_which_make_check_tries_an_agent_is_the_same_when_forked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = write_study(tmp_path / "study", start=2)
     (folder / "agent.py").write_text(AGENT_TELLS)
     (tmp_path / "place").mkdir()
@@ -247,7 +247,7 @@ sys.exit("in the end")
 """
 
 
-def test_an_experiment_is_the_same_forked(tmp_path: Path) -> None:
+def test_the_process_of_an_experiment_is_the_same_when_forked(tmp_path: Path) -> None:
     """What is loaded, too: an experiment's project holds what the experiment has imported."""
     (tmp_path / "how.html").write_text("<h1>How</h1>")
     (tmp_path / "helper.py").write_text(HELPER)

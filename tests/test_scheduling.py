@@ -60,13 +60,13 @@ class Worker:
         self.shutting_down = True
 
 
-def test_the_longer_of_two_places_says_which_worker_gets_a_test() -> None:
+def test_the_longer_of_two_matching_places_decides_the_worker() -> None:
     assert _group("tests/browser/test_pages_browser.py::test_it") != _group("tests/browser/test_examples.py::test_it")
     assert _group("tests/trial/gym/test_gym_ids.py::test_it") is not None
     assert _group("tests/trial/test_match.py::test_it") is None
 
 
-def test_what_is_one_workers_is_there() -> None:
+def test_every_place_of_one_after_another_exists() -> None:
     places = [place for places in ONE_AFTER_ANOTHER for place in places]
     assert [place for place in places if not (TESTS.parent / place).exists()] == []
 

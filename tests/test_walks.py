@@ -58,7 +58,7 @@ def in_rooms() -> Iterator[tuple[Path, str]]:
 
 
 @pytest.mark.parametrize(("folder", "named"), list(in_rooms()))
-def test_what_the_tables_of_rooms_name_is_there(folder: Path, named: str) -> None:
+def test_every_file_in_the_tables_of_folders_exists(folder: Path, named: str) -> None:
     assert (folder / named).exists() or (ROOT / named).exists()
 
 

@@ -114,7 +114,7 @@ def test_a_small_crowd_comes_to_the_end_of_the_study(tmp_path: Path) -> None:
     assert len(answers) == 3 * len(study_on_moto.ANSWERS)
 
 
-def test_who_comes_to_warm_servers_is_given_one_and_waits_for_nothing() -> None:
+def test_participants_who_get_warm_servers_do_not_wait() -> None:
     arrivals = [warm.OPENS + 90.0 * number for number in range(5)]
     with quiet():
         came, without = (warm.simulated(servers, arrivals, 900, 2400) for servers in (2, 0))
@@ -145,7 +145,7 @@ def test_a_bill_counts_what_ran_and_on_demand_only_the_servers_cost_more() -> No
     assert all(usd.likely > 0 for usd in spot.values())
 
 
-def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cost_of_a_crowd_is_given_per_participant(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scale, "MANY", 3)
     with quiet():
         served, sweep, cut_off, cost = scale.many_at_once()
@@ -156,7 +156,7 @@ def test_the_cost_of_many_is_told_for_each_of_them(monkeypatch: pytest.MonkeyPat
     assert an_hour.low < cost["value"] < 2 * an_hour.high, "they play for an hour"
 
 
-def test_what_warm_servers_cost_is_what_the_command_says() -> None:
+def test_the_bench_and_the_command_agree_on_the_cost_of_warm_servers() -> None:
     (row,) = warm.what_they_cost()
     assert_well_formed([row])
     assert row["value"] == pytest.approx(warm.WARM * Prices().server_hour(1, 2, spot=True).likely)
@@ -171,7 +171,7 @@ def test_a_goal_is_about_the_ratio_where_there_is_a_yardstick() -> None:
     assert (without["ratio"], without["goal"], without["met"]) == (None, None, None)
 
 
-def test_a_measure_that_fails_does_not_keep_the_others() -> None:
+def test_a_failed_measurement_does_not_stop_the_others() -> None:
     def broken() -> Iterator[table.Row]:
         yield table.row("first", 1, "ms")
         raise RuntimeError("no such thing")
@@ -226,7 +226,7 @@ def test_the_command_keeps_the_rows_and_fails_only_for_what_it_could_not_measure
 # Rows that cannot mislead
 
 
-def test_memory_is_that_of_the_command_and_not_of_who_starts_it(tmp_path: Path) -> None:
+def test_memory_is_that_of_the_command_and_not_of_its_parent(tmp_path: Path) -> None:
     def held() -> float:
         with (tmp_path / "out").open("wb") as out:
             status, most = memory.run(
@@ -262,7 +262,7 @@ def test_waiting_counts_from_asking_to_the_page(crowd: scale.ServedCrowd) -> Non
         assert wait > scale.seconds_of(record["ready"]) - scale.seconds_of(record["requested"])
 
 
-def test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting() -> None:
+def test_a_start_server_with_a_concurrency_of_two_misses_the_goal_of_waiting() -> None:
     """What waits in the topic, the queue and the function is in the row."""
     few = {**world.WIRES, "start_server": world.WIRES["start_server"]._replace(concurrency=2)}
     with quiet():
@@ -271,7 +271,7 @@ def test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting() -> 
     assert row["met"] is False
 
 
-def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the_quotas() -> None:
+def test_the_time_of_aws_depends_on_arrivals_and_seed_alone_and_respects_the_quotas() -> None:
     at_once = [0.0] * 400
     assert aws_bound.aws_alone(at_once, 1) == aws_bound.aws_alone(at_once, 1) != aws_bound.aws_alone(at_once, 2)
     swift = {"starts": (1e-9, 0.0, 0.0), "propagation": (0.0, 0.0), "slow_zone": 0.0, "late_addresses": 0.0}
@@ -283,7 +283,7 @@ def test_what_aws_alone_takes_depends_on_arrivals_and_seed_only_and_respects_the
     assert {round(wait, 3) % 5 for wait in aws_bound.aws_alone(at_once, 1, busy)} == {0.0}
 
 
-def test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal(crowd: scale.ServedCrowd) -> None:
+def test_a_crowd_with_a_stranded_participant_or_a_leftover_misses_its_goal(crowd: scale.ServedCrowd) -> None:
     theirs = {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}
     assert scale.served("a crowd", [crowd], theirs, 1.0)["met"]
     visits = [*crowd.visits[1:], dataclasses.replace(crowd.visits[0], finished=None, reason="waited too long")]
@@ -318,7 +318,7 @@ def test_functions_that_run_for_long_miss_their_goal(crowd: scale.ServedCrowd, m
     assert next(scale.costs(crowd, theirs))["met"] is False
 
 
-def test_what_is_assumed_is_told_from_the_constants_and_of_worse_conditions_what_differs() -> None:
+def test_assumptions_are_printed_from_the_constants_and_differences_of_worse_conditions() -> None:
     told = scale.assumed(Conditions())
     assert told["zone busy after a change"].startswith("0.2 to 1 s")
     worse = scale.assumed(scale.WORSE["a zone busy for 5 to 15 s"])
@@ -356,14 +356,14 @@ def test_hippo_gives_up_an_address_after_a_minute_and_a_run_after_three_tries() 
     assert full["billed"] > 60
 
 
-def test_hippo_swallows_what_the_look_for_an_address_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hippo_ignores_errors_of_the_request_for_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(cloud.QUOTAS, "ec2:DescribeNetworkInterfaces", (1e-9, 0.0))
     found = scale._hippo(2, 1.0, None, early=True)
     assert found["failed"] == {"no address after a minute": 2}, "and Lambda does not invoke the function again"
     assert found["throttled"]["ec2:DescribeNetworkInterfaces"] == 2 * hippo.TRIES * hippo.ATTEMPTS
 
 
-def test_crowds_say_what_they_assume(crowd: scale.ServedCrowd) -> None:
+def test_rows_of_crowds_name_their_assumptions(crowd: scale.ServedCrowd) -> None:
     with quiet():
         pairs = sessions.crowd(sessions.PAIRS, Conditions(s3=(0.1, 0.2)), people=4, within=2.0)
     served = scale.served("a crowd", [crowd], {"ready": 0.1, "failed": {}, "both": ["10 %", "9 %"]}, 1.0)["detail"]
@@ -400,7 +400,7 @@ def test_a_row_says_whether_it_is_compared_or_a_bound_or_information() -> None:
     assert re.findall("compared|bound|information", text.getvalue())[:3] == ["compared", "bound", "information"]
 
 
-def test_goals_that_are_missed_are_named_once_more() -> None:
+def test_missed_goals_are_listed_below_the_table() -> None:
     text = io.StringIO()
     rows = [table.row(name, value, "s", at_most=2, bound="ours") for name, value in (("slow", 3), ("quick", 1))]
     table.show([*rows, table.row("information", 1, "s")], Console(file=text, width=100))
@@ -450,7 +450,7 @@ def test_all_servers_of_environments_have_the_same_core_and_the_client_another(m
     assert given == [{2}, {0, 1}] * 2
 
 
-def test_a_server_of_environments_that_is_dear_misses_its_goals() -> None:
+def test_an_expensive_server_of_environments_misses_its_goals() -> None:
     def run(cpu: float) -> gym.GymRun:
         return gym.GymRun(cpu, 1000, [cpu] * 5)
 
@@ -480,7 +480,7 @@ def test_frames_are_measured_on_three_kinds_of_picture(monkeypatch: pytest.Monke
     assert [row["value"] for row in rows if "unchanged" in row["name"]] == [1.0] * 3
 
 
-def test_frames_that_are_dear_or_late_or_changed_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_expensive_late_or_changed_frames_miss_their_goals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "FRAMES", 4)
     monkeypatch.setattr(trial, "ROUNDS", 1)
     kind = "scrolling texture, 600 x 400"
@@ -532,7 +532,7 @@ def test_pictures_that_cost_more_than_hippos_miss_their_goals(monkeypatch: pytes
         assert judged == [met, met]
 
 
-def test_a_server_that_is_busy_with_nobody_misses_its_goal() -> None:
+def test_a_server_that_is_busy_without_participants_misses_its_goal() -> None:
     assert [trial.judged_idle(share)["met"] for share in (0.009, 0.011)] == [True, False]
 
 
@@ -577,7 +577,7 @@ def test_a_sweep_that_its_timeout_cuts_off_misses_its_goal(monkeypatch: pytest.M
     assert (cut_off["value"], cut_off["met"]) == (2, False)
 
 
-def test_a_slow_policy_that_was_never_late_shows_nothing() -> None:
+def test_a_slow_policy_that_was_never_late_proves_nothing() -> None:
     with pytest.raises(RuntimeError, match="never late"):
         load.judged_policy(1.0, 1.0, 0.0)
 
@@ -623,7 +623,7 @@ def test_a_heavy_game_page_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> N
     assert [row["met"] for row in pages.weights() if "game page" in row["name"]] == [False, False]
 
 
-def test_a_fault_that_strands_somebody_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_that_strands_a_participant_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
     stranded = types.SimpleNamespace(well=False)
     monkeypatch.setattr(scale.faults, "explore", lambda journey, seed: [stranded])
     assert [row["met"] for row in scale.faults_of_journeys()] == [None, False]
@@ -687,7 +687,7 @@ def test_a_game_of_two_is_measured_at_a_real_server(monkeypatch: pytest.MonkeyPa
     assert 10 < found.bytes_a_tick < 500
 
 
-def test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal() -> None:
+def test_a_crowd_of_pairs_with_a_split_group_or_a_stranded_participant_misses_its_goal() -> None:
     with quiet():
         found = sessions.crowd(sessions.PAIRS, people=12, within=6.0)
         rows = [*sessions.judged("in pairs", found), *sessions.costs(found)]
@@ -742,35 +742,35 @@ SEEN_MISSED: dict[str, Any] = {
     "control.judged_start": test_cold_starts_that_are_slow_miss_their_goals,
     "data.download": test_memory_that_grows_with_the_study_misses_its_goal,
     "functions.judged_import": test_cold_starts_that_are_slow_miss_their_goals,
-    "gym._single": test_a_server_of_environments_that_is_dear_misses_its_goals,
-    "gym._batched": test_a_server_of_environments_that_is_dear_misses_its_goals,
+    "gym._single": test_an_expensive_server_of_environments_misses_its_goals,
+    "gym._batched": test_an_expensive_server_of_environments_misses_its_goals,
     "load.judged_cpu": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
     "load.judged_core": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
     "load.judged_policy": test_trials_that_cost_too_much_or_deliver_too_little_miss_their_goals,
     "pages.weights": test_a_heavy_game_page_misses_its_goal,
     "scale.costs": test_functions_that_run_for_long_miss_their_goal,
-    "scale.faults_of_journeys": test_a_fault_that_strands_somebody_misses_its_goal,
-    "scale.served": test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal,
-    "scale.served_many": test_a_crowd_with_somebody_stranded_or_something_left_misses_its_goal,
+    "scale.faults_of_journeys": test_a_fault_that_strands_a_participant_misses_its_goal,
+    "scale.served": test_a_crowd_with_a_stranded_participant_or_a_leftover_misses_its_goal,
+    "scale.served_many": test_a_crowd_with_a_stranded_participant_or_a_leftover_misses_its_goal,
     "scale.small_account": test_pages_that_find_no_room_miss_their_goal,
     "scale.sweeps": test_a_sweep_that_its_timeout_cuts_off_misses_its_goal,
-    "scale.waiting": test_a_start_server_that_serves_two_at_once_misses_the_goal_of_waiting,
+    "scale.waiting": test_a_start_server_with_a_concurrency_of_two_misses_the_goal_of_waiting,
     "scenes.judged": test_objects_that_are_late_or_large_miss_their_goals,
-    "sessions.judged": test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal,
-    "sessions.judged_faults": test_a_crowd_of_pairs_with_a_group_split_or_somebody_stranded_misses_its_goal,
+    "sessions.judged": test_a_crowd_of_pairs_with_a_split_group_or_a_stranded_participant_misses_its_goal,
+    "sessions.judged_faults": test_a_crowd_of_pairs_with_a_split_group_or_a_stranded_participant_misses_its_goal,
     "together.judged_game": test_games_of_several_that_deliver_too_little_miss_their_goals,
     "together.judged_core": test_games_of_several_that_deliver_too_little_miss_their_goals,
     "together.judged_views": test_views_that_are_late_or_apart_miss_their_goals,
-    "trial._seen": test_frames_that_are_dear_or_late_or_changed_miss_their_goals,
+    "trial._seen": test_expensive_late_or_changed_frames_miss_their_goals,
     "trial.encoding": test_pictures_that_cost_more_than_hippos_miss_their_goals,
-    "trial.judged_idle": test_a_server_that_is_busy_with_nobody_misses_its_goal,
+    "trial.judged_idle": test_a_server_that_is_busy_without_participants_misses_its_goal,
     "warm._compared": test_warm_servers_that_do_not_help_or_stay_miss_their_goals,
     "warm.an_hour": test_warm_servers_that_do_not_help_or_stay_miss_their_goals,
     "warm.for_real": test_a_warm_server_that_is_no_quicker_for_real_misses_its_goal,
 }
 
 
-def test_each_goal_has_a_test_that_sees_it_missed() -> None:
+def test_each_goal_has_a_test_that_reports_it_as_missed() -> None:
     """A new goal needs its test, and its line in the table above."""
     functions_with_goals = set()
     for file in (study_on_moto.ROOT / "bench").glob("*.py"):

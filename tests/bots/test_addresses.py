@@ -51,7 +51,7 @@ def test_the_pages_of_the_project_are_allowed(port: str) -> None:
         "",
     ],
 )
-def test_no_other_page_is(address: str) -> None:
+def test_other_pages_are_refused(address: str) -> None:
     with pytest.raises(AddressRefused):
         ONE_SITE.page(address)
 
@@ -80,7 +80,7 @@ def test_servers_by_their_own_names_are_allowed(address: str) -> None:
         "wss://127.0.0.1:5000/",
     ],
 )
-def test_no_other_server_is(address: str) -> None:
+def test_other_servers_are_refused(address: str) -> None:
     with pytest.raises(AddressRefused):
         ONE_SITE.server(address)
 
@@ -88,14 +88,14 @@ def test_no_other_server_is(address: str) -> None:
 @pytest.mark.parametrize(
     "address", ["https://127.0.0.1", "http://127.0.0.1.example.org/", "http://localhost@example.org"]
 )
-def test_on_one_machine_only_that_machine(address: str) -> None:
+def test_on_one_machine_only_its_own_addresses_are_allowed(address: str) -> None:
     with pytest.raises(AddressRefused):
         THIS_MACHINE.page(address)
     with pytest.raises(AddressRefused):
         THIS_MACHINE.server(address.replace("http", "ws"))
 
 
-def test_what_is_refused_is_named_without_its_token() -> None:
+def test_a_refused_address_is_named_without_its_token() -> None:
     with pytest.raises(AddressRefused) as refused:
         ONE_SITE.server("wss://evil.org/?token=secret")
     assert "secret" not in str(refused.value)
@@ -204,7 +204,7 @@ def test_a_page_that_is_moved_elsewhere_is_not_followed(site: Site) -> None:
     assert site.dialled == [f"{SITE}:443"]
 
 
-def test_a_waiting_page_that_asks_elsewhere_is_not_obeyed(site: Site) -> None:
+def test_a_waiting_page_that_polls_elsewhere_is_refused(site: Site) -> None:
     site.answer("GET", game(poll=f"https://{EVIL}/next?projectId=rehearsal-1"))
     assert f"not to https://{EVIL}" in site.walk()[0]
     assert site.dialled == [f"{SITE}:443"]
@@ -225,7 +225,7 @@ def test_a_server_that_redirects_is_not_followed(site: Site) -> None:
     assert set(site.dialled) == {f"{SITE}:443", f"{SERVER}.servers.example.org:443"}
 
 
-def test_a_site_with_a_certificate_of_nobody_known_is_told_nothing(site: Site) -> None:
+def test_a_site_with_an_untrusted_certificate_gets_no_request(site: Site) -> None:
     site.answer("GET", form(LINK))
     site._theirs = ssl.create_default_context()
     assert "CERTIFICATE_VERIFY_FAILED" in site.walk()[0]

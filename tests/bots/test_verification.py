@@ -55,12 +55,12 @@ def test_a_recording_is_read_to_its_end(tmp_path: Path, more: tuple[object, ...]
         "no gzip",
     ],
 )
-def test_what_is_no_whole_recording_is_not_complete(tmp_path: Path, packed: bytes) -> None:
+def test_an_incomplete_recording_is_recognized(tmp_path: Path, packed: bytes) -> None:
     assert not read_recording(recorded(tmp_path, packed)).complete
 
 
 @pytest.mark.parametrize("line", [lines({"kind": "step"}) * 500, b"x" * 10_000])
-def test_a_bomb_is_no_recording_and_fills_no_memory(
+def test_a_zip_bomb_is_no_recording_and_does_not_fill_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: bytes
 ) -> None:
     monkeypatch.setattr(verification, "MAX_BYTES", 2 * 1024**2)
@@ -74,6 +74,6 @@ def test_a_bomb_is_no_recording_and_fills_no_memory(
         tracemalloc.stop()
 
 
-def test_an_answer_that_no_program_can_read_is_none(tmp_path: Path) -> None:
+def test_an_unreadable_answer_counts_as_missing(tmp_path: Path) -> None:
     (tmp_path / "3.json").write_bytes(b"[" * 60_000)
     assert document(tmp_path / "3.json") == {}

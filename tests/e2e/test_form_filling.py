@@ -210,7 +210,7 @@ def test_every_kind_of_input_gets_an_answer(kind: str) -> None:
         assert re.fullmatch(patterns.get(kind, r"(?s).+"), text), text
 
 
-def test_patterns_are_kept_where_an_answer_can_be_thought_of() -> None:
+def test_answers_match_simple_patterns() -> None:
     for pattern in (r"\d{4}", "[A-Z]{3}", "[a-z]+", r"[A-Z0-9]{6}"):
         assert all(
             re.fullmatch(pattern, filled(f'<input name=x required pattern="{pattern}">', seed)[0][1])
@@ -218,12 +218,12 @@ def test_patterns_are_kept_where_an_answer_can_be_thought_of() -> None:
         )
 
 
-def test_what_may_be_left_out_sometimes_is() -> None:
+def test_optional_fields_are_sometimes_left_out() -> None:
     texts = [filled("<input name=x>", seed)[0][1] for seed in range(60)]
     assert 0 < sum(not text for text in texts) < 30
 
 
-def test_names_that_come_twice_are_lists_and_ours_are_no_answers() -> None:
+def test_repeated_names_are_lists_and_fields_of_hippodrome_are_no_answers() -> None:
     pairs = [("hippodrome-step", "1"), ("a", "1"), ("b", "2"), ("a", "3")]
     assert form_filling.gathered(pairs) == {"a": ["1", "3"], "b": "2"}
 

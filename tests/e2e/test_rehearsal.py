@@ -53,7 +53,7 @@ def said(process: Process, seconds: float = 120) -> str:
         process.kill()
 
 
-def test_the_example_project(tmp_path: Path) -> None:
+def test_bots_walk_through_the_example_project(tmp_path: Path) -> None:
     process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="local.rehearsal")
     text = said(process)
     assert process.returncode == 0, text
@@ -82,7 +82,7 @@ def test_bots_play_in_pairs_and_one_of_an_odd_number_finds_no_other(tmp_path: Pa
     assert (rows["servers left over"], rows["errors"]) == ("0", "none")
 
 
-def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Path) -> None:
+def test_bots_play_a_game_with_the_default_break_to_its_end(project: Any, tmp_path: Path) -> None:
     """With a break between its two episodes, as studies have it by default."""
     process = rehearsal(project(length=30, betweenEpisodes=1), "--bots", "3", "--at-once", "2", "--play", "0")
     text = said(process)
@@ -91,7 +91,7 @@ def test_to_the_end_of_a_game_of_the_project_as_it_is(project: Any, tmp_path: Pa
     assert "9 of 9" in text
 
 
-def test_to_the_end_of_a_game_with_pages_keys_and_limits_of_its_own(project: Any, tmp_path: Path) -> None:
+def test_bots_play_a_game_with_pages_keys_and_limits_to_its_end(project: Any, tmp_path: Path) -> None:
     """The environment would go on for long; there are pages to read before it and between its episodes."""
     folder = project(
         length=100_000,
@@ -171,7 +171,7 @@ def test_ctrl_c_ends_it_whichever_thread_the_signal_reaches(project: Any, tmp_pa
     assert servers_of(data) == []
 
 
-def test_it_says_what_is_missing(project: Any, tmp_path: Path) -> None:
+def test_the_rehearsal_says_what_is_missing(project: Any, tmp_path: Path) -> None:
     folder = project(start="raise RuntimeError('no such game')")
     process = rehearsal(folder, "--bots", "1", "--data", tmp_path / "data", TMPDIR=str(tmp_path))
     text = said(process)
@@ -187,7 +187,7 @@ def test_it_says_what_is_missing(project: Any, tmp_path: Path) -> None:
     assert servers_of(tmp_path / "data") == []
 
 
-def test_an_error_in_mid_game_is_told_in_its_own_words(project: Any) -> None:
+def test_the_error_of_an_agent_in_mid_game_is_printed(project: Any) -> None:
     folder = project()
     agent = folder / "agent.py"
     agent.write_text(agent.read_text().replace("self.t += 1", "raise ValueError('boom secret')"))
@@ -229,7 +229,7 @@ def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Pat
     assert not (tmp_path / "copy" / "data-try").exists()
 
 
-def test_bots_are_never_among_people(project: Any, tmp_path: Path) -> None:
+def test_bots_are_refused_in_a_folder_with_data_of_people(project: Any, tmp_path: Path) -> None:
     folder = project()
     (tmp_path / "people" / "tiny" / "users" / "ada").mkdir(parents=True)
     for place in (folder / "data", tmp_path / "people"):
@@ -241,7 +241,7 @@ def test_bots_are_never_among_people(project: Any, tmp_path: Path) -> None:
     assert "cannot be stored" in said(process)
 
 
-def test_a_broken_page_is_told_once_with_its_name(project: Any, tmp_path: Path) -> None:
+def test_a_broken_page_is_reported_once_with_its_name(project: Any, tmp_path: Path) -> None:
     folder = project(s3upload=False)
     (folder / "steps" / "after.html").write_text("<h1>After</h1>\n{{ nobody( }}")
     text = said(rehearsal(folder, "--bots", "2", "--play", "1", TMPDIR=str(tmp_path)))
@@ -281,7 +281,7 @@ def test_bots_stay_on_this_machine(project: Any) -> None:
     assert THIS_MACHINE.server("ws://127.0.0.1:5000/")
 
 
-def test_a_study_that_is_held_already(project: Any, hold: Any) -> None:
+def test_a_study_that_is_already_running_can_be_rehearsed(project: Any, hold: Any) -> None:
     study = hold(project(length=30))
     process = rehearsal(study.folder, "--bots", "2", "--url", study.link.split("/next")[0], "--data", study.data)
     text = said(process)
@@ -316,7 +316,7 @@ def test_bots_need_no_invitation_and_are_never_too_many(project: Any, tmp_path: 
     assert yaml.safe_load((tmp_path / "copy" / "config.yml").read_text())["project"] == tree["project"]
 
 
-def test_random_keys_are_only_what_the_game_knows() -> None:
+def test_random_keys_are_keys_of_the_game() -> None:
     keys_pressed = RandomKeys(
         Random(1), {"UI": ["left", "up", "start", "good"], "actionSpace": ["noop", "left", "jump"]}
     )
@@ -333,14 +333,14 @@ def test_random_keys_are_the_keys_that_the_project_names() -> None:
     assert {message["action"] for message in said if "action" in message} == {"left", "jump"}
 
 
-def test_a_bot_gives_up_where_nobody_answers(free_port: int) -> None:
+def test_a_bot_gives_up_if_no_server_answers(free_port: int) -> None:
     bot = Bot(f"http://127.0.0.1:{free_port}/next?projectId=x", "ada", Random(0), patience=1)
     report = asyncio.run(bot.run())
     assert not report.finished
     assert "no answer from" in report.errors[0]
 
 
-def test_the_link_of_one_participant() -> None:
+def test_the_link_gets_the_participants_id() -> None:
     assert (
         with_user("http://127.0.0.1/next?projectId=x&userId=old", "ada")
         == "http://127.0.0.1/next?projectId=x&userId=ada"

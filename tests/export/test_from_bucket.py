@@ -25,7 +25,7 @@ from tests.export.place import rows
 
 
 @pytest.mark.explores
-def test_nothing_is_cut_off_after_a_page(
+def test_data_of_more_than_a_page_are_fetched_whole(
     world: Installed, tmp_path: Path, capsys: Any, monkeypatch: Any, pages: int
 ) -> None:
     from moto.s3.models import s3_backends
@@ -51,7 +51,7 @@ def test_nothing_is_cut_off_after_a_page(
     assert asked == ["project_master_list.json", *pages_of_study], "no answer is fetched twice"
 
 
-def test_a_bucket_and_a_folder_give_the_same(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_a_bucket_and_a_folder_give_the_same_tables(world: Installed, tmp_path: Path, capsys: Any) -> None:
     into = into_folder(tmp_path / "data")
 
     def both(at: str, body: bytes) -> None:
@@ -69,7 +69,7 @@ def test_a_bucket_and_a_folder_give_the_same(world: Installed, tmp_path: Path, c
     assert world.run(capsys, "data", str(tmp_path / "here"), "--project", "maze").code == Exit.FAILED
 
 
-def test_a_body_that_breaks_off_is_asked_for_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_body_that_breaks_off_is_fetched_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     from botocore.exceptions import IncompleteReadError
 
     monkeypatch.setattr("export.source.time.sleep", lambda _: None)
@@ -99,7 +99,7 @@ def test_a_body_that_breaks_off_is_asked_for_again(world: Installed, tmp_path: P
         bucket.fetch(listed, tmp_path / "x")
 
 
-def test_refused_and_unknown(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_refused_and_unknown_projects_are_reported(world: Installed, tmp_path: Path, capsys: Any) -> None:
     crowd(world.put, tmp_path, 2)
     out = str(tmp_path / "out")
     assert "no project nobody" in world.run(capsys, "data", out, "--project", "nobody").err
@@ -140,7 +140,7 @@ def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, 
     assert [row["finished"] for row in rows(tmp_path / "after" / "answers.csv")] == ["true", "true", "true", "false"]
 
 
-def test_a_folder_goes_on_from_the_kept_bucket(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_a_folder_is_updated_from_the_kept_bucket(world: Installed, tmp_path: Path, capsys: Any) -> None:
     users = crowd(world.put, tmp_path, 3)
     world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze")
     world.put(key(users[2], "answers/3.json"), json.dumps(made_of.answer("3", GAME)).encode())
@@ -148,7 +148,7 @@ def test_a_folder_goes_on_from_the_kept_bucket(world: Installed, tmp_path: Path,
     assert world.run(capsys, *again).json["run"]["new"] == 1
 
 
-def test_answers_are_fetched_without_the_list_of_projects_which_is_told(
+def test_answers_are_fetched_without_the_list_of_projects_with_a_warning(
     world: Installed, tmp_path: Path, capsys: Any
 ) -> None:
     crowd(world.put, tmp_path, 3)
@@ -179,7 +179,7 @@ def test_a_kept_bucket_says_which_projects_it_holds(world: Installed, tmp_path: 
         ([], "holds no installation's data"),
     ],
 )
-def test_a_bucket_without_the_studys_data(
+def test_a_bucket_without_the_studys_data_is_reported(
     world: Installed, tmp_path: Path, capsys: Any, keys: list[str], says: str
 ) -> None:
     world.client("s3").create_bucket(Bucket="photographs")
@@ -190,7 +190,7 @@ def test_a_bucket_without_the_studys_data(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path, capsys: Any) -> None:
+def test_a_missing_or_foreign_bucket_is_reported(world: Installed, tmp_path: Path, capsys: Any) -> None:
     """Gap: moto does not compare ExpectedBucketOwner. S3 answers 403 to HeadBucket then, without a word."""
 
     def told(name: str) -> str:
@@ -207,7 +207,7 @@ def test_a_bucket_that_is_not_there_or_not_ours(world: Installed, tmp_path: Path
     assert "credentials have expired" in told(world.env["BUCKET"])
 
 
-def test_a_process_that_is_ended_in_the_middle_and_once_more(world: Installed, tmp_path: Path) -> None:
+def test_a_run_that_was_interrupted_twice_is_finished_by_the_next(world: Installed, tmp_path: Path) -> None:
     """One run is ended by Ctrl-C, and the next one by `kill -9`."""
     crowd(world.put, tmp_path, 30)
     out = tmp_path / "out"

@@ -47,7 +47,7 @@ def data(tmp: Path, *more: str, out: str = "out") -> Path:
 # Parquet
 
 
-def test_every_line_is_a_row_and_nothing_is_lost(tmp_path: Path) -> None:
+def test_every_line_of_a_recording_is_a_row(tmp_path: Path) -> None:
     body = record(tmp_path, "ann", episodes=3, frames=7, observe=True, messages=[{"action": "left"}], unheard_of=[1])
     lines = recording.read(body)
     done, found = convert(tmp_path, body)
@@ -87,7 +87,7 @@ def test_half_a_recording_gives_what_the_trial_itself_would_read(tmp_path: Path,
 
 @settings(max_examples=examples(80))
 @given(st.binary(max_size=300), st.integers(0, 2000), st.booleans())
-def test_no_damage_is_a_crash(noise: bytes, at: int, packed: bool) -> None:
+def test_damaged_recordings_cause_no_crash(noise: bytes, at: int, packed: bool) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +136,7 @@ def _first_header(lines: list[dict[str, Any]]) -> int:
     return next(number for number, line in enumerate(lines) if line.get("kind") == "header")
 
 
-def test_a_bomb_and_a_lie_about_an_observation(tmp_path: Path) -> None:
+def test_bombs_and_false_sizes_of_observations_are_refused(tmp_path: Path) -> None:
     big = recording.observation(np.zeros(50_000_000, np.uint8))
     lies = [
         {**big, "shape": [3]},
@@ -167,7 +167,7 @@ def test_long_recordings_are_written_in_groups(tmp_path: Path, monkeypatch: Any)
     assert done.rows == 952
 
 
-def test_several_gzip_files_in_one_are_read_to_the_end(tmp_path: Path) -> None:
+def test_a_recording_of_several_gzip_members_is_read_to_the_end(tmp_path: Path) -> None:
     one, two = (record(tmp_path, "ann", frames=n) for n in (3, 4))
     done, _ = convert(tmp_path, one + two)
     assert done.frames == 7
@@ -222,7 +222,7 @@ def test_minari_loads_what_was_played(tmp_path: Path, monkeypatch: Any) -> None:
     )
 
 
-def test_what_else_a_step_returned_is_in_tables_and_datasets(tmp_path: Path, monkeypatch: Any) -> None:
+def test_other_values_of_a_step_are_in_tables_and_datasets(tmp_path: Path, monkeypatch: Any) -> None:
     extra = {"agentAction": 2, "word": "good"}
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=6, extra=extra)
     out = data(tmp_path, "--format", "parquet,minari")
@@ -262,7 +262,7 @@ def test_the_table_of_episodes_says_who_played_and_each_players_score(tmp_path: 
     assert said == {"player.me": "human", "player.it": "policies/a.onnx", "score.me": "6.0", "score.it": "-1.5"}
 
 
-def test_a_score_beyond_all_numbers_is_missing_and_one_player_has_no_columns(tmp_path: Path) -> None:
+def test_an_infinite_score_is_missing_and_a_single_player_has_no_columns(tmp_path: Path) -> None:
     did = {"me": {"reward": 1.0}, "it": {"reward": 1e308}}
     head = {"me": {"kind": "human"}, "it": {"kind": "program"}}
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, frames=2, head={"players": head}, players=did)
@@ -315,7 +315,7 @@ def test_observations_of_other_types(tmp_path: Path, monkeypatch: Any, dtype: st
     assert episode.observations.tolist() == [0, 1, 0, 1, 0, 1]
 
 
-def test_without_observations_the_steps_number_stands_there_and_that_is_said(
+def test_without_observations_a_dataset_holds_step_numbers_and_the_run_says_so(
     tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
     crowd(into_folder(tmp_path / "data"), tmp_path, 3)
@@ -332,7 +332,7 @@ def test_without_observations_the_steps_number_stands_there_and_that_is_said(
     )
 
 
-def test_a_game_that_changed_on_the_way_makes_two_datasets(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_game_that_changed_during_the_study_makes_two_datasets(tmp_path: Path, monkeypatch: Any) -> None:
     put = into_folder(tmp_path / "data")
     users = crowd(put, tmp_path, 3, observe=True)
     late = record(tmp_path, users[2], observe=True, picture=lambda n: np.zeros((3, 3), np.float32))
@@ -382,7 +382,7 @@ def test_datasets_are_made_again_only_when_recordings_change(tmp_path: Path) -> 
 # Identities apart
 
 
-def test_apart_nothing_outside_private_names_anybody(tmp_path: Path, monkeypatch: Any) -> None:
+def test_with_identities_apart_only_private_files_name_participants(tmp_path: Path, monkeypatch: Any) -> None:
     import h5py
 
     put = into_folder(tmp_path / "data")
@@ -424,7 +424,7 @@ def test_apart_nothing_outside_private_names_anybody(tmp_path: Path, monkeypatch
     assert (out / "private").stat().st_mode & 0o077 == 0
 
 
-def test_numbers_stay_the_same_from_run_to_run_and_say_nothing(tmp_path: Path) -> None:
+def test_participants_numbers_are_random_and_stay_the_same_in_later_runs(tmp_path: Path) -> None:
     put = into_folder(tmp_path / "data")
     users = crowd(put, tmp_path, 6)
 
@@ -450,7 +450,7 @@ def test_numbers_stay_the_same_from_run_to_run_and_say_nothing(tmp_path: Path) -
     assert not set(again.values()) & set(first.values())  # drawn, not computed
 
 
-def test_other_identities_make_everything_anew(tmp_path: Path) -> None:
+def test_new_values_of_the_link_convert_recordings_again(tmp_path: Path) -> None:
     """A recording that was converted before the link's values were known."""
     put = into_folder(tmp_path / "data")
     (user,) = crowd(put, tmp_path, 1)
@@ -466,7 +466,7 @@ def test_other_identities_make_everything_anew(tmp_path: Path) -> None:
 # The documentation
 
 
-def test_what_the_documentation_shows_works(tmp_path: Path) -> None:
+def test_the_examples_of_the_documentation_work(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
     blocks = [block.replace("ms-pacman", "maze") for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
     (parquet,) = [block for block in blocks if "pyarrow" in block]

@@ -61,7 +61,7 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     assert not [name for name in on_disk if name.endswith(".part")]
 
 
-def test_answers_from_another_page_than_their_step_has_now_are_told_apart(place: Place) -> None:
+def test_answers_from_an_earlier_page_of_a_step_are_marked(place: Place) -> None:
     users = crowd(place.put, place.tmp, 3)
     assert place.done()["moved"] == []  # the versions of a page for groups are one page
     assert not [column for column in place.rows()[0] if column.startswith("page.")]
@@ -91,7 +91,7 @@ def test_a_page_says_which_of_its_fields_send_numbers_and_which_lists() -> None:
     assert fields_of(f"<![1]>{PAGE}<![") == kinds, "whatever else stands there"
 
 
-def test_columns_of_a_step_stand_as_its_fields_on_the_page_whatever_was_sent_first(place: Place) -> None:
+def test_columns_have_the_order_of_the_fields_on_the_page(place: Place) -> None:
     made_of.register(place.put)
     place.put("maze/steps/questionnaire.html", PAGE.encode())
     arrive(place.put, "user-1", {"2": {"old": "1", "zip": "1", "mood": "2"}})
@@ -101,7 +101,7 @@ def test_columns_of_a_step_stand_as_its_fields_on_the_page_whatever_was_sent_fir
     assert columns == ["age", "mood", "zip", "pet", "old", "made"], "what the page does not have comes last"
 
 
-def test_the_type_of_a_column_is_what_its_page_asks_for_whatever_was_sent_so_far(place: Place) -> None:
+def test_a_column_has_the_type_of_its_field_on_the_page(place: Place) -> None:
     made_of.register(place.put)
 
     def types(**sent: str | list[str]) -> dict[str, str]:
@@ -135,7 +135,7 @@ def test_the_type_of_a_column_is_what_its_page_asks_for_whatever_was_sent_so_far
     assert types(**first | {"age": "9" * 20})["age"] == "string"
 
 
-def test_what_callbacks_recorded_is_a_table(place: Place) -> None:
+def test_values_recorded_by_callbacks_are_a_table(place: Place) -> None:
     (user,) = crowd(place.put, place.tmp, 1, callbacks=[
         {"callback": "on_tick", "name": "lean", "value": {"left": 0.5}},
         {"callback": "on_tick", "name": "said", "value": 'text, "quoted"'},
@@ -165,7 +165,7 @@ def test_without_callbacks_there_is_no_table_of_them(place: Place) -> None:
     assert not list(place.out.glob("callbacks.*"))
 
 
-def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
+def test_only_the_owner_may_read_downloaded_files(place: Place) -> None:
     before = os.umask(0o022)
     try:
         crowd(place.put, place.tmp, 2)
@@ -180,7 +180,7 @@ def test_what_is_downloaded_is_its_owners_alone(place: Place) -> None:
     assert "Other users of this machine can read" in place.run().err
 
 
-def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
+def test_documents_of_warm_servers_count_as_no_participants(place: Place) -> None:
     users = crowd(place.put, place.tmp, 2)
     name = "s" + "a" * 20 + "-1"
     handover = Handover(users[0], 1, made_of.server(users[0]))
@@ -194,7 +194,7 @@ def test_what_is_kept_of_warm_servers_is_no_participants(place: Place) -> None:
     assert not [p for p in place.out.rglob("*") if p.is_file() and name.encode() in p.read_bytes()]
 
 
-def test_only_csv_fetches_no_recordings_and_leaves_none_behind_later(place: Place) -> None:
+def test_csv_alone_fetches_no_recordings_and_removes_earlier_tables_of_them(place: Place) -> None:
     crowd(place.put, place.tmp, 3)
     assert place.done("--format", "csv")["run"]["new"] == 3 * 3 + 2 * 2  # without the two recordings
     assert not (place.out / "recordings").exists()
@@ -206,7 +206,7 @@ def test_only_csv_fetches_no_recordings_and_leaves_none_behind_later(place: Plac
     assert place.rows("answers")
 
 
-def test_raw_files_are_kept_byte_by_byte(place: Place) -> None:
+def test_raw_files_are_copied_byte_by_byte(place: Place) -> None:
     (user, *_) = crowd(place.put, place.tmp, 2)
     place.done()
     assert place.done("--raw")["run"]["changed"] == place_files(place)
@@ -231,7 +231,7 @@ def test_long_has_a_row_for_each_text(place: Place) -> None:
     assert place.rows("answers-long")[0]["page"] == "consent-1"
 
 
-def test_a_study_that_is_not_registered_any_more_still_has_its_answers(place: Place) -> None:
+def test_answers_of_a_study_that_is_no_longer_registered_are_exported(place: Place) -> None:
     crowd(place.put, place.tmp, 3)
     (place.data / "project_master_list.json").write_text('{"projects": [{"id": 7}]}')
     ran = place.run()
@@ -278,7 +278,7 @@ def test_a_dry_run_says_what_there_is_to_do_and_makes_nothing(place: Place) -> N
     assert (place.out / "private/state.sqlite").read_bytes() == state
 
 
-def test_who_was_erased_at_the_source_is_erased_here(place: Place) -> None:
+def test_participants_erased_at_the_source_are_erased_in_the_folder(place: Place) -> None:
     users = crowd(place.put, place.tmp, 4)
     place.done("--raw", "--format", "csv,parquet,minari", "--identities", "apart", "--long")
     numbers = {row["userId"]: row["participant"] for row in rows(place.out / "private/identities.csv")}
@@ -308,7 +308,7 @@ def test_an_empty_source_empties_no_folder(place: Place) -> None:
 
 
 @pytest.mark.parametrize("how", ["missing", "shorter", "same size"])
-def test_what_is_damaged_here_is_found_by_its_hash_and_made_anew(place: Place, how: str) -> None:
+def test_a_damaged_file_is_found_by_its_hash_and_made_again(place: Place, how: str) -> None:
     crowd(place.put, place.tmp, 3)
     place.done()
     before = place.listed()
@@ -332,7 +332,7 @@ def test_what_is_damaged_here_is_found_by_its_hash_and_made_anew(place: Place, h
     assert place.listed() == before
 
 
-def test_a_damaged_manifest_or_state_is_said(place: Place) -> None:
+def test_a_damaged_manifest_or_state_is_reported(place: Place) -> None:
     crowd(place.put, place.tmp, 2)
     place.done()
     for name in ("manifest.json", "private/manifest.json"):
@@ -358,7 +358,7 @@ class Trouble(Exception):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, Trouble])
 @pytest.mark.parametrize("at", [0, 1, 7, 20])
-def test_cut_off_while_fetching_it_goes_on_from_there(place: Place, monkeypatch: Any, at: int, error: Any) -> None:
+def test_a_run_interrupted_while_fetching_is_continued(place: Place, monkeypatch: Any, at: int, error: Any) -> None:
     crowd(place.put, place.tmp, 8)
     other = place.tmp / "whole"
     assert place.run(out=other).code == Exit.DONE
@@ -386,7 +386,7 @@ def test_cut_off_while_fetching_it_goes_on_from_there(place: Place, monkeypatch:
     }
 
 
-def test_killed_between_a_file_and_its_note(place: Place) -> None:
+def test_a_file_that_was_not_noted_before_a_kill_is_made_again(place: Place) -> None:
     """The file exists, and the state does not have it, so it is made again."""
     crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
@@ -399,7 +399,7 @@ def test_killed_between_a_file_and_its_note(place: Place) -> None:
 
 
 @pytest.mark.parametrize("what", ["answers", "episodes", "write"])
-def test_cut_off_while_writing_tables(place: Place, monkeypatch: Any, what: str) -> None:
+def test_tables_are_whole_after_an_interruption(place: Place, monkeypatch: Any, what: str) -> None:
     users = crowd(place.put, place.tmp, 3)
     place.done()
     before = {name: (place.out / name).read_bytes() for name in ("answers.csv", "answers.parquet", "manifest.json")}
@@ -420,7 +420,7 @@ def test_cut_off_while_writing_tables(place: Place, monkeypatch: Any, what: str)
     assert place.rows()[2]["3.score"] == "12.5"
 
 
-def test_two_runs_in_one_folder_at_once(place: Place) -> None:
+def test_a_second_run_in_the_same_folder_is_refused(place: Place) -> None:
     from export import run
 
     crowd(place.put, place.tmp, 2)
@@ -440,7 +440,7 @@ def test_two_runs_in_one_folder_at_once(place: Place) -> None:
         (FileNotFoundError(2, "No such file or directory", "x.hdf5"), "x.hdf5", "HIPPODROME_DEBUG=1"),
     ],
 )
-def test_what_files_refuse_is_a_sentence_that_names_no_other_cause(
+def test_errors_of_the_file_system_are_reported_in_a_sentence(
     place: Place, error: OSError, cause: str, advice: str
 ) -> None:
     crowd(place.put, place.tmp, 2)
@@ -459,7 +459,7 @@ def test_what_files_refuse_is_a_sentence_that_names_no_other_cause(
 # Broken input
 
 
-def test_broken_input_is_listed_and_nothing_is_dropped_silently(place: Place) -> None:
+def test_broken_input_is_listed(place: Place) -> None:
     users = crowd(place.put, place.tmp, 3)
     whole = record(place.tmp, users[0], frames=2000)
     put = place.put
@@ -502,7 +502,7 @@ def test_broken_input_is_listed_and_nothing_is_dropped_silently(place: Place) ->
     assert place.done()["counts"]["problems"] == told["counts"]["problems"]  # also of files that were not fetched again
 
 
-def test_a_file_that_goes_while_it_is_fetched(place: Place, monkeypatch: Any) -> None:
+def test_a_file_deleted_while_it_is_fetched_is_skipped(place: Place, monkeypatch: Any) -> None:
     users = crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
         read = Folder.read
@@ -519,7 +519,7 @@ def test_a_file_that_goes_while_it_is_fetched(place: Place, monkeypatch: Any) ->
     assert place.rows()[0]["1.consent"] == "yes"
 
 
-def test_names_that_some_machines_confuse(place: Place) -> None:
+def test_folders_of_participants_are_distinct_and_allowed_on_every_machine(place: Place) -> None:
     from export.state import ExportState
 
     state = ExportState(None)
@@ -528,7 +528,7 @@ def test_names_that_some_machines_confuse(place: Place) -> None:
     assert not {"con", "nul", "com1"} & {name.lower() for name in folders}
 
 
-def test_folders_that_are_not_ours_and_words_that_mean_nothing(place: Place, tmp_path: Path) -> None:
+def test_foreign_folders_and_wrong_options_are_refused(place: Place, tmp_path: Path) -> None:
     crowd(place.put, place.tmp, 2)
     full = tmp_path / "full"
     full.mkdir()

@@ -41,7 +41,7 @@ def table(out: Path, *columns: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_a_sessions_recording_is_read_once_and_says_whose_each_step_is(place: Place) -> None:
+def test_a_sessions_recording_is_read_once_and_names_the_player_of_each_action(place: Place) -> None:
     study(place.put, place.tmp)
     done = place.done()
     assert done["counts"]["sessions"] == done["counts"]["recordings"] == 1
@@ -172,7 +172,7 @@ def test_a_member_who_was_erased_is_no_ones_in_tables_and_the_other_stays(place:
     assert [each["id"] for each in done["minari"]] == ["maze-3-right-v0"]
 
 
-def test_apart_nothing_of_any_member_stands_outside_private(place: Place) -> None:
+def test_with_identities_apart_only_private_files_hold_members_data(place: Place) -> None:
     study(place.put, place.tmp)
     told = [ANN, BOB, f"prolific-of-{ANN}", f"prolific-of-{BOB}"]
     made = [line.replace(b"words-of-annabel", f"I am {' and '.join(told)}".encode()) for line in lines()]
@@ -228,7 +228,7 @@ def test_an_episode_with_a_number_that_no_dataset_can_hold_is_left_out(
     assert (right["id"], right["episodes"], right["leftOut"]) == ("maze-3-right-v0", 0, {reason: 1})
 
 
-def test_who_could_be_either_player_has_a_dataset_of_each(tmp_path: Path, monkeypatch: Any) -> None:
+def test_participants_with_different_players_have_a_dataset_for_each_player(tmp_path: Path, monkeypatch: Any) -> None:
     """Groups with different players, without sessions."""
     put = into_folder(tmp_path / "data")
     from tests.export.data_world import arrive, record, register
@@ -248,7 +248,7 @@ def test_who_could_be_either_player_has_a_dataset_of_each(tmp_path: Path, monkey
         assert about["participant"] == f"user-of-{player}"
 
 
-def test_half_a_session_still_gives_what_there_is(place: Place) -> None:
+def test_an_incomplete_session_is_exported_as_far_as_possible(place: Place) -> None:
     """A recording that is cut off, and sessions whose document is missing or damaged."""
     study(place.put, place.tmp)
     made = lines()

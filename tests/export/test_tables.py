@@ -103,7 +103,7 @@ def test_columns_stand_in_the_order_of_the_study_and_of_its_pages(tmp_path: Path
 @example([{"a": HOSTILE, "": "empty name"}, {"a": "one"}])
 @example([{"x\ud800": "1"}, {"x\ufffd": "2"}])
 @example([{"a": "1\x85\u20282"}])
-def test_whatever_was_sent_comes_back(people: list[dict[str, Any]]) -> None:
+def test_tables_give_back_every_value_that_was_sent(people: list[dict[str, Any]]) -> None:
     state = filled({f"u{number}": {"2": given} for number, given in enumerate(people)})
     with tempfile.TemporaryDirectory() as folder:
         sheet, parquet = written(state, Path(folder))
@@ -192,7 +192,7 @@ def test_a_number_that_a_form_sent_can_be_read_back_as_the_text_that_was_sent(se
     assert [as_sent(row["2.x"], text) for row, text in zip(parquet, sent, strict=True)] == sent
 
 
-def test_for_a_spreadsheet_nothing_is_a_formula_and_otherwise_everything_is_true(tmp_path: Path) -> None:
+def test_only_tables_for_spreadsheets_escape_formulas(tmp_path: Path) -> None:
     sent = {str(number): text for number, text in enumerate([*HOSTILE, "-5.5", "+1e3", "1-2"])}
     state = filled({"-user": {"2": sent}})
     true, _ = written(state, tmp_path)
@@ -206,7 +206,7 @@ def test_for_a_spreadsheet_nothing_is_a_formula_and_otherwise_everything_is_true
     assert (tmp_path / "answers.csv").read_bytes().startswith("\ufeff".encode())
 
 
-def test_a_flood_of_fields_does_not_become_a_flood_of_columns(tmp_path: Path, monkeypatch: Any) -> None:
+def test_the_number_of_columns_is_limited(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("export.answers.MAX_FIELDS", 10)
     monkeypatch.setattr("export.answers._MAX_COUNTED", 60)
     people = {f"u{n}": {"2": {"age": "3", "pet": "cat"}} for n in range(5)}
@@ -246,7 +246,7 @@ def test_hostile_keys_never_become_paths(rest: str) -> None:
         assert item.user
 
 
-def test_the_keys_that_hippodrome_writes_are_known() -> None:
+def test_every_key_that_hippodrome_writes_is_recognized() -> None:
     kinds = {
         "ann/participant.json": KeyKind.PARTICIPANT,
         "ann/answers/finalStep.json": KeyKind.ANSWER,
@@ -278,7 +278,7 @@ def test_an_identity_leaves_every_text_and_every_json(identity: str, before: str
         assert identity not in hide.text(form) or identity in before + after
 
 
-def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
+def test_only_identifying_values_of_enough_characters_are_replaced() -> None:
     document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
     known = identities(ExportedParticipant("user-0001", "p1", "p1", document))
     hide = Scrub(known)
@@ -293,7 +293,7 @@ def test_what_gives_somebody_away_and_what_is_too_short_to_be_found() -> None:
 # Writing
 
 
-def test_csv_is_what_the_standard_says(tmp_path: Path) -> None:
+def test_csv_follows_the_standard(tmp_path: Path) -> None:
     columns = [
         table_files.Column("a"),
         table_files.Column("b", "texts"),
@@ -307,7 +307,7 @@ def test_csv_is_what_the_standard_says(tmp_path: Path) -> None:
     assert next(csv.reader(io.StringIO(sheet.read_text()))) == ["a", "b", "c", "d"]
 
 
-def test_nothing_half_written_stands_under_a_name(tmp_path: Path) -> None:
+def test_files_appear_only_when_they_are_whole(tmp_path: Path) -> None:
     def rows() -> Any:
         yield ["a"]
         raise KeyboardInterrupt

@@ -48,7 +48,7 @@ def test_a_study_of_this_machine_is_converted_without_a_word_about_aws(
     assert told(capsys, "--project", "maze").code == Exit.DONE
 
 
-def test_a_study_of_this_machine_that_nobody_has_begun(tmp_path: Path, capsys: Any) -> None:
+def test_a_local_study_without_participants_says_so(tmp_path: Path, capsys: Any) -> None:
     folder = project_folder(tmp_path)
     ran = told(capsys, "--project", f"{folder}/")
     assert ran.code == Exit.FAILED

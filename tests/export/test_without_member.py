@@ -27,7 +27,9 @@ def without(folder: Path, body: bytes, seat: int = 0, user: str = ANN) -> tuple[
 
 
 @pytest.mark.parametrize(("seat", "user", "player", "other"), [(0, ANN, "left", "right"), (1, BOB, "right", "left")])
-def test_nothing_that_a_member_sent_stays(tmp_path: Path, seat: int, user: str, player: str, other: str) -> None:
+def test_everything_that_the_member_sent_is_removed(
+    tmp_path: Path, seat: int, user: str, player: str, other: str
+) -> None:
     body = packed(tmp_path, [*lines(), recording.line("error", episode=1, error=f"{user} and {user.upper()}")])
     left, differs = without(tmp_path, body, seat, user)
     text = gzip.decompress(left)
@@ -45,7 +47,7 @@ def test_nothing_that_a_member_sent_stays(tmp_path: Path, seat: int, user: str, 
 
 
 @pytest.mark.parametrize(("seat", "user", "other"), [(0, ANN, BOB), (1, BOB, ANN)])
-def test_what_the_others_sent_and_the_game_stay_as_they_were(tmp_path: Path, seat: int, user: str, other: str) -> None:
+def test_the_game_and_the_others_messages_are_unchanged(tmp_path: Path, seat: int, user: str, other: str) -> None:
     body = packed(tmp_path, lines(observe=True))
     left, _ = without(tmp_path, body, seat, user)
     before, after = recording.read(body), recording.read(left)
@@ -75,13 +77,13 @@ def test_the_game_can_still_be_repeated(tmp_path: Path) -> None:
     assert whole.ended == rest.ended
 
 
-def test_lines_of_others_stay_byte_for_byte(tmp_path: Path) -> None:
+def test_lines_of_others_are_unchanged_byte_for_byte(tmp_path: Path) -> None:
     odd = b'{"kind":"callback","callback":"on_tick","episode":1, "value":1.50, "name":"caf\\u00e9"}\n'
     left, _ = without(tmp_path, packed(tmp_path, [*lines(), odd]))
     assert odd in gzip.decompress(left)
 
 
-def test_one_cut_off_stays_cut_off_and_keeps_what_there_is(tmp_path: Path) -> None:
+def test_a_recording_that_was_cut_off_stays_so_and_keeps_its_lines(tmp_path: Path) -> None:
     made = lines()
     left, _ = without(tmp_path, packed(tmp_path, made[:9], close=False))
     unpack = zlib.decompressobj(31)
@@ -91,7 +93,7 @@ def test_one_cut_off_stays_cut_off_and_keeps_what_there_is(tmp_path: Path) -> No
     assert said(ANN).encode() not in found
 
 
-def test_without_a_head_no_message_of_anyone_stays(tmp_path: Path) -> None:
+def test_without_a_header_the_messages_of_all_members_are_removed(tmp_path: Path) -> None:
     left, _ = without(tmp_path, packed(tmp_path, lines()[1:]))
     text = gzip.decompress(left)
     assert said(ANN).encode() not in text
@@ -99,7 +101,7 @@ def test_without_a_head_no_message_of_anyone_stays(tmp_path: Path) -> None:
     assert len(steps(recording.read(left))) == 6
 
 
-def test_what_does_not_say_whose_it_is_goes(tmp_path: Path) -> None:
+def test_lines_that_name_no_player_are_removed(tmp_path: Path) -> None:
     more = [
         recording.line("callback", episode=1, callback="on_feedback", name="who", value="unknown"),
         recording.line("end", episode=1, why="stopped", messages=[{"ns": 1, "command": "unknown"}, "unknown"]),
@@ -108,7 +110,7 @@ def test_what_does_not_say_whose_it_is_goes(tmp_path: Path) -> None:
     assert b"unknown" not in gzip.decompress(left)
 
 
-def test_a_place_that_the_substitute_had_is_no_members(tmp_path: Path) -> None:
+def test_a_place_of_the_substitute_belongs_to_no_member(tmp_path: Path) -> None:
     """The header has the seats. After the erasure of a member, the order of the humans is not that of the seats."""
     head = {"left": {"kind": "policy", "policy": "random", "seat": 0}, "right": {"kind": "human", "seat": 1}}
     body = packed(tmp_path, lines(head=head))
@@ -125,7 +127,7 @@ def test_the_seed_of_the_policy_that_took_the_place_stays(tmp_path: Path) -> Non
 
 @settings(max_examples=examples(60))
 @given(st.binary(max_size=200), st.integers(0, 3000), st.booleans())
-def test_no_damage_keeps_what_they_sent(noise: bytes, at: int, inside: bool) -> None:
+def test_damaged_recordings_keep_nothing_of_the_member(noise: bytes, at: int, inside: bool) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as name:

@@ -46,7 +46,7 @@ CONDITIONS = ("IfNoneMatch", "IfMatch")
 HASHED = "sabcdefghijklmnopqrst-1.servers.example.org"
 
 
-def test_ministack_is_there_where_it_must_be() -> None:
+def test_ministack_is_installed_where_it_is_required() -> None:
     """Without it no role is judged, in no test; CI sets REQUIRE_MINISTACK."""
     if evaluator() is None:
         if os.environ.get("REQUIRE_MINISTACK"):
@@ -358,15 +358,15 @@ def walked(name: str) -> IamEnforcement:
 
 
 @pytest.mark.parametrize("name", WALKS)
-def test_the_functions_have_the_rights_for_all_that_they_do_and_no_more(judged: None, name: str) -> None:
+def test_the_functions_have_the_permissions_for_their_calls_and_no_more(judged: None, name: str) -> None:
     assert walked(name).findings() == []
 
 
-def test_every_row_of_who_may_what_is_needed(judged: None) -> None:
+def test_every_row_of_who_may_is_needed(judged: None) -> None:
     assert set(WHO_MAY) == frozenset[str]().union(*(walked(name).kinds for name in WALKS))
 
 
-def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
+def test_a_missing_permission_is_noticed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("StartServerRole", less)
     document["Statement"] = [s for s in document["Statement"] if s["Action"] != "ecs:RunTask"]
@@ -384,7 +384,7 @@ def test_a_permission_taken_away_is_missed(world: MotoWorld) -> None:
     world.iam = None  # this finding was wanted
 
 
-def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
+def test_a_missing_permission_to_pass_a_role_is_noticed(world: MotoWorld) -> None:
     world.ids["task_execution_role"] = "arn:aws:iam::123456789012:role/somebody-elses"
     world.enforce(IamEnforcement(world))
     Person(StudyOnMoto(world), "R_alice").to_the_game()
@@ -395,7 +395,7 @@ def test_a_role_that_may_not_be_passed_is_missed(world: MotoWorld) -> None:
     world.iam = None
 
 
-def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
+def test_a_needless_permission_is_noticed(world: MotoWorld) -> None:
     more = copy.deepcopy(cfn.template())
     (document,) = cfn.role_documents("SendStartServerMessageRole", more)
     document["Statement"].append({"Effect": "Allow", "Action": "sns:Publish", "Resource": {"Ref": "StopServerTopic"}})
@@ -409,7 +409,7 @@ def test_a_permission_too_many_is_noticed(world: MotoWorld) -> None:
     world.iam = None
 
 
-def test_a_variable_that_the_template_forgets_is_missed(world: MotoWorld) -> None:
+def test_a_variable_that_is_missing_in_the_template_is_noticed(world: MotoWorld) -> None:
     less = copy.deepcopy(cfn.template())
     del less["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"]["SECURITY_GROUP"]
     world.enforce(IamEnforcement(world, less))
@@ -497,7 +497,7 @@ def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: 
     assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
 
 
-def test_answers_are_never_written_over(judge: Judge) -> None:
+def test_answers_cannot_be_overwritten(judge: Judge) -> None:
     theirs = {
         f"{PROJECT}/users/R_alice/answers/1.json": {"next_step", SIGN},
         f"{PROJECT}/users/R_alice/trials/a-1/3-trial.jsonl.gz": {SIGN},
@@ -519,7 +519,7 @@ def test_a_write_with_if_match_reads_as_well() -> None:
     assert actions == {"IfNoneMatch": ["s3:PutObject"], "IfMatch": ["s3:PutObject", "s3:GetObject"]}
 
 
-def test_who_is_a_member_is_written_once_by_the_control_plane(judge: Judge) -> None:
+def test_only_the_control_plane_writes_memberships_and_only_once(judge: Judge) -> None:
     """And no server of a session may change it, nor what is decided in the lobby."""
     theirs = {
         f"{PROJECT}/users/R_alice/session.json": {"next_step", "sweep"},
@@ -538,7 +538,7 @@ def test_who_is_a_member_is_written_once_by_the_control_plane(judge: Judge) -> N
         assert judge.who_may(Ask(action, lobby)) == frozenset()
 
 
-def test_who_plays_with_whom_is_asked_by_the_control_plane_and_answered_once_by_a_server(judge: Judge) -> None:
+def test_the_control_plane_writes_the_question_of_match_and_a_server_one_answer(judge: Judge) -> None:
     new, again = {"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}
     question, answer = (f"{BUCKET}/{key}" for key in (waiting_key(PROJECT), groups_key(PROJECT, "0" * 20)))
     for context in (new, again):
@@ -552,14 +552,14 @@ def test_who_plays_with_whom_is_asked_by_the_control_plane_and_answered_once_by_
 
 
 @pytest.mark.parametrize("key", ["participant.json", "answers/3.json", "trials/a-1/3-trial.jsonl.gz", "session.json"])
-def test_a_participant_who_is_called_lobby_is_a_participant(judge: Judge, key: str) -> None:
+def test_a_participant_with_the_id_lobby_is_a_participant(judge: Judge, key: str) -> None:
     theirs = f"{BUCKET}/{PROJECT}/users/lobby/{key}"
     assert judge.who_may(Ask("s3:DeleteObject", theirs)) == frozenset()
     alices = judge.who_may(Ask("s3:PutObject", f"{BUCKET}/{PROJECT}/users/R_alice/{key}", {"s3:if-none-match": "*"}))
     assert judge.who_may(Ask("s3:PutObject", theirs, {"s3:if-none-match": "*"})) == alices
 
 
-def test_nobody_writes_places_without_having_seen_them(judge: Judge) -> None:
+def test_places_are_written_only_with_if_match_or_if_none_match(judge: Judge) -> None:
     theirs = {
         f"{PROJECT}/places/3.json": {"next_step", "update_project_master_list"},
         f"_places/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
@@ -740,7 +740,7 @@ def test_each_function_reads_its_own_queue_and_writes_its_own_log(judge: Judge) 
     ],
     ids=lambda ask: f"{ask.action} {ask.resource.rpartition(':')[2]}",
 )  # fmt: skip
-def test_what_nobody_may(judge: Judge, other: Ask) -> None:
+def test_no_role_may_make_these_calls(judge: Judge, other: Ask) -> None:
     assert judge.who_may(other) == frozenset()
 
 
@@ -749,7 +749,7 @@ def test_names_are_normalized_as_route_53_does() -> None:
     assert normalized("*.example.org") == "\\052.example.org"
 
 
-def test_a_call_that_nobody_has_described_is_no_free_pass(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_call_is_refused(world: MotoWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     study = StudyOnMoto(world)
     assert world.iam
     assert world.iam.judge(ApiCall("s3", "DeleteBucket", {})) is None, "not by a function"

@@ -68,6 +68,6 @@ def test_a_function(name: str) -> None:
     assert ast.get_docstring(handler), "its handler does not say what goes in and what comes out"
 
 
-def test_nothing_speaks_of_a_function_that_is_gone() -> None:
+def test_every_list_names_exactly_the_deployed_functions() -> None:
     assert set(cfn.functions()) == set(CLIENTS) == rows("permissions.md") == set(HANDLERS)
     assert set.union(*WHO_MAY.values()) <= set(HANDLERS)

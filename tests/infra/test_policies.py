@@ -78,7 +78,7 @@ def faults(of: dict[str, Any] | None = None) -> list[str]:
     return found
 
 
-def test_nothing_is_wider_than_it_need_be() -> None:
+def test_no_policy_is_wider_than_necessary() -> None:
     assert faults() == []
 
 
@@ -92,7 +92,7 @@ def test_every_exception_is_used() -> None:
     assert everything == set(ON_EVERYTHING)
 
 
-def test_every_star_has_its_reason_beside_it() -> None:
+def test_every_wildcard_has_its_reason_beside_it() -> None:
     lines = cfn.PATH.read_text().splitlines()
     stars = [line for line in lines if re.search(r"""Resource: \[?["']\*["']""", line)]
     assert len(stars) >= len(ON_EVERYTHING)
@@ -100,12 +100,12 @@ def test_every_star_has_its_reason_beside_it() -> None:
         assert re.search(r"  # \w+ \w+", line), line
 
 
-def test_everybody_is_only_ever_denied() -> None:
+def test_statements_for_all_principals_only_deny() -> None:
     everybody = [s for _, s in cfn.statements() if s.get("Principal") in ("*", {"AWS": "*"})]
     assert [s["Effect"] for s in everybody] == ["Deny"]
 
 
-def test_services_act_for_this_account_only() -> None:
+def test_services_may_act_for_this_account_only() -> None:
     """A service's right to use our topics and queues, or to assume a role, is bound to our own resources."""
     for name, statement in cfn.statements():
         principal = statement.get("Principal", {})

@@ -52,7 +52,7 @@ def test_zones_without_fargate_are_those_of_supported_regions() -> None:
     assert regions.runs_fargate("us-east-1", "use1-az3")
 
 
-def test_another_region_is_refused_with_those_that_are_near() -> None:
+def test_another_region_is_refused_with_the_nearest_supported_ones() -> None:
     regions.check("eu-west-1")
     with pytest.raises(Problem, match="cannot be installed in eu-north-1") as refused:
         regions.check("eu-north-1")

@@ -85,7 +85,7 @@ def statements(of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
     return found
 
 
-def test_every_action_is_one_that_shows_no_secret() -> None:
+def test_no_action_of_the_policy_shows_a_secret() -> None:
     allowed = [
         action
         for statement in statements()
@@ -141,7 +141,7 @@ class Played:
         return found
 
 
-def test_no_document_that_they_read_holds_a_secret(world: MotoWorld) -> None:
+def test_no_document_that_researchers_may_read_holds_a_secret(world: MotoWorld) -> None:
     played = Played(world)
     assert len(set(played.secrets.values())) >= 6
     assert all(len(secret) >= 48 for secret in played.secrets.values())
@@ -161,7 +161,7 @@ def test_a_policy_that_shows_the_secret_is_noticed(world: MotoWorld) -> None:
     assert Played(world).shown(Judge(account_of(world, more))) == [f"{KEY}: the secret"]
 
 
-def test_what_the_function_answers_that_they_may_invoke_holds_no_secret(world: MotoWorld) -> None:
+def test_answers_of_the_function_that_researchers_may_invoke_hold_no_secret(world: MotoWorld) -> None:
     played = Played(world)
     registration = {"id": PROJECT, "steps": []}
     asked: list[dict[str, Any]] = [
@@ -271,7 +271,7 @@ def judge(judged: None) -> Judge:
     return Judge(cfn.ReferenceValues(parameters=texts, known={"Bucket": "the-bucket"}))
 
 
-def test_no_other_way_leads_to_one(judge: Judge) -> None:
+def test_the_policy_allows_no_other_way_to_a_secret(judge: Judge) -> None:
     assert len(WAYS) > 200
     assert [ask for ask in WAYS if judge.may(POLICY, ask)] == []
 
@@ -288,7 +288,7 @@ def test_no_other_way_leads_to_one(judge: Judge) -> None:
         "SSL/steps/x.pem",
     ],
 )
-def test_they_write_pages_and_nothing_that_looks_like_one(judge: Judge, key: str) -> None:
+def test_researchers_may_write_pages_and_nothing_with_a_similar_key(judge: Judge, key: str) -> None:
     for action in ("s3:PutObject", "s3:DeleteObject"):
         assert not judge.may(POLICY, Ask(action, f"{BUCKET}/{key}"))
         assert judge.may(POLICY, Ask(action, f"{BUCKET}/p/steps/consent.html"))
@@ -296,12 +296,12 @@ def test_they_write_pages_and_nothing_that_looks_like_one(judge: Judge, key: str
 
 
 @pytest.mark.parametrize("role", LENT)
-def test_nor_do_the_roles_that_work_for_them(judge: Judge, role: str) -> None:
+def test_the_roles_of_builds_and_containers_allow_no_way_to_a_secret(judge: Judge, role: str) -> None:
     assert [ask for ask in WAYS if judge.may(role, ask)] == []
 
 
 @pytest.mark.parametrize("role", LENT)
-def test_those_roles_read_no_documents_of_the_study(judge: Judge, role: str) -> None:
+def test_the_roles_of_builds_and_containers_read_no_documents(judge: Judge, role: str) -> None:
     for key in (
         "project_master_list.json",
         "_servers/s.json",

@@ -33,13 +33,13 @@ def test_a_template_that_breaks_the_rule_is_noticed(rule: Rule) -> None:
     assert next(iter(noticed), None), f"nobody notices a template without: {rule}"
 
 
-def test_each_rule_is_there_once_and_says_where_it_stands() -> None:
+def test_each_rule_is_unique_and_has_a_source() -> None:
     names = [str(rule) for rule in RULES]
     assert sorted(names) == sorted(set(names))
     assert all(rule.accepts and len(rule.source) > 10 for rule in RULES)
 
 
-def test_every_property_of_the_template_was_looked_up() -> None:
+def test_the_limits_of_every_property_of_the_template_were_looked_up() -> None:
     """A new type or property: find out what AWS accepts beyond the schema, write the rules, then add it to the table."""
     used: dict[str, set[str]] = {}
     for one in cfn.template()["Resources"].values():
@@ -65,7 +65,7 @@ def test_the_largest_and_the_least_numbers_are_tried() -> None:
             assert limit not in parameter or parameter[limit] in tried, name
 
 
-def test_logs_are_kept_for_as_long_as_can_be_said() -> None:
+def test_the_retention_periods_of_logs_are_those_of_cloudwatch() -> None:
     assert set(cfn.template()["Parameters"]["LogRetentionDays"]["AllowedValues"]) <= set(data.RETENTION)
 
 

@@ -26,11 +26,11 @@ def against_schemas(there: Installation) -> Iterator[str]:
             yield f"{one.name}.{'.'.join(map(str, error.path))}: {error.message[:200]}"
 
 
-def test_the_calls_take_every_value() -> None:
+def test_the_models_of_the_calls_accept_every_value() -> None:
     assert sorted({fault for there in installations() for fault in shapes.faults(there)}) == []
 
 
-def test_the_schemas_take_every_value() -> None:
+def test_the_schemas_accept_every_value() -> None:
     assert sorted({fault for there in installations() for fault in against_schemas(there)}) == []
 
 
@@ -40,7 +40,7 @@ def test_every_type_has_its_calls() -> None:
     assert not set(shapes.CALLS) & set(shapes.NO_CALL)
 
 
-def test_what_a_call_limits_is_looked_at() -> None:
+def test_limits_of_the_calls_are_checked() -> None:
     found = [check for one in next(installations()).everything.values() for check in shapes.checks(one)]
     kinds = {kind for _, shape, _ in found for kind in LIMITS & set(shape.metadata)}
     assert kinds == LIMITS

@@ -36,18 +36,18 @@ OUTPUTS = [
 ]
 
 
-def test_cfn_lint_has_nothing_to_say() -> None:
+def test_cfn_lint_finds_nothing() -> None:
     done = subprocess.run(
         [Path(sys.executable).with_name("cfn-lint"), cfn.PATH], capture_output=True, text=True, check=False, cwd=ROOT
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stdout
 
 
-def test_it_is_plain_cloudformation() -> None:
+def test_the_template_is_plain_cloudformation() -> None:
     assert "Transform" not in cfn.template()
 
 
-def test_outputs_are_what_the_commands_read() -> None:
+def test_the_template_has_the_outputs_that_the_commands_read() -> None:
     assert sorted(cfn.template()["Outputs"]) == sorted(OUTPUTS)
 
 
@@ -136,7 +136,7 @@ def test_each_function_runs_the_file_of_its_name() -> None:
         assert (properties["Runtime"], properties["Architectures"]) == ("python3.13", ["arm64"])
 
 
-def test_every_log_is_kept_for_a_while_only() -> None:
+def test_every_log_has_a_retention_period() -> None:
     for name, group in cfn.resources("AWS::Logs::LogGroup").items():
         assert group["RetentionInDays"] == {"Ref": "LogRetentionDays"}, name
 
@@ -162,7 +162,7 @@ def test_queues_wait_for_their_functions_and_failures_end_in_dead_letters() -> N
     assert watched == dead
 
 
-def test_the_function_that_asks_itself_may_and_no_other() -> None:
+def test_only_the_function_that_calls_itself_may_do_so() -> None:
     """Lambda drops the invocation after about 16 of a chain of messages, unless it is told that the loop is meant."""
     allowed = {
         name
@@ -180,7 +180,7 @@ def test_a_message_that_lambda_takes_for_a_loop_raises_an_alarm() -> None:
     assert all(alarm["Namespace"] == "AWS/Lambda" for alarm in alarms("RecursiveInvocationsDropped"))
 
 
-def test_every_alarm_reaches_somebody() -> None:
+def test_every_alarm_reaches_the_topic_of_alarms() -> None:
     for name, alarm in cfn.resources("AWS::CloudWatch::Alarm").items():
         assert alarm["AlarmActions"] == [{"Ref": "Alarms"}], name
         assert alarm["AlarmDescription"], name
@@ -294,7 +294,7 @@ def test_with_the_administrators_network_none_is_made() -> None:
 
 
 @pytest.mark.parametrize("payload", ["running", "spot_warning", "deprovisioning_spot", "stopped_spot"])
-def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -> None:
+def test_only_events_of_our_tasks_reach_the_queue(payload: str) -> None:
     (rule,) = [r for r in cfn.resources("AWS::Events::Rule").values() if "EventPattern" in r]
     pattern = cfn.ReferenceValues().resolve(rule["EventPattern"])
     event = json.loads((ROOT / f"tests/events/sqs_task_{payload}.json").read_text())["Records"][0]
@@ -313,9 +313,7 @@ def test_events_of_our_tasks_and_of_nobody_elses_reach_the_queue(payload: str) -
     ("writer", "document"),
     [("StartServer", "_servers/"), ("UpdateProjectMasterList", "project_master_list.json")],
 )
-def test_who_writes_what_an_earlier_version_does_not_understand_is_updated_after_all_who_read_it(
-    writer: str, document: str
-) -> None:
+def test_writers_of_new_documents_are_updated_after_their_readers(writer: str, document: str) -> None:
     """CloudFormation updates a resource after those that it depends on."""
     readers = {
         name

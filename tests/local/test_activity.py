@@ -32,7 +32,7 @@ def watched(data: Path, owner: str) -> WatchedServer:
     return WatchedServer(task, data, data / "log", whole_log=True)
 
 
-def test_answers_of_a_participants_server_are_told_once(tmp_path: Path) -> None:
+def test_answers_of_a_participants_server_are_printed_once(tmp_path: Path) -> None:
     answer(tmp_path, "P1", "1")
     server = watched(tmp_path, "P1")
     assert server.answers() == []
@@ -41,7 +41,7 @@ def test_answers_of_a_participants_server_are_told_once(tmp_path: Path) -> None:
     assert server.answers() == []
 
 
-def test_answers_that_a_sessions_server_writes_are_its_members(tmp_path: Path) -> None:
+def test_answers_of_a_sessions_server_are_printed_for_its_members(tmp_path: Path) -> None:
     answer(tmp_path, "anna", "1")
     server = watched(tmp_path, SID)
     assert server.answers() == []
@@ -87,7 +87,7 @@ class Running:
         return Path("/nowhere") / name
 
 
-def test_a_game_on_a_warm_server_that_is_over_by_the_next_look_is_told(tmp_path: Path) -> None:
+def test_a_game_on_a_warm_server_that_ended_before_the_next_look_is_printed(tmp_path: Path) -> None:
     text = io.StringIO()
     log = ActivityLog(Console(file=text, width=200))
     warm = TaskRecord("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
@@ -104,7 +104,7 @@ def test_a_game_on_a_warm_server_that_is_over_by_the_next_look_is_told(tmp_path:
     assert "step 1" not in text.getvalue()
 
 
-def test_the_terminal_says_who_plays_with_whom_and_who_found_no_others(tmp_path: Path) -> None:
+def test_the_terminal_names_sessions_and_unmatched_participants(tmp_path: Path) -> None:
     text = io.StringIO()
     log = ActivityLog(Console(file=text, width=200))
     both = SessionDocument(SID, 2, (Member("bert", None, 1), Member("anna", None, 0)))

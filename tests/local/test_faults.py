@@ -58,11 +58,11 @@ def test_without_faults_nothing_is_left(journey: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("journey", ["server_is_killed", "warm_is_given"])
-def test_a_data_folder_on_another_file_system(journey: str, tmp_path: Path) -> None:
+def test_a_study_runs_with_its_data_on_another_file_system(journey: str, tmp_path: Path) -> None:
     assert went_wrong(journey, tmp_path / "study", ELSEWHERE) == []
 
 
-def test_a_few_faults_of_all(tmp_path: Path) -> None:
+def test_a_sample_of_faults_leaves_nothing_wrong(tmp_path: Path) -> None:
     dice = random.Random(SEED)
     journey = dice.choice(list(JOURNEYS))
     for number, fault in enumerate(dice.sample(list(points(run(journey, tmp_path / "counted"))), SAMPLE)):
@@ -72,7 +72,7 @@ def test_a_few_faults_of_all(tmp_path: Path) -> None:
 @pytest.mark.hunt
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("journey", JOURNEYS)
-def test_faults_at_every_call(journey: str, tmp_path: Path) -> None:
+def test_a_fault_at_any_call_leaves_nothing_wrong(journey: str, tmp_path: Path) -> None:
     """Every kind of call, with the next of its faults; all of them if the hunt is a long one."""
     chosen = list(points(run(journey, tmp_path / "counted")))
     if exploration.TIMES < 2:

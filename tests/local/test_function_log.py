@@ -15,7 +15,7 @@ from local.activity.log import ActivityLog
 
 
 @pytest.mark.parametrize(("error", "shown"), [(RetryLater("soon"), False), (KeyError("broken"), True)])
-def test_a_message_that_the_queue_delivers_again_is_no_complaint(tmp_path: Path, error: Exception, shown: bool) -> None:
+def test_a_redelivered_message_is_not_shown_in_the_terminal(tmp_path: Path, error: Exception, shown: bool) -> None:
     terminal = io.StringIO()
     with function_log(tmp_path, ActivityLog(Console(file=terminal, width=200))):
         failure("message failed", error)

@@ -160,7 +160,7 @@ def test_check_tries_the_agent_in_app_and_strict_refuses_remarks(tmp_path: Path)
         ("App/levels.py", "FRAMES = 1 / 0\n", 'App/levels.py:1: start("none") fails: ZeroDivisionError'),
     ],
 )
-def test_what_is_wrong_in_app_is_named_with_its_folder(tmp_path: Path, file: str, text: str, said: str) -> None:
+def test_mistakes_in_app_are_reported_with_the_folder(tmp_path: Path, file: str, text: str, said: str) -> None:
     clone = write_clone(tmp_path / "clone")
     (clone / file).write_text(text)
     code, lines = _check(clone)

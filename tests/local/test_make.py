@@ -39,7 +39,7 @@ def test_variables_reach_the_command(arguments: tuple[str, ...], wanted: str) ->
     assert re.search(wanted, make(*arguments))
 
 
-def test_what_nobody_has_given_is_not_handed_on() -> None:
+def test_variables_that_are_not_given_are_not_passed_on() -> None:
     assert "--host" not in make("run", HOST="x86_64-conda-linux-gnu")  # a compiler's, in the environment
     assert "--tls" not in make("run", "TLS=0")
     assert "--tls" not in make("run", TLS="1")
@@ -48,14 +48,14 @@ def test_what_nobody_has_given_is_not_handed_on() -> None:
 
 
 @pytest.mark.parametrize("empty", ["DATA=", "DATA= ", "PORT=", "PROJECT="])
-def test_an_empty_variable_is_as_if_not_given(empty: str) -> None:
+def test_an_empty_variable_counts_as_not_given(empty: str) -> None:
     """Else the data would lie in the current folder, or below the root."""
     assert re.search(r'-m local "\.?" --data "\./data" --port 8000 ', make("run", empty))
     assert "--data" not in make("try", empty)
     assert "--from" not in make("data", empty)
 
 
-def test_a_variable_that_does_not_exist_is_said() -> None:
+def test_an_unknown_variable_is_refused() -> None:
     """Nothing is run: else `make deploy PROJCT=../a` would put another study on AWS, and EMIAL= send alarms to nobody."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
         make("run", "PROJCT=../a")
@@ -148,7 +148,7 @@ def test_intel_macs_get_the_last_versions_that_have_wheels_for_them(somewhere: P
         ("Darwin x86_64", (3, 14), "3.11 to 3.13"),
     ],
 )
-def test_a_python_that_the_packages_do_not_know_is_refused_before_anything_is_installed(
+def test_an_unsupported_python_is_refused_before_anything_is_installed(
     somewhere: Path, machine: str, version: tuple[int, int], range_: str
 ) -> None:
     code, said = installing(somewhere, machine, version)
@@ -158,7 +158,7 @@ def test_a_python_that_the_packages_do_not_know_is_refused_before_anything_is_in
     assert not (somewhere / ".venv").exists()
 
 
-def test_what_cannot_be_installed_ends_with_a_sentence(somewhere: Path) -> None:
+def test_a_failed_installation_is_reported_in_a_sentence(somewhere: Path) -> None:
     no_wheel = "echo 'ERROR: No matching distribution found for h5py==3.16.0' >&2; exit 1"
     code, said = installing(somewhere, "FreeBSD amd64", (3, 13), no_wheel)
     assert code != 0

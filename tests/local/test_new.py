@@ -102,7 +102,7 @@ def test_only_the_id_changes_in_the_file(root: Path, tmp_path: Path) -> None:
     assert (tmp_path / "mine" / "config.yml").read_text() == before.replace("id: maze", "id: mine")
 
 
-def test_commands_and_links_of_the_copy_lead_where_they_should(root: Path, tmp_path: Path) -> None:
+def test_commands_and_links_of_the_copy_are_adapted(root: Path, tmp_path: Path) -> None:
     (root / "docs").mkdir()
     (root / "docs" / "objects.md").write_text("# Objects")
     readme = "make run PROJECT=examples/maze, or (examples/maze).\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
@@ -123,7 +123,7 @@ def test_the_links_of_each_copy_lead_somewhere(tmp_path: Path, name: str) -> Non
     assert f"make run PROJECT={tmp_path}/mine" in text
 
 
-def test_an_empty_folder_is_filled(root: Path, tmp_path: Path) -> None:
+def test_a_study_can_be_made_in_an_empty_folder(root: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     new.make_study(new.templates(root)["maze"], tmp_path / "mine")
     assert (tmp_path / "mine" / "agent.py").is_file()
@@ -138,7 +138,7 @@ def test_a_folder_that_holds_something_stays_as_it_is(root: Path, tmp_path: Path
     assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_is_no_folder(root: Path, tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_folder_is_refused(root: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("a file")
     with pytest.raises(new.NotMade, match="is a file"):
         new.make_study(new.templates(root)["maze"], tmp_path / "mine")
@@ -158,13 +158,13 @@ def test_a_name_that_makes_no_id_is_refused(root: Path, tmp_path: Path, name: st
     assert not (tmp_path / name).exists()
 
 
-def test_a_place_where_nothing_can_be_written_is_a_sentence(root: Path, tmp_path: Path) -> None:
+def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(root: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(new.NotMade, match="cannot be written: Not a directory"):
         new.make_study(new.templates(root)["maze"], tmp_path / "file" / "mine")
 
 
-def test_a_template_whose_config_cannot_be_read_is_none(root: Path) -> None:
+def test_a_folder_with_an_unreadable_config_is_no_template(root: Path) -> None:
     (root / "examples" / "maze" / "config.yml").write_text("project:\n\tid: maze\n")
     shutil.copytree(root / "examples" / "maze", root / "examples" / "empty")
     assert new.templates(root) == {}

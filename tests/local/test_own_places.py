@@ -15,18 +15,18 @@ def groups_of(matching: str, players: int, groups: int, run: int) -> list[int]:
 
 
 @pytest.mark.parametrize("run", range(8))
-def test_they_are_of_groups_that_play_together(run: int) -> None:
+def test_the_ids_are_of_groups_that_play_together(run: int) -> None:
     assert len(set(groups_of("group", 3, 4, run))) == 1
     assert len(set(groups_of("mixed", 3, 3, run))) == 3
     assert sorted(map(groups_of("mixed", 4, 2, run).count, (0, 1))) == [2, 2]
 
 
 @pytest.mark.parametrize(("matching", "groups"), [("arrival", 2), ("group", 0)])
-def test_where_groups_do_not_matter_they_are_numbered(matching: str, groups: int) -> None:
+def test_without_groups_the_ids_are_numbered(matching: str, groups: int) -> None:
     assert user_ids("maze", 2, matching, groups, lambda number: f"try-{number}") == ["try-1", "try-2"]
 
 
-def test_what_answers_let_them_play_together_is_said() -> None:
+def test_the_answers_that_let_the_ids_play_together_are_printed() -> None:
     assert advice("mixed") == ""
     assert advice({"same": "language"}) == "Give the same answer to the question language in each window."
     assert advice({"different": "role"}) == "Give a different answer to the question role in each window."

@@ -127,7 +127,9 @@ def test_a_power_cut_breaks_no_promise(steps: list[tuple[str, int]], seed: int, 
 
 
 @pytest.mark.parametrize("lazy", ["sync_folder", "write_new"])
-def test_that_model_sees_what_is_not_synced(lazy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_sync_the_model_finds_a_broken_promise(
+    lazy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same without one of the syncs breaks promises."""
     from protocol import disk
 

@@ -32,7 +32,7 @@ def open_to_others(*folders: Path) -> list[str]:
     return found
 
 
-def test_every_file_of_a_study_is_its_owners_alone(local: Make) -> None:
+def test_only_the_owner_may_read_the_files_of_a_study(local: Make) -> None:
     here = local(frames=30).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -44,7 +44,7 @@ def test_every_file_of_a_study_is_its_owners_alone(local: Make) -> None:
     assert open_to_others(here.data, here.state.parent) == []
 
 
-def test_folders_of_an_earlier_version_are_closed_or_told(local: Make) -> None:
+def test_open_folders_of_an_earlier_version_are_closed_or_reported(local: Make) -> None:
     here = local()
     here.state.mkdir(parents=True)
     here.data.mkdir()
@@ -55,7 +55,7 @@ def test_folders_of_an_earlier_version_are_closed_or_told(local: Make) -> None:
 
 
 @pytest.mark.parametrize("where", ["file/data", "file/deep/data"])
-def test_a_place_where_nothing_can_be_written_is_a_sentence(local: Make, where: str) -> None:
+def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(local: Make, where: str) -> None:
     here = local()
     (here.place / "file").write_text("no folder")
     assert here.begin("--data", where).wait(20) == 1

@@ -38,7 +38,7 @@ def _keys(platform: LocalPlatform) -> list[str]:
     return [entry.key for entry in platform.documents.list("")]
 
 
-def test_pages_pictures_and_the_registration(folder: Path, platform: LocalPlatform) -> None:
+def test_publish_writes_pages_pictures_and_the_registration(folder: Path, platform: LocalPlatform) -> None:
     (folder / "steps" / "cat.png").write_bytes(b"\x89PNG")
     (folder / "steps" / ".DS_Store").write_bytes(b"?")
     (folder / "steps" / "folder").mkdir()
@@ -52,7 +52,7 @@ def test_pages_pictures_and_the_registration(folder: Path, platform: LocalPlatfo
     assert project["id"] == "quick"
 
 
-def test_only_what_differs_is_written(folder: Path, platform: LocalPlatform) -> None:
+def test_publish_writes_only_changed_files(folder: Path, platform: LocalPlatform) -> None:
     publish.publish(folder, platform.documents)
     pages = platform.documents.folder / "quick" / "steps"
     before = {path.name: path.stat().st_ino for path in pages.iterdir()}
@@ -76,7 +76,7 @@ def test_the_secret_stays_when_it_is_published_again(folder: Path, platform: Loc
     assert (secret(), len(first)) == (first, 64)
 
 
-def test_a_project_made_for_aws_can_be_held_here(folder: Path, platform: LocalPlatform) -> None:
+def test_a_project_for_aws_can_run_on_this_machine(folder: Path, platform: LocalPlatform) -> None:
     config = folder / "config.yml"
     setup = (
         "  useAWS: true\n  awsSetup: "
@@ -86,7 +86,7 @@ def test_a_project_made_for_aws_can_be_held_here(folder: Path, platform: LocalPl
     assert publish.publish(folder, platform.documents).project.use_aws
 
 
-def test_steps_that_get_other_pages_are_told_once_people_have_begun(folder: Path, platform: LocalPlatform) -> None:
+def test_changed_steps_are_reported_if_participants_have_begun(folder: Path, platform: LocalPlatform) -> None:
     config, said = folder / "config.yml", list[str]()
     with_two = config.read_text()
     with_three = with_two.replace("{1: hello, 2: game, 3: bye,", "{1: hello, 2: bye, 3: game, 4: bye,")
@@ -103,7 +103,7 @@ def test_steps_that_get_other_pages_are_told_once_people_have_begun(folder: Path
     assert ": step 2 is game (was bye), step 3 is bye (was game), step 4 is gone (was bye). " in said[1]
 
 
-def test_all_mistakes_are_told(folder: Path, platform: LocalPlatform) -> None:
+def test_publish_reports_all_mistakes(folder: Path, platform: LocalPlatform) -> None:
     config = folder / "config.yml"
     config.write_text(config.read_text().replace("1: hello", "1: nowhere").replace("maxEpisodes: 1", "maxEpisodes: no"))
     with pytest.raises(publish.NotPublished) as found:
@@ -117,7 +117,7 @@ def _activity_log() -> tuple[ActivityLog, io.StringIO]:
     return ActivityLog(Console(file=text, highlight=False, soft_wrap=True)), text
 
 
-def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
+def test_the_terminal_shortens_ids_and_shows_no_answers() -> None:
     activity_log, text = _activity_log()
     activity_log.set_steps(["1", "2", "finalStep"])
     folder = "study/users/5f2a9bc01d7e"
@@ -137,13 +137,13 @@ def test_the_story_shortens_ids_and_never_shows_an_answer() -> None:
 @pytest.mark.parametrize(
     ("user", "shown"), [("P1", "P1"), ("123456", "123456"), ("1234567", "123456…"), ("12345678", "123456…")]
 )
-def test_an_id_is_never_shown_beyond_six_characters(user: str, shown: str) -> None:
+def test_the_terminal_shows_at_most_six_characters_of_an_id(user: str, shown: str) -> None:
     activity_log, text = _activity_log()
     activity_log.participant(user, "arrived")
     assert text.getvalue().split()[1] == shown
 
 
-def test_a_servers_line_waits_for_the_one_it_follows() -> None:
+def test_the_lines_of_a_server_are_printed_in_order() -> None:
     activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
 
@@ -172,7 +172,7 @@ def test_a_servers_line_waits_for_the_one_it_follows() -> None:
     ]
 
 
-def test_the_story_of_a_server() -> None:
+def test_the_terminal_shows_the_states_of_a_server() -> None:
     activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
     for state in ("starting", "starting", "naming", "ready", "closed"):
@@ -187,7 +187,7 @@ def test_the_story_of_a_server() -> None:
     ]
 
 
-def test_a_game_that_begins_anew_is_told_where_chance_may_be(tmp_path: Path) -> None:
+def test_a_game_that_starts_again_is_printed_if_it_may_differ(tmp_path: Path) -> None:
     log = tmp_path / "s-2.log"
     log.write_text("")
     task = SimpleNamespace(name="s-2", folder="study/users/P1")
@@ -203,7 +203,7 @@ def test_a_game_that_begins_anew_is_told_where_chance_may_be(tmp_path: Path) -> 
     assert "begins anew: something in agent.py is left to chance (docs/agent.md)" in line
 
 
-def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:
+def test_a_server_that_was_stopped_before_its_start_is_not_printed() -> None:
     activity_log, text = _activity_log()
     record = {"projectId": "p", "userId": "P1", "attempt": 1, "state": "closed", "reason": "stopped"}
     activity_log.wrote("_servers/s.json", json.dumps(record).encode())
@@ -211,7 +211,7 @@ def test_a_server_that_was_stopped_before_it_began_is_no_news() -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b"\xff", b'{"userId": 1}', b'{"state": "ready", "attempt": "x"}'])
-def test_a_terminal_is_not_worth_a_failure(body: bytes) -> None:
+def test_a_closed_terminal_does_not_stop_the_study(body: bytes) -> None:
     activity_log, text = _activity_log()
     for key in ("_servers/s.json", "p/users/u/answers/1.json", "p/users/u/participant.json", "x"):
         activity_log.wrote(key, body)

@@ -88,7 +88,7 @@ def goes_on(here: Local, walker: Walker) -> None:
     not SHARED.is_dir() or SHARED.stat().st_dev == Path(tempfile.gettempdir()).stat().st_dev,
     reason="there is no other file system here; test_faults.py has the same with links that are refused",
 )
-def test_the_state_is_on_another_file_system_than_the_data(local: Make) -> None:
+def test_a_study_goes_on_with_its_state_on_another_file_system(local: Make) -> None:
     here = local(frames=240, holds=120)
     other = Path(tempfile.mkdtemp(dir=SHARED))
     try:
@@ -104,7 +104,7 @@ def test_the_state_is_on_another_file_system_than_the_data(local: Make) -> None:
 
 @linux
 @pytest.mark.parametrize("restart", [pytest.param(False, marks=pytest.mark.hunt), True], ids=["", "killed meanwhile"])
-def test_a_server_dies_when_no_more_files_can_be_opened(local: Make, restart: bool) -> None:
+def test_a_server_lost_while_no_files_can_be_opened_is_replaced(local: Make, restart: bool) -> None:
     here = local(frames=240, holds=120).run()
     walker, _ = begun(here)
     assert here.process
@@ -122,7 +122,7 @@ def test_a_server_dies_when_no_more_files_can_be_opened(local: Make, restart: bo
 
 
 @linux
-def test_connections_that_say_nothing_use_up_all_files(local: Make) -> None:
+def test_silent_connections_that_use_up_all_files_do_not_stop_the_study(local: Make) -> None:
     here = local().run()
     port = int(here.url.rpartition(":")[2])
     assert here.process
@@ -148,7 +148,7 @@ def _well(here: Local) -> bool:
 
 @linux
 @pytest.mark.parametrize("restart", [False, pytest.param(True, marks=pytest.mark.hunt)], ids=["", "killed meanwhile"])
-def test_a_server_dies_when_nothing_can_be_written(local: Make, restart: bool) -> None:
+def test_a_server_lost_while_nothing_can_be_written_is_replaced(local: Make, restart: bool) -> None:
     """No file may have a byte (RLIMIT_FSIZE), as on a full disk."""
     here = local(frames=240, holds=120)
     here.through_pipe = True
@@ -167,7 +167,7 @@ def test_a_server_dies_when_nothing_can_be_written(local: Make, restart: bool) -
 
 
 @linux
-def test_a_start_where_nothing_can_be_written_is_a_sentence(local: Make) -> None:
+def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: Make) -> None:
     here = local()
     command = f"ulimit -f 0; exec {sys.executable} -m local {here.folder} --port 0"
     made = subprocess.run(
@@ -187,7 +187,7 @@ def test_a_start_where_nothing_can_be_written_is_a_sentence(local: Make) -> None
 @pytest.mark.hunt
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(2 if exploration.TIMES < 2 else 8))
-def test_by_chance_anything_is_refused_and_everything_killed(local: Make, seed: int) -> None:
+def test_a_study_survives_random_refusals_and_kills(local: Make, seed: int) -> None:
     """Four participants walk while calls are refused and the process is killed; then all is as if nothing had been."""
     here = local(frames=120)
     said = ""

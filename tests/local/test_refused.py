@@ -63,7 +63,7 @@ def refusing(tmp_path: Path) -> Iterator[Callable[..., OsFaultInjector]]:
 
 
 @pytest.mark.parametrize(("operation", "error"), [("rename", errno.ENOSPC), ("unlink", errno.EIO)])
-def test_a_message_whose_file_cannot_be_changed_comes_all_the_same(
+def test_a_message_whose_file_cannot_be_changed_is_delivered(
     tmp_path: Path, refusing: Callable[..., OsFaultInjector], operation: str, error: int
 ) -> None:
     came: list[Any] = []
@@ -76,7 +76,7 @@ def test_a_message_whose_file_cannot_be_changed_comes_all_the_same(
     assert injector.struck == 1
 
 
-def test_a_message_is_not_put_aside_for_what_the_machine_refuses(tmp_path: Path) -> None:
+def test_refusals_of_the_machine_make_no_dead_letters(tmp_path: Path) -> None:
     retry, tries = Retry(lambda text: None), list[int]()
 
     def handler(event: Any, context: object) -> Any:
@@ -93,7 +93,7 @@ def test_a_message_is_not_put_aside_for_what_the_machine_refuses(tmp_path: Path)
     assert not (tmp_path / "dead").exists()
 
 
-def test_messages_that_cannot_be_read_at_the_start_are_not_left_out(
+def test_a_message_that_cannot_be_read_stops_the_start_and_is_kept(
     tmp_path: Path, refusing: Callable[..., OsFaultInjector]
 ) -> None:
     FolderBus(tmp_path, {}).publish(Topic.START, {"n": 1})
@@ -133,7 +133,7 @@ def test_names_that_cannot_be_read_are_not_overwritten(
 @pytest.mark.parametrize(
     "call", [OsCall("list", "data"), OsCall("stat", "data/_servers"), OsCall("open", "data/project_master_list.json")]
 )
-def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
+def test_data_that_cannot_be_listed_do_not_count_as_deleted(
     tmp_path: Path, refusing: Callable[..., OsFaultInjector], call: OsCall
 ) -> None:
     told: list[str] = []
@@ -155,7 +155,7 @@ def test_data_that_cannot_be_seen_are_not_taken_for_deleted(
     assert len(set(threading.enumerate()) - others) < 50
 
 
-def test_files_of_a_project_that_cannot_be_seen_are_not_gone(
+def test_files_of_a_project_that_cannot_be_listed_do_not_count_as_deleted(
     tmp_path: Path, refusing: Callable[..., OsFaultInjector]
 ) -> None:
     study = write_study(tmp_path / "study")
@@ -185,7 +185,7 @@ def test_files_of_a_project_that_cannot_be_seen_are_not_gone(
     assert [line for line in told if "goes on as it was. The disk is full" in line]
 
 
-def test_an_exit_status_that_could_not_be_written_down_is_known_all_the_same(here: Here) -> None:  # noqa: F811
+def test_an_exit_status_that_could_not_be_written_is_still_known(here: Here) -> None:  # noqa: F811
     """As on a full disk: the shell cannot write it."""
     tasks = here.tasks()
     tasks.run(request(FAKE_STATUS="3"))

@@ -81,19 +81,19 @@ def test_a_changed_file_is_installed_again(study: Path) -> None:
     assert "2.0" in installed(study)
 
 
-def test_what_cannot_be_installed_is_said_each_time_and_the_command_ends_well(study: Path) -> None:
+def test_a_failed_installation_is_reported_each_time_without_an_error(study: Path) -> None:
     (study / "requirements.txt").write_text("a-package-that-is-nowhere\n")
     for _ in range(2):
         assert "Not everything that" in installing(study)
 
 
-def test_a_clone_of_hippo_gym_is_left_alone(study: Path) -> None:
+def test_requirements_of_a_clone_of_hippo_gym_are_not_installed(study: Path) -> None:
     """Its file names versions for Python 3.7."""
     (study / "steps").rename(study / "StepFiles")
     assert installing(study) == ""
 
 
-def test_a_study_that_cannot_be_read_is_left_to_the_next_command(study: Path) -> None:
+def test_an_unreadable_study_is_left_to_the_next_command(study: Path) -> None:
     (study / "config.yml").unlink()
     assert installing(study) == ""
 
@@ -108,7 +108,7 @@ def test_the_commands_for_one_machine_install(study: Path) -> None:
         assert f'"{study}"' in second
 
 
-def test_our_tests_come_before_a_package_of_this_name(tmp_path: Path) -> None:
+def test_our_package_tests_is_imported_before_an_installed_one(tmp_path: Path) -> None:
     """`slimevb` installs a package `tests`; a folder without a file of its own would come after it."""
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "__init__.py").touch()

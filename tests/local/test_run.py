@@ -64,7 +64,7 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
     assert "{" not in text, "what the functions log belongs into a file"
 
 
-def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
+def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None:
     here = local(frames=100_000).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -110,7 +110,7 @@ def test_killed_while_somebody_plays_it_goes_on(local: Make) -> None:
     assert sorted(path.name for path in answers.iterdir()) == ["1.json", "2.json", "3.json"]
 
 
-def test_a_trial_that_ends_while_local_is_dead_is_over_and_not_replaced(local: Make) -> None:
+def test_a_trial_that_ended_between_two_runs_is_not_replaced(local: Make) -> None:
     here = local(frames=60).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -124,7 +124,7 @@ def test_a_trial_that_ends_while_local_is_dead_is_over_and_not_replaced(local: M
     assert here.servers() == []
 
 
-def test_a_server_that_dies_while_local_is_dead_is_replaced(local: Make) -> None:
+def test_a_server_that_was_lost_between_two_runs_is_replaced(local: Make) -> None:
     here = local().run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -162,7 +162,7 @@ def test_ctrl_c_ends_everything_and_keeps_what_was_played(local: Make) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_other_ways_to_be_ended(local: Make, number: int) -> None:
+def test_other_signals_end_the_study_too(local: Make, number: int) -> None:
     here = local().run()
     Walker(here.url, "quick", "P1").page()
     here.told("server ready")
@@ -197,7 +197,7 @@ def test_an_agent_that_hangs_does_not_hold_up_ctrl_c(local: Make) -> None:
     assert here.servers() == []
 
 
-def test_a_second_one_on_the_same_data_says_so(local: Make) -> None:
+def test_a_second_run_on_the_same_data_is_refused(local: Make) -> None:
     here = local().run()
     other = Local(here.folder, here.place)
     other.output = here.place / "other.txt"
@@ -217,7 +217,7 @@ def test_a_port_in_use_leads_to_the_next(local: Make) -> None:
         assert httpx.get(f"{here.url}/healthz").text == "ok\n"
 
 
-def test_a_mistake_in_the_project_is_told_and_nothing_begins(local: Make) -> None:
+def test_mistakes_in_the_project_are_reported_and_nothing_starts(local: Make) -> None:
     here = local()
     config = here.folder / "config.yml"
     config.write_text(config.read_text().replace("maxEpisodes: 1", "maxEpisodes: none"))
@@ -242,7 +242,7 @@ def test_a_study_with_signed_links_shows_one_that_is_let_in(local: Make) -> None
     assert httpx.get(link.partition("&")[0]).status_code == 403
 
 
-def test_a_page_is_edited_and_reloaded(local: Make) -> None:
+def test_an_edited_page_is_shown_after_a_reload(local: Make) -> None:
     here = local(start=2).run()
     walker = Walker(here.url, "quick", "P1")
     assert "<h1>hello</h1>" in walker.page()
@@ -264,7 +264,7 @@ def test_a_page_is_edited_and_reloaded(local: Make) -> None:
     assert httpx.get(walker.link).status_code == 404
 
 
-def test_a_broken_agent_is_told_in_its_own_words(local: Make) -> None:
+def test_the_error_of_a_broken_agent_is_printed(local: Make) -> None:
     here = local()
     agent = here.folder / "agent.py"
     agent.write_text(agent.read_text().replace("self.env = Env()", "self.env = Envy()"))
@@ -273,7 +273,7 @@ def test_a_broken_agent_is_told_in_its_own_words(local: Make) -> None:
     here.told("name 'Envy' is not defined")
 
 
-def test_an_agent_that_cannot_start_is_told_with_what_make_check_advises(local: Make) -> None:
+def test_the_error_of_an_agent_that_cannot_start_comes_with_the_advice_of_make_check(local: Make) -> None:
     here = local()
     agent = here.folder / "agent.py"
     agent.write_text("import cv2_of_nobody\n" + agent.read_text())
@@ -308,7 +308,7 @@ def _gone(here: Local, seconds: float = 15) -> None:
         time.sleep(0.05)
 
 
-def test_killed_again_and_again_nothing_is_lost_and_nothing_is_left(local: Make) -> None:
+def test_repeated_kills_lose_nothing_and_leave_nothing(local: Make) -> None:
     here = local(frames=400).run()
     port = here.url.rpartition(":")[2]
     people = [f"P{n}" for n in range(4)]
@@ -361,7 +361,7 @@ def _walk_whatever_happens(url: str, user: str) -> None:
             time.sleep(0.2)
 
 
-def test_a_broken_page_is_told_with_its_line(local: Make) -> None:
+def test_a_broken_page_is_reported_with_its_line(local: Make) -> None:
     here = local(start=2)
     (here.folder / "steps" / "hello.html").write_text("<h1>Hello</h1>\n{{ nobody( }}")
     here.run()
@@ -389,7 +389,7 @@ def test_a_participant_whose_documents_were_deleted_gets_another_server(local: M
 
 
 @pytest.mark.parametrize("what", ["data", "project_master_list.json", "_secret.json", "quick/steps"])
-def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: Make, what: str) -> None:
+def test_deleted_data_are_reported_and_the_study_goes_on(local: Make, what: str) -> None:
     here = local(start=1).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -418,7 +418,7 @@ def test_data_deleted_in_the_midst_of_it_are_told_and_the_study_goes_on(local: M
     assert here.text().count("answered step 1") == (2 if what == "data" else 1)
 
 
-def test_data_deleted_between_two_runs_are_no_trouble(local: Make) -> None:
+def test_data_deleted_between_two_runs_cause_no_error(local: Make) -> None:
     here = local(start=1).run()
     for _ in range(2):
         walker = Walker(here.url, "quick", "P1")
@@ -429,7 +429,7 @@ def test_data_deleted_between_two_runs_are_no_trouble(local: Make) -> None:
         here.run()
 
 
-def test_after_ctrl_c_the_participant_is_told_the_truth(local: Make) -> None:
+def test_after_ctrl_c_the_participant_is_told_that_the_study_was_stopped(local: Make) -> None:
     here = local(frames=100_000).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -441,7 +441,7 @@ def test_after_ctrl_c_the_participant_is_told_the_truth(local: Make) -> None:
     assert "switched off by the researchers" in again.page()
 
 
-def test_a_folder_without_a_study_is_told(local: Make) -> None:
+def test_a_folder_without_a_study_is_reported(local: Make) -> None:
     here = local()
     here.folder = here.place
     assert here.begin().wait(20) == 1
@@ -449,7 +449,7 @@ def test_a_folder_without_a_study_is_told(local: Make) -> None:
     assert "Traceback" not in here.text()
 
 
-def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
+def test_an_unusable_data_folder_is_reported(local: Make) -> None:
     here = local()
     (here.place / "data").write_text("a file")
     assert here.begin().wait(20) == 1
@@ -458,13 +458,13 @@ def test_a_data_folder_that_cannot_be_used_is_told(local: Make) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7"])
-def test_another_address_than_this_machines_is_refused_in_a_sentence(local: Make, host: str) -> None:
+def test_an_address_of_another_machine_is_refused_in_a_sentence(local: Make, host: str) -> None:
     here = local()
     assert here.begin("--host", host).wait(20) == 1
     assert f"A study cannot run at {host}" in here.text()
 
 
-def test_an_origin_that_is_none_is_refused_in_a_sentence(local: Make) -> None:
+def test_an_invalid_origin_is_refused_in_a_sentence(local: Make) -> None:
     here = local()
     assert here.begin("--origin", "localhost:3000").wait(20) == 1
     assert "Write it like http://localhost:3000" in here.text()

@@ -116,7 +116,7 @@ def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> N
         assert f"wss://*.localhost:{port}" in page.headers["content-security-policy"]
 
 
-def test_servers_that_pages_would_look_for_elsewhere_are_replaced(local: Make) -> None:
+def test_servers_of_a_run_with_other_addresses_are_replaced(local: Make) -> None:
     """A run that was killed, and the next one without TLS."""
     one = hold(local, front_end=False)
     link = {"projectId": "quick", "userId": "Ada"}
@@ -185,7 +185,7 @@ def made(tmp_path: Path) -> Authority:
     return Authority(tmp_path / "tls")
 
 
-def test_its_key_is_its_owners_alone_and_stays(made: Authority, tmp_path: Path) -> None:
+def test_the_authoritys_key_is_readable_by_its_owner_alone_and_stays(made: Authority, tmp_path: Path) -> None:
     key = tmp_path / "tls" / "authority.key"
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = made.certificate.read_bytes(), key.read_bytes()
@@ -198,7 +198,7 @@ def test_its_key_is_its_owners_alone_and_stays(made: Authority, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("harm", ["key", "certificate", "other key", "old"])
-def test_one_that_cannot_be_used_is_made_anew(
+def test_an_unusable_authority_is_replaced(
     made: Authority, tmp_path: Path, harm: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "tls"
@@ -239,7 +239,7 @@ def handshake(made: Authority, name: str, *certificate_for: str) -> None:
     client.do_handshake()
 
 
-def test_it_vouches_for_names_below_localhost_alone(made: Authority) -> None:
+def test_the_authority_is_trusted_only_for_names_below_localhost(made: Authority) -> None:
     handshake(made, "alice.localhost", "alice.localhost")
     handshake(made, "127.0.0.1", "localhost", "127.0.0.1")
     for name in ("bank.example.org", "localhost.example.org"):
@@ -249,7 +249,7 @@ def test_it_vouches_for_names_below_localhost_alone(made: Authority) -> None:
         handshake(made, "bob.localhost", "alice.localhost")
 
 
-def test_its_certificate_says_so_critically(made: Authority) -> None:
+def test_the_authoritys_certificate_has_critical_name_constraints(made: Authority) -> None:
     own = x509.load_pem_x509_certificate(made.certificate.read_bytes())
     limits = own.extensions.get_extension_for_class(x509.NameConstraints)
     assert limits.critical
@@ -303,14 +303,14 @@ def test_bytes_go_both_ways_and_the_end_of_one_side_ends_the_other(echo: tuple[i
             assert got == sent
 
 
-def test_what_is_no_tls_is_closed(echo: tuple[int, ssl.SSLContext]) -> None:
+def test_connections_without_tls_are_closed(echo: tuple[int, ssl.SSLContext]) -> None:
     port, _ = echo
     with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
         client.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert re.fullmatch(rb"(\x15.*)?", client.recv(1024), re.DOTALL)
 
 
-def test_connections_that_say_nothing_keep_nobody_out_of_the_port_of_names(
+def test_silent_connections_do_not_block_the_port_of_names(
     echo: tuple[int, ssl.SSLContext], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port, trusted = echo
@@ -332,7 +332,7 @@ def test_connections_that_say_nothing_keep_nobody_out_of_the_port_of_names(
             each.close()
 
 
-def test_what_it_vouches_for_is_a_server_alone(made: Authority) -> None:
+def test_the_authority_is_trusted_only_for_server_certificates(made: Authority) -> None:
     own = x509.load_pem_x509_certificate(made.certificate.read_bytes())
     uses = own.extensions.get_extension_for_class(x509.ExtendedKeyUsage)
     assert list(uses.value) == [ExtendedKeyUsageOID.SERVER_AUTH]

@@ -14,9 +14,7 @@ from tests.local.conftest import Local
 
 
 @pytest.mark.parametrize("signed", [False, True])
-def test_one_link_for_all_and_one_for_each_place_to_play_in_all_oneself(
-    local: Callable[..., Local], signed: bool
-) -> None:
+def test_make_run_prints_a_link_for_all_and_one_for_each_place(local: Callable[..., Local], signed: bool) -> None:
     held = local(start=2)
     (held.folder / "agent.py").write_text(AGENT)
     configured(held.folder, f"  patience: 60\n  signedLinks: {str(signed).lower()}\n")

@@ -30,7 +30,7 @@ def wait_for(here: Local, number: int) -> None:
     until(lambda: len(here.servers()) == number, 15)
 
 
-def test_who_comes_gets_a_server_that_waited_and_their_recording_lies_where_it_always_does(local: Make) -> None:
+def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_place(local: Make) -> None:
     here = local(warm=1).run()
     ready(here, 1)
     (waiting,) = here.servers()
@@ -57,7 +57,7 @@ def test_who_comes_gets_a_server_that_waited_and_their_recording_lies_where_it_a
     wait_for(here, 1)
 
 
-def test_only_who_was_given_the_server_gets_in(local: Make) -> None:
+def test_a_warm_server_admits_only_its_participant(local: Make) -> None:
     here = local(warm=1).run()
     ready(here, 1)
     walker = Walker(here.url, "quick", "P1")
@@ -71,7 +71,7 @@ def test_only_who_was_given_the_server_gets_in(local: Make) -> None:
     assert walker.play(state)["score"] == 30
 
 
-def test_a_server_lost_while_it_waited_is_replaced_and_one_lost_in_play_goes_on_with_another(local: Make) -> None:
+def test_warm_servers_are_replaced_whether_lost_while_waiting_or_in_play(local: Make) -> None:
     here = local(warm=1, frames=240, holds=120).run()
     ready(here, 1)
     for process in servers_of(here.data):
@@ -92,7 +92,7 @@ def test_a_server_lost_while_it_waited_is_replaced_and_one_lost_in_play_goes_on_
     assert walker.play(again)["score"] == 240
 
 
-def test_a_changed_agent_replaces_those_that_wait(local: Make) -> None:
+def test_a_changed_agent_replaces_the_warm_servers(local: Make) -> None:
     here = local(warm=1).run()
     ready(here, 1)
     (before,) = here.servers()
@@ -107,7 +107,7 @@ def test_a_changed_agent_replaces_those_that_wait(local: Make) -> None:
     assert walker.play(walker.until("ready", seconds=20))["score"] == 40
 
 
-def test_none_is_left_when_it_ends_or_the_study_closes(local: Make) -> None:
+def test_no_warm_server_is_left_when_the_run_ends_or_the_study_is_closed(local: Make) -> None:
     here = local(warm=2).run()
     ready(here, 2)
     config = here.folder / "config.yml"

@@ -70,7 +70,7 @@ OF_DNS = (
 
 
 @pytest.mark.parametrize(("record", "values", "message"), OF_DNS, ids=[message for *_, message in OF_DNS])
-def test_what_dns_has_wrong_is_said_in_the_words_of_the_page(
+def test_problems_of_dns_are_reported_in_the_words_of_the_page(
     newcomer: Newcomer,
     empty: dict[str, list[str]],
     monkeypatch: pytest.MonkeyPatch,
@@ -93,7 +93,7 @@ def refused(newcomer: Newcomer, line: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(("line", "message"), FAILURES, ids=[message for _, message in FAILURES])
-def test_what_is_wrong_is_said_in_the_words_of_the_page(
+def test_problems_are_reported_in_the_words_of_the_page(
     newcomer: Newcomer, empty: dict[str, list[str]], line: str, message: str
 ) -> None:
     refused(newcomer, line.format(plan=BEFORE[1], deploy=DEPLOY), message)
@@ -108,21 +108,23 @@ def types(newcomer: Newcomer, command: str, exit_code: int = 0, answer: str = ""
 
 
 @pytest.mark.parametrize("command", BEFORE)
-def test_before_anything_is_there(newcomer: Newcomer, empty: dict[str, list[str]], command: str) -> None:
+def test_commands_before_the_installation_print_what_the_page_shows(
+    newcomer: Newcomer, empty: dict[str, list[str]], command: str
+) -> None:
     types(newcomer, command, exit_code=2 if command == "make doctor" else 0)
     assert newcomer.world.inventory() == empty
 
 
 @pytest.mark.parametrize("command", STANDING)
-def test_deployed(newcomer: Newcomer, command: str) -> None:
+def test_deploy_prints_what_the_page_shows(newcomer: Newcomer, command: str) -> None:
     types(newcomer, command)
 
 
-def test_in_another_region_the_installation_is_in_the_way(newcomer: Newcomer) -> None:
+def test_deploy_in_another_region_is_refused(newcomer: Newcomer) -> None:
     refused(newcomer, f"AWS_REGION=eu-west-1 {DEPLOY}", IN_THE_WAY)
 
 
-def test_the_link_that_was_printed_opens_the_study(newcomer: Newcomer) -> None:
+def test_the_printed_link_opens_the_study(newcomer: Newcomer) -> None:
     (link,) = [line for line in first_hour.shown()[DEPLOY] if "projectId=" in line]
     site = httpx.URL(link)
     with httpx.Client(headers={"Host": site.host, "Accept": "text/html"}, verify=newcomer.world.tls) as browser:
@@ -144,11 +146,11 @@ def test_deploying_again_changes_nothing(newcomer: Newcomer) -> None:
 
 
 @pytest.mark.parametrize("command", DRAINING)
-def test_away_again(newcomer: Newcomer, command: str) -> None:
+def test_destroy_prints_what_the_page_shows(newcomer: Newcomer, command: str) -> None:
     types(newcomer, command, answer="hippodrome" if command == "make destroy" else "")
 
 
-def test_what_is_left_is_the_data_alone(newcomer: Newcomer, empty: dict[str, list[str]]) -> None:
+def test_only_the_data_are_left(newcomer: Newcomer, empty: dict[str, list[str]]) -> None:
     left = {kind: set(names) - set(empty[kind]) for kind, names in newcomer.world.inventory().items()}
     (bucket,) = left.pop("buckets")
     assert bucket.startswith("hippodrome-bucket-")

@@ -234,13 +234,15 @@ def test_pages_come_over_the_real_api_and_answers_lie_in_the_bucket(
         (f"/steps/{PROJECT}/../users/R_alice/answers/1.json", 404),
     ],
 )
-def test_what_is_not_there_is_refused(installed: MinistackInstallation, people: People, path: str, status: int) -> None:
+def test_unknown_studies_and_paths_are_refused(
+    installed: MinistackInstallation, people: People, path: str, status: int
+) -> None:
     found = people.alice.browser.get(path)
     assert found.status_code == status, found.text
     assert SECRET_WORD not in found.text
 
 
-def test_a_ticket_of_ones_own_is_needed_to_answer(installed: MinistackInstallation, people: People) -> None:
+def test_an_answer_needs_the_participants_own_ticket(installed: MinistackInstallation, people: People) -> None:
     forged = {"hippodrome-step": AFTER, "hippodrome-ticket": "0" * 32, "fun": "1"}
     people.alice.browser.post(people.alice.link, data=forged)
     assert installed.stored(f"{PROJECT}/users/{people.alice.user}/answers/{AFTER}.json") is None
@@ -274,7 +276,7 @@ def test_the_same_start_message_again_starts_nothing(installed: MinistackInstall
 # -- queues, alarms ---------------------------------------------------------------------------------------------------
 
 
-def test_a_message_that_always_fails_ends_among_the_dead(installed: MinistackInstallation, people: People) -> None:
+def test_a_message_that_always_fails_becomes_a_dead_letter(installed: MinistackInstallation, people: People) -> None:
     world, carol = installed.world, people.carol
     queue, dead = installed.queue("start_server"), installed.queue("start_server", dead=True)
     # Only the time between two deliveries is shortened; how often it is delivered stays as the template says.
@@ -305,7 +307,7 @@ def alarms(installed: MinistackInstallation, namespace: str, metric: str, dimens
     }
 
 
-def test_the_dead_and_errors_raise_alarms_that_reach_somebody(installed: MinistackInstallation) -> None:
+def test_dead_letters_and_errors_raise_alarms_that_are_delivered(installed: MinistackInstallation) -> None:
     world, topic = installed.world, installed.outputs["Alarms"]
     about_queues = alarms(installed, "AWS/SQS", "ApproximateNumberOfMessagesVisible", "QueueName")
     for function in ("start_server", "stop_server", "task_changed"):
@@ -426,7 +428,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("who", REFUSALS)
-def test_each_role_refuses_what_is_its_neighbours(installed: MinistackInstallation, people: People, who: str) -> None:
+def test_each_role_refuses_calls_of_other_functions(installed: MinistackInstallation, people: People, who: str) -> None:
     role = installed.outputs[who] if who in installed.outputs else installed.role(who)
     known = calls(installed)
     allowed = [what for what in (*REFUSALS[who], *EVERYBODY) if not refused(installed, role, known[what])]
@@ -453,7 +455,7 @@ SERVICES: list[tuple[str, list[str], str]] = [
 
 
 @pytest.mark.parametrize(("who", "actions", "what"), SERVICES, ids=[f"{who}-{what}" for who, _, what in SERVICES])
-def test_services_may_do_with_our_roles_what_they_do(
+def test_services_of_aws_may_make_their_calls_with_our_roles(
     installed: MinistackInstallation, who: str, actions: list[str], what: str
 ) -> None:
     iam, mine = installed.world.client("iam"), resource(installed, what)
@@ -495,7 +497,7 @@ def resource(installed: MinistackInstallation, what: str) -> str:
     }.get(what) or installed.outputs[what]
 
 
-def test_roles_allow_what_is_their_own(installed: MinistackInstallation, people: People) -> None:
+def test_each_role_allows_its_own_calls(installed: MinistackInstallation, people: People) -> None:
     """The other side of the refusals: were everything refused to everybody, they would prove nothing."""
     known = calls(installed)
     assert not refused(installed, installed.role("next_step"), known["write an answer"])
@@ -510,7 +512,9 @@ def test_roles_allow_what_is_their_own(installed: MinistackInstallation, people:
 # -- ready, done, stopped ---------------------------------------------------------------------------------------------
 
 
-def test_a_running_server_is_named_and_alice_is_told_where(installed: MinistackInstallation, people: People) -> None:
+def test_a_running_server_gets_a_name_and_the_page_gets_its_address(
+    installed: MinistackInstallation, people: People
+) -> None:
     name = server_of("R_alice")
     until(
         lambda: installed.names().get(f"{name}.servers.{DOMAIN}") == people.addresses[name],
@@ -523,7 +527,7 @@ def test_a_running_server_is_named_and_alice_is_told_where(installed: MinistackI
     assert told["token"] == environment["TOKEN"]
 
 
-def test_the_relays_ask_for_a_proof(installed: MinistackInstallation, people: People) -> None:
+def test_the_relays_require_a_ticket(installed: MinistackInstallation, people: People) -> None:
     browser, alice = people.alice.browser, people.alice
     where = f"projectId={PROJECT}&userId={alice.user}"
     assert browser.post(f"/stop?{where}", json={"token": "guessed"}).status_code == 403
@@ -546,7 +550,7 @@ def test_a_forgotten_server_is_stopped_by_its_timer(installed: MinistackInstalla
     assert (told["state"], told["again"]) == ("ended", True)
 
 
-def test_when_alice_has_played_her_server_goes_and_the_study_goes_on(
+def test_after_the_game_the_server_is_stopped_and_the_study_goes_on(
     installed: MinistackInstallation, people: People
 ) -> None:
     alice, name = people.alice, server_of("R_alice")
@@ -585,7 +589,7 @@ def register_again(installed: MinistackInstallation, **changes: Any) -> None:
     assert answer.get("registered") == PROJECT, answer
 
 
-def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(
+def test_a_participant_gets_a_warm_server_and_none_is_left_at_the_end(
     installed: MinistackInstallation, people: People
 ) -> None:
     keep_warm(installed, 1)
@@ -621,7 +625,7 @@ def test_a_server_that_waits_is_given_to_who_comes_and_none_is_left(
     assert "spares" not in installed.stored(pool)
 
 
-def test_a_pair_has_one_server_and_each_an_answer(installed: MinistackInstallation, people: People) -> None:
+def test_a_pair_has_one_server_and_each_member_an_answer(installed: MinistackInstallation, people: People) -> None:
     registration = installed.stored("project_master_list.json")["projects"][0]
     trial_of_two = {**registration["trial"], "players": {"first_0": "human", "second_0": "human"}}
     register_again(installed, players=2, trial=trial_of_two)
@@ -665,7 +669,7 @@ def test_a_pair_has_one_server_and_each_an_answer(installed: MinistackInstallati
     installed.world.client("s3").put_object(Bucket=installed.bucket, Key="project_master_list.json", Body=listed)
 
 
-def test_the_researcher_can_look_at_everything_of_the_study(
+def test_the_researcher_can_run_every_command_for_the_study(
     world: MinistackWorld, researcher: dict[str, str], people: People, tmp_path: Path
 ) -> None:
     status = world.deploy("status", "--project", PROJECT, "--json", keys=researcher)
@@ -720,7 +724,7 @@ def test_sweep_and_certificate_have_their_timers(installed: MinistackInstallatio
     assert arns[installed.function("renew_certificate")].startswith(("rate(", "cron("))
 
 
-def test_all_functions_ran_with_their_own_roles_and_were_never_refused(
+def test_all_functions_ran_with_their_own_roles_without_a_refusal(
     installed: MinistackInstallation, people: People
 ) -> None:
     world = installed.world
@@ -732,7 +736,7 @@ def test_all_functions_ran_with_their_own_roles_and_were_never_refused(
     assert [one for one in denied if one["action"] != "logs:DescribeLogGroups"] == []
 
 
-def test_logs_hold_no_ids_no_answers_and_no_tokens(installed: MinistackInstallation, people: People) -> None:
+def test_logs_hold_no_ids_answers_or_tokens(installed: MinistackInstallation, people: People) -> None:
     logs = installed.world.client("logs")
     kept = installed.stored(KEY)
     text = json.dumps(kept).encode()
@@ -802,7 +806,7 @@ Outputs:
 """
 
 
-def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
+def test_a_failed_update_reports_its_cause_and_changes_nothing(
     world: MinistackWorld, installed: MinistackInstallation, people: People
 ) -> None:
     before, code = things(world), functions(world)
@@ -823,7 +827,7 @@ def test_an_update_that_fails_says_why_and_leaves_all_as_it_was(
     assert json.loads(again.out)["changed"] is False
 
 
-def test_two_installations_live_side_by_side(world: MinistackWorld, installed: MinistackInstallation) -> None:
+def test_two_installations_work_side_by_side(world: MinistackWorld, installed: MinistackInstallation) -> None:
     before, status = world.inventory(), MinistackInstallation(world).status
     made = world.deploy("apply", "--domain", f"second.{DOMAIN}", "--yes", "--anyway", stack="second")
     assert made.code == 0, made.err

@@ -45,7 +45,7 @@ def test_the_emulator_ends_when_the_tests_are_killed(world: MinistackWorld, tmp_
     until(lambda: not is_alive(emulator), "the emulator is gone")
 
 
-def test_who_calls_is_checked(world: MinistackWorld) -> None:
+def test_the_emulator_checks_the_callers_permissions(world: MinistackWorld) -> None:
     assert world.client("sts").get_caller_identity()["Arn"].endswith(":root")
     stranger = {"AccessKeyId": "AKIASTRANGERSTRANGER", "SecretAccessKey": "guessed"}
     with pytest.raises(botocore.exceptions.ClientError, match="InvalidAccessKeyId"):

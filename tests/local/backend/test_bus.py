@@ -74,7 +74,7 @@ def _files(tmp_path: Path) -> list[Path]:
     return sorted(path for path in (tmp_path / "queue").rglob("*.json"))
 
 
-def test_a_message_arrives_as_an_sqs_batch_and_its_file_goes(tmp_path: Path, made: list[FolderBus]) -> None:
+def test_a_message_arrives_as_an_sqs_batch_and_its_file_is_deleted(tmp_path: Path, made: list[FolderBus]) -> None:
     start = Functions()
     bus = _bus(tmp_path, made, start=start)
     bus.publish(Topic.START, {"userId": "Zoë"})
@@ -91,7 +91,7 @@ def test_a_message_arrives_as_an_sqs_batch_and_its_file_goes(tmp_path: Path, mad
     assert _files(tmp_path) == []
 
 
-def test_no_thread_takes_from_a_queue_while_it_is_seen_whether_it_is_idle(
+def test_no_message_is_taken_while_it_is_checked_whether_the_queue_is_idle(
     tmp_path: Path, made: list[FolderBus]
 ) -> None:
     queue = _bus(tmp_path, made, start=Functions())._queues["start"]
@@ -127,7 +127,7 @@ def test_batches_have_at_most_ten(tmp_path: Path, made: list[FolderBus]) -> None
     assert max(len(event["Records"]) for event in stop.events) == 10
 
 
-def test_only_the_failed_items_come_again(tmp_path: Path, made: list[FolderBus], quick: None) -> None:
+def test_only_failed_items_are_delivered_again(tmp_path: Path, made: list[FolderBus], quick: None) -> None:
     def answer(event: Event) -> Any:
         bad = [r["messageId"] for r in event["Records"] if json.loads(r["body"])["n"] == 2]
         first = all(r["attributes"]["ApproximateReceiveCount"] == "1" for r in event["Records"])
@@ -155,7 +155,7 @@ def test_only_the_failed_items_come_again(tmp_path: Path, made: list[FolderBus],
     ],
     ids=["raises", "unknown id", "no id", "a text"],
 )
-def test_after_five_receives_it_is_put_aside(
+def test_after_five_receives_a_message_is_a_dead_letter(
     tmp_path: Path, made: list[FolderBus], quick: None, answer: Callable[[Event], Any]
 ) -> None:
     start, said = Functions(answer), list[str]()
@@ -200,7 +200,7 @@ def test_later_waits(tmp_path: Path, made: list[FolderBus]) -> None:
     assert time.monotonic() - began >= 3
 
 
-def test_what_is_not_handled_comes_again_in_the_next_process(tmp_path: Path, made: list[FolderBus]) -> None:
+def test_an_unhandled_message_is_delivered_again_by_the_next_process(tmp_path: Path, made: list[FolderBus]) -> None:
     _bus(tmp_path, made).publish(Topic.STOP, {"n": 1})
     began = time.time()
     _bus(tmp_path, made).send_delayed({"n": 2}, 1)
@@ -231,7 +231,9 @@ time.sleep(30)
 """
 
 
-def test_a_message_outlives_the_process_that_dies_of_it_but_not_for_ever(tmp_path: Path, made: list[FolderBus]) -> None:
+def test_a_message_that_kills_its_process_is_delivered_a_limited_number_of_times(
+    tmp_path: Path, made: list[FolderBus]
+) -> None:
     state, seen = tmp_path / "state", tmp_path / "seen"
     for publish in (["yes"], [], [], [], []):
         command = [sys.executable, "-c", DIE, str(state), str(seen), *publish]
@@ -246,7 +248,7 @@ def test_a_message_outlives_the_process_that_dies_of_it_but_not_for_ever(tmp_pat
     assert list((state / "dead" / "start").iterdir())
 
 
-def test_a_file_that_somebody_took_away_stops_nothing(tmp_path: Path, made: list[FolderBus]) -> None:
+def test_a_deleted_message_file_does_not_stop_the_queue(tmp_path: Path, made: list[FolderBus]) -> None:
     start = Functions()
     bus = _bus(tmp_path, made, start=start)
     bus.publish(Topic.START, {"n": 1})

@@ -58,14 +58,14 @@ def _python(code: str, *arguments: object, **options: object) -> subprocess.Pope
     return subprocess.Popen(command, cwd=ROOT, **options)  # type: ignore[call-overload, no-any-return]
 
 
-def test_no_change_of_several_processes_is_lost(documents: FolderDocuments, tmp_path: Path) -> None:
+def test_changes_of_several_processes_are_all_kept(documents: FolderDocuments, tmp_path: Path) -> None:
     documents.create("count.json", b"0")
     workers = [_python(COUNT_UP, tmp_path / "data", tmp_path / "state", 50) for _ in range(4)]
     assert [worker.wait(60) for worker in workers] == [0] * 4
     assert documents.get("count.json").body == b"200"  # type: ignore[union-attr]
 
 
-def test_of_a_trial_and_a_function_that_create_at_once_one_wins(documents: FolderDocuments) -> None:
+def test_only_one_of_a_trial_and_a_function_creates_a_document(documents: FolderDocuments) -> None:
     store = FolderStore(documents.folder)
     for n in range(50):
         key, won = f"study/users/P1/answers/{n}.json", []
@@ -92,7 +92,7 @@ def test_of_a_trial_and_a_function_that_create_at_once_one_wins(documents: Folde
         assert [documents.get(key).body] == won  # type: ignore[union-attr]
 
 
-def test_killed_in_the_middle_of_writing_every_document_is_whole(documents: FolderDocuments, tmp_path: Path) -> None:
+def test_documents_are_whole_after_a_kill_during_writing(documents: FolderDocuments, tmp_path: Path) -> None:
     documents.create("big.json", b"_" * 3_000_000)
     for _ in range(5):
         writer = _python(WRITE_FOR_EVER, tmp_path / "data", tmp_path / "state", stdout=subprocess.PIPE)
@@ -117,7 +117,7 @@ def test_killed_in_the_middle_of_writing_every_document_is_whole(documents: Fold
     "key",
     ["", "/etc/passwd", "../x", "a/../../x", "a/..", "a//b", "a/", "a\\b", "a\0b", ".hidden", "a/.b/c", "x" * 300],
 )
-def test_no_key_leaves_the_folder(documents: FolderDocuments, tmp_path: Path, key: str) -> None:
+def test_no_key_leads_out_of_the_folder(documents: FolderDocuments, tmp_path: Path, key: str) -> None:
     (tmp_path / "x").write_text("outside")
     documents.create("a/b", b"here")
     with pytest.raises(ValueError):
@@ -132,7 +132,7 @@ def test_no_key_leaves_the_folder(documents: FolderDocuments, tmp_path: Path, ke
     assert [entry.key for entry in documents.list("")] == ["a/b"]
 
 
-def test_listings_in_the_order_of_s3(documents: FolderDocuments) -> None:
+def test_listings_are_in_the_order_of_s3(documents: FolderDocuments) -> None:
     keys = ["a", "b/c", "b-d", "b.e", "b0", "b/c.d/e", "b/cé", "b/cz", "B", "é", "b/c0/x"]
     keys.remove("b/c")  # a folder and a file cannot have one name; S3 would allow it
     for key in keys:
@@ -140,14 +140,14 @@ def test_listings_in_the_order_of_s3(documents: FolderDocuments) -> None:
     assert [entry.key for entry in documents.list("")] == sorted(keys, key=str.encode)
 
 
-def test_files_that_a_trial_has_not_finished_are_no_documents(documents: FolderDocuments) -> None:
+def test_unfinished_files_of_a_trial_are_no_documents(documents: FolderDocuments) -> None:
     documents.create("study/users/P1/answers/1.json", b"{}")
     (documents.folder / "study" / "users" / "P1" / "answers" / ".abc.new").write_bytes(b"half")
     assert [entry.key for entry in documents.list("study/")] == ["study/users/P1/answers/1.json"]
     assert documents.get("study/users/P1/answers/.abc.new") is None
 
 
-def test_whoever_listens_is_told_after_the_write(tmp_path: Path) -> None:
+def test_listeners_are_called_after_the_write(tmp_path: Path) -> None:
     told: list[tuple[str, bytes, bytes]] = []
 
     def written(key: str, body: bytes) -> None:

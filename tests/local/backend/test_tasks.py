@@ -104,7 +104,7 @@ def here(tmp_path: Path) -> Iterator[Here]:
     end_everything(made.state)
 
 
-def test_a_server_runs_and_is_stopped_and_its_events_are_those_of_ecs(here: Here) -> None:
+def test_a_server_that_runs_and_is_stopped_has_the_events_of_ecs(here: Here) -> None:
     tasks = here.tasks()
     arn = tasks.run(request())
     running = here.wait("RUNNING")
@@ -133,7 +133,7 @@ def test_a_server_runs_and_is_stopped_and_its_events_are_those_of_ecs(here: Here
     ]
 
 
-def test_what_a_server_is_told(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_gets_its_environment(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "not for servers")
     here.tasks().run(request())
     here.wait("RUNNING")
@@ -151,7 +151,7 @@ def test_what_a_server_is_told(here: Here, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("status", [0, 3])
-def test_a_server_that_ends_by_itself(here: Here, status: int) -> None:
+def test_the_end_of_a_server_is_reported_with_its_exit_code(here: Here, status: int) -> None:
     tasks = here.tasks()
     arn = tasks.run(request(FAKE_SECONDS="0.3", FAKE_STATUS=str(status)))
     stopped = here.wait("STOPPED")
@@ -169,7 +169,7 @@ def test_a_server_that_never_listens_is_ended(here: Here, monkeypatch: pytest.Mo
     assert here.processes() == []
 
 
-def test_what_cannot_be_run_is_refused(here: Here) -> None:
+def test_a_task_that_cannot_run_is_refused(here: Here) -> None:
     here.project.rmdir()
     tasks = here.tasks()
     with pytest.raises(Refused):
@@ -178,7 +178,7 @@ def test_what_cannot_be_run_is_refused(here: Here) -> None:
     assert list((here.state / "tasks").iterdir()) == []
 
 
-def test_who_stops_a_server_does_not_wait_for_its_end(here: Here) -> None:
+def test_stop_does_not_wait_for_the_servers_end(here: Here) -> None:
     tasks = here.tasks(stop_timeout=600)
     arn = tasks.run(request(FAKE_STUBBORN="yes"))
     here.wait("RUNNING")
@@ -186,7 +186,7 @@ def test_who_stops_a_server_does_not_wait_for_its_end(here: Here) -> None:
     assert here.processes() == [NAME]
 
 
-def test_a_stubborn_server_is_killed(here: Here) -> None:
+def test_a_server_that_ignores_sigterm_is_killed(here: Here) -> None:
     tasks = here.tasks(stop_timeout=0.5)
     arn = tasks.run(request(FAKE_STUBBORN="yes"))
     here.wait("RUNNING")
@@ -195,13 +195,13 @@ def test_a_stubborn_server_is_killed(here: Here) -> None:
     until(lambda: not here.processes())  # SIGKILL was sent to its group; the system takes a moment to carry it out
 
 
-def test_stop_before_it_has_begun(here: Here) -> None:
+def test_a_server_can_be_stopped_before_its_process_starts(here: Here) -> None:
     tasks = here.tasks()
     tasks.stop(tasks.run(request()), "hippodrome", "hippodrome: enough")
     assert here.wait("STOPPED")["stopCode"] == "UserInitiated"
 
 
-def test_children_of_a_server_go_with_it(here: Here, tmp_path: Path) -> None:
+def test_child_processes_of_a_server_end_with_it(here: Here, tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(
         "import subprocess, sys, json\n"
@@ -214,7 +214,7 @@ def test_children_of_a_server_go_with_it(here: Here, tmp_path: Path) -> None:
     until(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE)
 
 
-def test_the_next_process_takes_up_what_runs(here: Here) -> None:
+def test_the_next_process_takes_over_running_servers(here: Here) -> None:
     arn = here.tasks().run(request())
     here.wait("RUNNING")
     here.forget()
@@ -260,7 +260,7 @@ def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
         until((here.state / "tasks" / f"{NAME}.pid").exists, 10)
 
 
-def test_killed_between_the_intent_and_the_process_it_is_simply_asked_for_again(here: Here) -> None:
+def test_after_a_kill_before_the_server_started_the_task_can_be_requested_again(here: Here) -> None:
     _begin_and_be_killed(here, "before")
     tasks = here.tasks()
     tasks.start()
@@ -271,7 +271,7 @@ def test_killed_between_the_intent_and_the_process_it_is_simply_asked_for_again(
 
 
 @pytest.mark.parametrize("moment", ["after", "end"])
-def test_killed_after_the_process_began_it_is_found(here: Here, moment: str) -> None:
+def test_after_a_kill_the_started_server_is_found(here: Here, moment: str) -> None:
     _begin_and_be_killed(here, moment)
     before = marked(here.state)[NAME]
     tasks = here.tasks()
@@ -285,14 +285,14 @@ def test_killed_after_the_process_began_it_is_found(here: Here, moment: str) -> 
 
 
 @pytest.mark.parametrize("moment", ["after", "end"])
-def test_what_ended_while_nobody_looked_is_told_with_its_exit_code(here: Here, moment: str) -> None:
+def test_servers_that_ended_between_two_processes_are_reported_with_their_exit_code(here: Here, moment: str) -> None:
     _begin_and_be_killed(here, moment, seconds=0.2)
     until(lambda: not here.processes(), 10)
     here.tasks().start()
     assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
 
 
-def test_killed_while_it_was_being_stopped_the_stop_goes_on(here: Here) -> None:
+def test_after_a_kill_the_stop_of_a_server_is_finished(here: Here) -> None:
     first = here.tasks()
     arn = first.run(request())
     here.wait("RUNNING")
@@ -319,7 +319,7 @@ def test_an_event_that_may_not_have_been_sent_is_sent_again(here: Here) -> None:
     assert here.wait("STOPPED")["version"] == 3
 
 
-def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: Here) -> None:
+def test_a_process_id_that_another_program_has_now_is_left_alone(here: Here) -> None:
     """As after a restart of the machine: the record says it runs, and its process id is another program's."""
     bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
     try:
@@ -338,7 +338,7 @@ def test_a_process_id_that_belongs_to_somebody_else_by_now_is_left_alone(here: H
         bystander.wait()
 
 
-def test_processes_that_nobody_knows_of_are_ended(here: Here) -> None:
+def test_unknown_server_processes_are_ended(here: Here) -> None:
     here.tasks().run(request())
     here.wait("RUNNING")
     here.written()
@@ -370,14 +370,14 @@ def test_a_recording_of_a_killed_server_of_a_session_is_kept_with_the_session(he
     assert (here.data / folder / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
-def test_a_desktops_own_variable_makes_no_session(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_desktops_variable_SESSION_makes_no_session(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SESSION", "ubuntu")
     tasks = here.tasks()
     assert "SESSION" not in tasks._shared.environment(request())
     assert tasks._shared.environment(request(SESSION=SESSION))["SESSION"] == SESSION
 
 
-def test_a_recording_that_is_not_to_be_kept_is_not(here: Here) -> None:
+def test_a_recording_is_not_kept_if_the_study_keeps_none(here: Here) -> None:
     folder = f"study/users/P1/trials/{NAME}"
     tasks = here.tasks(stop_timeout=0.2)
     arn = tasks.run(request(FAKE_STUBBORN="yes", TRIAL='{"s3upload": false}'))
@@ -430,7 +430,7 @@ def test_a_recording_of_a_killed_warm_server_is_kept_where_its_participants_are(
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
-def test_a_warm_server_that_was_handed_to_a_session_is_the_sessions(here: Here) -> None:
+def test_a_recording_of_a_warm_server_in_a_session_is_kept_with_the_session(here: Here) -> None:
     tasks = here.tasks()
     tasks.run(warm_server_request())
     here.wait("RUNNING")
@@ -438,7 +438,7 @@ def test_a_warm_server_that_was_handed_to_a_session_is_the_sessions(here: Here) 
     assert [(task.folder, task.server) for task in tasks.playing()] == [(f"study/sessions/{SESSION}", OWN)]
 
 
-def test_a_warm_servers_document_may_be_gone_when_its_process_is(here: Here) -> None:
+def test_the_document_of_a_warm_server_may_be_deleted_before_its_process_ends(here: Here) -> None:
     tasks = here.tasks(stop_timeout=0.5)
     arn = tasks.run(warm_server_request(FAKE_STUBBORN="yes"))
     here.wait("RUNNING")
@@ -450,7 +450,7 @@ def test_a_warm_servers_document_may_be_gone_when_its_process_is(here: Here) -> 
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 
 
-def test_the_next_process_knows_whose_a_warm_server_is(here: Here) -> None:
+def test_the_next_process_knows_the_participant_of_a_warm_server(here: Here) -> None:
     first = here.tasks()
     first.run(warm_server_request())
     here.wait("RUNNING")
@@ -473,7 +473,9 @@ def test_a_warm_servers_record_names_its_handover_as_earlier_versions_did(tmp_pa
 
 
 @pytest.mark.parametrize("document", [None, b"", b'{"userId": "P1", "ser', b'{"userId": "../P1", "server": "a-1"}'])
-def test_a_warm_server_that_is_nobodys_has_no_folder_and_nothing_to_keep(here: Here, document: bytes | None) -> None:
+def test_a_warm_server_without_a_participant_has_no_folder_and_no_recordings(
+    here: Here, document: bytes | None
+) -> None:
     tasks = here.tasks()
     arn = tasks.run(warm_server_request())
     here.wait("RUNNING")
@@ -524,7 +526,7 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
     assert not list((here.state / "spool").rglob("*.part"))
 
 
-def test_closing_ends_all_and_starts_none(here: Here) -> None:
+def test_close_ends_all_servers_and_starts_none(here: Here) -> None:
     tasks = here.tasks(stop_timeout=600)
     names = [f"s{'a' * 20}-{n}" for n in range(1, 6)]
     for n, name in enumerate(names):
@@ -541,7 +543,7 @@ def test_closing_ends_all_and_starts_none(here: Here) -> None:
         tasks.run(request("saaaaaaaaaaaaaaaaaaaa-99"))
 
 
-def test_old_logs_go(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_logs_are_deleted(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks_module, "KEPT_LOGS", 2)
     monkeypatch.setattr(tasks_module, "KEPT_TASKS", 3)
     tasks = here.tasks()

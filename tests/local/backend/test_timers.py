@@ -41,7 +41,7 @@ def timers(tmp_path: Path, fired: list[Any]) -> Iterator[Make]:
         one.close()
 
 
-def test_a_timer_fires_when_it_is_due_and_is_gone(timers: Make, fired: list[Any]) -> None:
+def test_a_timer_fires_when_it_is_due_and_is_deleted(timers: Make, fired: list[Any]) -> None:
     here = timers()
     here.start()
     here.set("late", _now() + timedelta(hours=1), {"n": 3})
@@ -93,7 +93,7 @@ def test_a_timer_that_cannot_publish_is_kept(timers: Make, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 65, "a b"])
-def test_names_that_a_scheduler_would_not_take(timers: Make, name: str) -> None:
+def test_names_that_the_scheduler_of_aws_refuses_are_refused(timers: Make, name: str) -> None:
     with pytest.raises(ValueError):
         timers().set(name, _now(), {})
 
@@ -101,7 +101,7 @@ def test_names_that_a_scheduler_would_not_take(timers: Make, name: str) -> None:
 RECORD = DnsRecord("saaaaaaaaaaaaaaaaaaaa-1.localhost", "127.0.0.1")
 
 
-def test_here_a_name_is_in_sync_at_once(tmp_path: Path) -> None:
+def test_a_local_name_is_in_sync_at_once(tmp_path: Path) -> None:
     names = FileDns(tmp_path)
     assert names.change(add=[RECORD]) == ""
     assert names.in_sync("")

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("forked")
 # --- the command -------------------------------------------------------------------------------------
 
 
-def test_a_good_study(folder: Path) -> None:
+def test_a_good_study_has_no_findings(folder: Path) -> None:
     assert run(folder) == (
         0,
         [
@@ -38,7 +38,7 @@ def test_the_example_is_free_of_remarks() -> None:
     assert tried(ROOT) == []
 
 
-def test_everything_at_once(folder: Path) -> None:
+def test_all_mistakes_are_reported_at_once_by_check(folder: Path) -> None:
     config(folder, "maxRuntime: 5", "maxRuntime: 0")
     page(folder, "<h1>Hello</h1>\n{{ nobody( }}\n<img src=missing.png>")
     agent(folder, "class Agent:", "class Agent")
@@ -72,14 +72,14 @@ def test_a_failing_game_is_a_mistake(folder: Path) -> None:
     ]
 
 
-def test_no_such_folder(tmp_path: Path) -> None:
+def test_check_reports_a_missing_folder(tmp_path: Path) -> None:
     assert run(tmp_path / "nowhere") == (1, [f"{tmp_path / 'nowhere'}: there is no such folder", "1 mistake."])
 
 
 # --- while the study runs -----------------------------------------------------------------------------
 
 
-def test_what_a_held_study_is_told(folder: Path, tmp_path: Path) -> None:
+def test_a_running_study_reports_mistakes_in_changed_files(folder: Path, tmp_path: Path) -> None:
     from lambdas import installed
 
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={})
@@ -139,7 +139,7 @@ def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path)
     assert run(folder)[0] == 0
 
 
-def test_how_far_an_agent_came_is_read_from_the_last_whole_line(
+def test_the_progress_of_an_agent_is_read_from_the_last_whole_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(agent_progress, "REPORT_BYTES", 1_000)
@@ -158,7 +158,7 @@ def test_how_far_an_agent_came_is_read_from_the_last_whole_line(
     assert last_line(report.read_text())["steps"] == 49
 
 
-def test_an_agent_that_closes_all_files_is_reported_all_the_same(folder: Path) -> None:
+def test_an_agent_that_closes_all_files_is_still_reported(folder: Path) -> None:
     agent(folder, "class Agent:", "import os\nclass Agent:")
     agent(
         folder,

@@ -40,13 +40,13 @@ pytestmark = pytest.mark.usefixtures("forked")
         ("self.env = Env()", "import signal; signal.raise_signal(11)", 'agent.py:16: start("none") ended Python itself (signal SIGSEGV)'),
     ],
 )  # fmt: skip
-def test_agents_that_fail(folder: Path, old: str, new: str, said: str) -> None:
+def test_failures_of_an_agent_are_reported_with_their_line(folder: Path, old: str, new: str, said: str) -> None:
     agent(folder, old, new)
     (line,) = tried(folder)
     assert line.startswith(said)
 
 
-def test_callbacks_that_fail_are_mistakes_and_the_game_is_played_all_the_same(folder: Path) -> None:
+def test_callbacks_that_fail_are_mistakes_and_the_game_goes_on(folder: Path) -> None:
     source = folder / "agent.py"
     start = len(source.read_text().splitlines())
     source.write_text(
@@ -73,7 +73,7 @@ def test_a_callback_that_hangs_is_remarked(folder: Path) -> None:
     ]
 
 
-def test_callbacks_that_are_fine_are_not_remarked(folder: Path) -> None:
+def test_good_callbacks_get_no_remark(folder: Path) -> None:
     source = folder / "agent.py"
     source.write_text(
         source.read_text() + "    def on_tick(self, session):\n        session.record('t', session.ticks)\n"
@@ -81,14 +81,14 @@ def test_callbacks_that_are_fine_are_not_remarked(folder: Path) -> None:
     assert tried(folder) == []
 
 
-def test_an_agent_that_fails_late_is_seen(folder: Path) -> None:
+def test_an_agent_that_fails_late_is_reported(folder: Path) -> None:
     agent(folder, "self.n += 1", "self.n += 1; assert self.n != 25, 'late'")
     (line,) = tried(folder)
     assert line.startswith("agent.py:8: step(")
     assert "fails (episode 1, after 24 steps in all): AssertionError: late" in line
 
 
-def test_an_agent_that_fails_in_one_group_only_is_seen(folder: Path) -> None:
+def test_an_agent_that_fails_in_one_group_only_is_reported(folder: Path) -> None:
     (folder / "steps" / "hello.html").unlink()
     page(folder, "<p>0", "hello-0")
     page(folder, "<p>1", "hello-1")
@@ -100,9 +100,7 @@ def test_an_agent_that_fails_in_one_group_only_is_seen(folder: Path) -> None:
     assert "  played in group 0: 1 of 1 episodes to the end, 30 steps" in lines
 
 
-def test_a_game_without_an_end_is_played_for_a_while_and_that_is_said(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_says_how_long_it_played_a_game_without_an_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     agent(folder, "self.n >= 30", "False")
     monkeypatch.setattr(agent_check, "PLAY_SECONDS", 0.5)
     said: list[str] = []
@@ -187,14 +185,14 @@ def test_an_arrow_without_an_action_of_the_environment_is_remarked(folder: Path,
     assert line.endswith("remark: trial.ui.right: the arrow does nothing: no action is called right")
 
 
-def test_arrows_of_actions_without_names_are_not_remarked_where_ui_is_not(folder: Path) -> None:
+def test_without_ui_arrows_of_actions_without_names_get_no_remark(folder: Path) -> None:
     config(folder, "  actionSpace: [noop, left]\n", "")
     config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
     agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
     assert tried(folder) == []
 
 
-def test_arrows_that_are_there_because_ui_is_not_are_not_remarked(folder: Path) -> None:
+def test_default_arrows_without_ui_get_no_remark(folder: Path) -> None:
     config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
     assert looked(folder) == []
 
@@ -212,7 +210,7 @@ def test_with_keys_the_arrows_of_ui_are_not_remarked(folder: Path) -> None:
     assert looked(folder) == []
 
 
-def test_players_whom_no_participant_plays_are_remarked(folder: Path) -> None:
+def test_players_without_a_participant_are_remarked(folder: Path) -> None:
     config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left]\n  players: {a: human, b: human, c: idle}")
     (line,) = looked(folder)
     assert line.endswith(
@@ -256,7 +254,7 @@ def test_fields_of_a_page_that_the_game_page_shows_are_remarked(folder: Path) ->
         ([], None),
     ],
 )
-def test_what_counts_as_slow(seconds: list[float], slow: str | None) -> None:
+def test_an_agent_is_slow_if_its_steps_take_too_long(seconds: list[float], slow: str | None) -> None:
     pace = Pace()
     for each in seconds:
         pace.took(each)
@@ -285,27 +283,27 @@ def test_an_agent_may_turn_names_into_actions_of_the_environment(folder: Path) -
     assert tried(folder) == []
 
 
-def test_an_error_is_not_blamed_on_the_names_where_the_agent_turns_them_into_actions(folder: Path) -> None:
+def test_if_the_agent_translates_names_an_error_is_not_attributed_to_the_names(folder: Path) -> None:
     with_a_third_name(folder, "assert action != 2, 'mine'; return self.env.step(0)")
     (line,) = tried(folder)
     assert "step(2) fails" in line
     assert line.endswith("AssertionError: mine")
 
 
-def test_an_action_that_the_environment_complains_of_is_a_mistake_of_the_names(folder: Path) -> None:
+def test_an_action_that_the_environment_refuses_is_a_mistake_in_the_names(folder: Path) -> None:
     with_a_third_name(folder, "return self.env.step(action)")
     (line,) = tried(folder)
     assert line.startswith("config.yml:13: trial.actionSpace: has 3 names, but the environment has 2 actions; ")
 
 
-def test_an_agent_that_hangs(folder: Path) -> None:
+def test_an_agent_that_hangs_is_reported(folder: Path) -> None:
     agent(folder, "self.n += 1", "import time; time.sleep(1000)")
     began = time.monotonic()
     assert tried(folder, 4) == ["agent.py:8: step(0) has not come back within 4 s"]
     assert time.monotonic() - began < 10
 
 
-def test_nothing_that_the_agent_starts_is_left(folder: Path, tmp_path: Path) -> None:
+def test_processes_of_the_agent_end_with_the_check(folder: Path, tmp_path: Path) -> None:
     note = tmp_path / "pid"
     agent(
         folder,
@@ -319,21 +317,21 @@ def test_nothing_that_the_agent_starts_is_left(folder: Path, tmp_path: Path) -> 
         time.sleep(0.05)
 
 
-def test_a_custom_agent_without_action_space(folder: Path) -> None:
+def test_a_custom_agent_needs_an_action_space(folder: Path) -> None:
     config(folder, "  actionSpace: [noop, left]\n", "")
     assert tried(folder) == [
         "config.yml:8: trial.actionSpace: missing; list the game's actions, since the environment does not name them"
     ]
 
 
-def test_a_game_that_does_not_exist(folder: Path) -> None:
+def test_a_game_that_does_not_exist_is_reported(folder: Path) -> None:
     (folder / "agent.py").unlink()
     config(folder, "game: none", "game: CartPoll-v1")
     (line,) = tried(folder)
     assert line.startswith('config.yml:9: trial.game: start("CartPoll-v1") fails: gymnasium.error.NameNotFound: ')
 
 
-def test_a_game_without_an_agent(folder: Path) -> None:
+def test_a_game_without_an_agent_is_tried(folder: Path) -> None:
     (folder / "agent.py").unlink()
     config(folder, "game: none", "game: ALE/Pong-v5")
     said = "config.yml:13: remark: trial.actionSpace: has 2 names, but the environment has 6 actions"
@@ -370,7 +368,7 @@ READS = ("os.environ.get('GROUP')", "os.getenv('GROUP')", "'GROUP' in os.environ
 
 @pytest.mark.explores
 @pytest.mark.parametrize(("reads", "at"), sample([(reads, at) for reads in READS for at in (1, 18)], 3))
-def test_a_group_that_is_read_too_early(folder: Path, reads: str, at: int) -> None:
+def test_a_group_that_is_read_before_the_handover_is_remarked(folder: Path, reads: str, at: int) -> None:
     warm(folder)
     if at == 1:
         agent(folder, "import numpy as np", f"import os; from os import environ; import numpy as np; x = {reads}")
@@ -379,7 +377,7 @@ def test_a_group_that_is_read_too_early(folder: Path, reads: str, at: int) -> No
     assert tried(folder) == [f"agent.py:{at}: remark: GROUP {EARLY}"]
 
 
-def test_a_group_that_is_demanded_too_early_is_a_mistake_with_its_reason(folder: Path) -> None:
+def test_a_group_that_is_required_before_the_handover_is_a_mistake(folder: Path) -> None:
     warm(folder, groups=False)  # an ordinary server has an empty one
     agent(folder, "self.env = Env()", "import os; self.group = os.environ['GROUP']")
     remark, mistake = tried(folder)
@@ -387,14 +385,14 @@ def test_a_group_that_is_demanded_too_early_is_a_mistake_with_its_reason(folder:
     assert mistake == "agent.py:17: start(\"none\") fails: KeyError: 'GROUP'"
 
 
-def test_a_participant_who_is_asked_for_too_early(folder: Path) -> None:
+def test_a_participant_id_that_is_read_before_the_handover_is_remarked(folder: Path) -> None:
     warm(folder, groups=False)
     (folder / "beside.py").write_text("import os\nPERSON = os.environ.get('USER_ID')\nGROUP = os.environ.get('GROUP')")
     agent(folder, "import numpy", "import beside; import numpy")
     assert tried(folder) == [f"beside.py:2: remark: USER_ID {EARLY}"]
 
 
-def test_a_group_that_is_read_at_the_reset_is_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_group_can_be_read_at_reset(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GROUP", "of this shell")
     monkeypatch.setenv("USER_ID", "of this shell")
     warm(folder)
@@ -407,7 +405,7 @@ def test_a_group_that_is_read_at_the_reset_is_there(folder: Path, monkeypatch: p
     assert tried(folder) == []
 
 
-def test_what_libraries_look_up_is_not_the_projects(folder: Path) -> None:
+def test_variables_that_libraries_read_are_not_the_projects(folder: Path) -> None:
     warm(folder)
     library = folder / ".venv" / "lib" / "site-packages"
     library.mkdir(parents=True)
@@ -423,7 +421,7 @@ def test_without_warm_servers_a_group_may_be_read_at_any_time(folder: Path) -> N
     assert tried(folder) == []
 
 
-def test_a_mistake_in_a_file_beside_the_agent(folder: Path) -> None:
+def test_a_mistake_in_a_file_beside_the_agent_is_reported_there(folder: Path) -> None:
     (folder / "beside.py").write_text("\nx = (")
     agent(folder, "import numpy", "import beside; import numpy")
     assert tried(folder) == ["beside.py:2: start(\"none\") fails: SyntaxError: '(' was never closed"]

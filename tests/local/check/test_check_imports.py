@@ -43,7 +43,7 @@ def test_a_package_that_the_image_lacks_is_a_mistake_with_its_line_and_what_to_w
     assert "trying agent.py …" in lines, "what is missing on AWS does not keep the agent from being tried here"
 
 
-def test_the_package_is_named_as_the_registry_calls_it(folder: Path) -> None:
+def test_a_missing_package_is_named_as_the_registry_names_it(folder: Path) -> None:
     begin(folder, "def late():\n    from jwt_of_nobody import x\n    import dns.resolver")
     (line,) = found(folder)
     assert line.startswith(
@@ -51,7 +51,7 @@ def test_the_package_is_named_as_the_registry_calls_it(folder: Path) -> None:
     )
 
 
-def test_requirements_are_heard_with_what_they_bring(folder: Path) -> None:
+def test_requirements_count_with_their_dependencies(folder: Path) -> None:
     begin(folder, "import minari\nimport psutil\nimport dns.resolver")
     (folder / "requirements.txt").write_text("# mine\nPSUtil >= 5  # comment\n--prefer-binary\nminari==0.5.4\n")
     (line,) = found(folder)
@@ -78,27 +78,27 @@ def test_a_package_may_come_with_requirements_that_are_not_installed_here(folder
         ("https://example.org/some.whl\n", "because a line of requirements.txt names no package;"),
     ],
 )
-def test_it_says_why_it_is_not_checked(folder: Path, requirements: str, reason: str) -> None:
+def test_check_says_why_it_does_not_check_imports(folder: Path, requirements: str, reason: str) -> None:
     begin(folder, "import psutil")
     (folder / "requirements.txt").write_text(requirements)
     (line,) = found(folder)
     assert reason in line
 
 
-def test_what_is_there_is_known_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
+def test_the_packages_of_the_image_are_known_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
     begin(folder, "import numpy, PIL, psutil\nimport dns")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\npsutil\ndns\n")
     assert found(folder) == []
 
 
-def test_parts_of_hippodrome_are_lacking_whatever_is_required(folder: Path) -> None:
+def test_parts_of_hippodrome_are_missing_whatever_the_requirements(folder: Path) -> None:
     begin(folder, "import hippodrome.model.ids")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
     (line,) = found(folder)
     assert line.startswith("agent.py:1: hippodrome is not in the servers' image")
 
 
-def test_what_playing_loads_is_told_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
+def test_imports_during_play_are_reported_beside_requirements_that_are_not_installed_here(folder: Path) -> None:
     agent = folder / "agent.py"
     agent.write_text(agent.read_text() + "\n__import__('importlib').import_module('psutil')\n")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
@@ -123,7 +123,7 @@ def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
     ]
 
 
-def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
+def test_of_our_own_code_the_image_holds_only_the_trials(folder: Path) -> None:
     begin(folder, "import trial.agent, protocol\nimport hippodrome.model.ids")
     (line,) = found(folder)
     assert (
@@ -143,12 +143,12 @@ def test_our_own_code_is_not_there_but_for_the_trials(folder: Path) -> None:
         "import typing as t\nif t.TYPE_CHECKING:\n    import psutil",
     ],
 )
-def test_imports_that_are_fine(folder: Path, text: str) -> None:
+def test_imports_that_the_image_holds_get_no_finding(folder: Path, text: str) -> None:
     begin(folder, text)
     assert found(folder) == []
 
 
-def test_what_is_here_for_other_commands_alone_is_not_in_the_image(folder: Path) -> None:
+def test_packages_for_other_commands_are_not_in_the_image(folder: Path) -> None:
     begin(folder, "import boto3")
     wanted = f"boto3=={version('boto3')}"
     assert found(folder) == [
@@ -156,23 +156,23 @@ def test_what_is_here_for_other_commands_alone_is_not_in_the_image(folder: Path)
     ]
 
 
-def test_nothing_is_said_of_a_study_without_aws_or_without_a_game(folder: Path) -> None:
+def test_imports_are_not_checked_without_aws_or_without_a_game(folder: Path) -> None:
     begin(folder, "import psutil")
     config(folder, "useAWS: true", "useAWS: false")
     assert run(folder)[0] == 0
 
 
-def test_the_examples_imports_are_there() -> None:
+def test_the_image_holds_the_imports_of_the_examples() -> None:
     assert agent_imports.missing(ROOT) == []
 
 
 @pytest.mark.parametrize("source", [b"(", b"\xff\0", b"import psutil, (", b"#" * 10 + b"\n" + b"(" * 5000])
-def test_what_python_cannot_read_is_said_elsewhere(folder: Path, source: bytes) -> None:
+def test_syntax_errors_are_not_reported_among_the_imports(folder: Path, source: bytes) -> None:
     (folder / "agent.py").write_bytes(source)
     assert found(folder) == []
 
 
-def test_what_the_game_loads_is_told_too_if_it_says_how_large_its_servers_are(folder: Path) -> None:
+def test_imports_of_the_game_are_reported_if_the_study_has_aws_setup(folder: Path) -> None:
     config(folder, "  useAWS: true\n", "")
     agent = folder / "agent.py"
     agent.write_text(agent.read_text() + "\n__import__('importlib').import_module('psutil')\n")
@@ -183,7 +183,7 @@ def test_what_the_game_loads_is_told_too_if_it_says_how_large_its_servers_are(fo
     assert status == 0, "it may do without"
 
 
-def test_what_agent_py_imports_is_a_remark_as_long_as_aws_is_left_open(folder: Path) -> None:
+def test_a_missing_import_is_a_remark_without_use_aws(folder: Path) -> None:
     begin(folder, "import psutil")
     config(folder, "  useAWS: true\n", "")
     status, lines = run(folder)
@@ -191,7 +191,7 @@ def test_what_agent_py_imports_is_a_remark_as_long_as_aws_is_left_open(folder: P
     assert status == 0
 
 
-def test_what_playing_loads_is_said_of_nothing_else(folder: Path) -> None:
+def test_other_imports_during_play_are_not_reported(folder: Path) -> None:
     """The trial's own packages, what the image holds, and what the project imports where it may fail."""
     begin(folder, "import numpy, PIL.Image\ntry:\n    import psutil\nexcept ImportError:\n    psutil = None")
     status, lines = run(folder)
@@ -211,7 +211,7 @@ def policies(folder: Path) -> None:
         (folder / f"policies/{name}.onnx").touch()
 
 
-def test_what_runs_the_files_of_policies_is_to_be_named(folder: Path) -> None:
+def test_the_package_that_runs_policy_files_must_be_required(folder: Path) -> None:
     policies(folder)
     config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx, c: sample:policies/q.onnx}")
     (line,) = needed(folder)
@@ -225,7 +225,7 @@ def test_what_runs_the_files_of_policies_is_to_be_named(folder: Path) -> None:
     assert needed(folder) == []
 
 
-def test_the_package_of_a_game_that_is_a_module_is_to_be_named(folder: Path) -> None:
+def test_the_package_of_a_game_in_a_module_must_be_required(folder: Path) -> None:
     config(folder, "game: ", "game: pettingzoo.classic.rps_v2 # ")
     assert needed(folder) == [], "agent.py makes the game"
     (folder / "agent.py").unlink()
@@ -238,7 +238,7 @@ def test_the_package_of_a_game_that_is_a_module_is_to_be_named(folder: Path) -> 
     assert needed(folder) == []
 
 
-def test_what_policies_need_is_left_open_where_requirements_are_not_known(folder: Path) -> None:
+def test_packages_of_policies_are_not_checked_with_unknown_requirements(folder: Path) -> None:
     policies(folder)
     config(folder, "trial:", "trial:\n  players: {a: human, b: policies/p.onnx}")
     (folder / "requirements.txt").write_text("not_installed_of_nobody\n")

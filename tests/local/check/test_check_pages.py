@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("forked")
         ("{{ 'x' * 100000000 }}", "1: the page cannot be shown: SecurityError"),
     ],
 )
-def test_jinja(folder: Path, text: str, said: str) -> None:
+def test_mistakes_in_jinja_are_reported(folder: Path, text: str, said: str) -> None:
     page(folder, text)
     assert any(line.startswith(f"steps/hello.html:{said}") for line in looked(folder)), looked(folder)
     assert any(not problem.remark for problem in check_pages(folder, read_project(folder)))
@@ -51,13 +51,13 @@ def test_jinja(folder: Path, text: str, said: str) -> None:
         ("{{ answers['1'].n * 2 }}", "a participant without the answer gets an error page here (UndefinedError: "),
     ],
 )
-def test_jinja_that_may_be_meant(folder: Path, text: str, said: str) -> None:
+def test_jinja_that_may_be_intended_is_remarked(folder: Path, text: str, said: str) -> None:
     page(folder, text)
     (line,) = looked(folder)
     assert line.startswith(f"steps/hello.html:1: remark: {said}")
 
 
-def test_jinja_that_is_fine(folder: Path) -> None:
+def test_good_jinja_gets_no_finding(folder: Path) -> None:
     page(
         folder,
         """{{ answers["9"].x.y }} {{ participant.PROLIFIC_PID }} {{ project.name|upper }} {{ completion_code }}
@@ -76,7 +76,7 @@ def test_jinja_that_is_fine(folder: Path) -> None:
         ("{% if answers[1].age %}{% endif %}", 'write answers["1"], with quotes'),
     ],
 )
-def test_an_answer_that_nobody_can_have_given(folder: Path, text: str, said: str) -> None:
+def test_answers_that_cannot_exist_are_reported(folder: Path, text: str, said: str) -> None:
     page(folder, ASKS)
     page(folder, f"\n{text}", "bye")
     (line,) = looked(folder)
@@ -87,7 +87,7 @@ ASKS = """<label>Age <input type="number" name="age"></label><textarea name="pet
 <button name="go" value="1">Go</button>"""
 
 
-def test_answers_that_may_have_been_given(folder: Path) -> None:
+def test_answers_that_may_exist_get_no_finding(folder: Path) -> None:
     page(folder, ASKS)
     page(
         folder,
@@ -136,7 +136,7 @@ def test_each_group_is_shown_its_page(folder: Path) -> None:
         ("<style>p { background: url('cat.png') }</style>", "cat.png is not found from a style; "),
     ],
 )
-def test_html_remarks(folder: Path, text: str, said: str) -> None:
+def test_doubtful_html_is_remarked(folder: Path, text: str, said: str) -> None:
     (folder / "steps" / "cat.png").touch()
     page(folder, f"{{# a\ncomment #}}\n{text}")
     (line,) = looked(folder)
@@ -161,20 +161,20 @@ def test_html_remarks(folder: Path, text: str, said: str) -> None:
         ("<embed src=https://media.example/x>", "<embed> is never shown"),
     ],
 )
-def test_html_mistakes(folder: Path, text: str, said: str) -> None:
+def test_mistakes_in_html_are_reported(folder: Path, text: str, said: str) -> None:
     config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
     page(folder, f"\n{text}")
     (line,) = looked(folder)
     assert line.startswith(f"steps/hello.html:2: {said}")
 
 
-def test_what_browsers_take_for_a_comment_hides_nothing_after_it(folder: Path) -> None:
+def test_comments_end_where_browsers_end_them(folder: Path) -> None:
     page(folder, '<![1]>\n<![if !mso]><p onclick="x()">a</p><![endif]>')
     (line,) = looked(folder)
     assert line.startswith("steps/hello.html:2: remark: onclick never runs")
 
 
-def test_html_that_is_fine(folder: Path) -> None:
+def test_good_html_gets_no_finding(folder: Path) -> None:
     config(folder, "  maxRuntime", "  allowedHosts: [https://media.example]\n  maxRuntime")
     (folder / "steps" / "a cat.png").touch()
     (folder / "steps" / "x.js").touch()
@@ -232,7 +232,7 @@ def test_tags_left_open_are_remarks(folder: Path, text: str, line: int, said: st
     assert [each for each in looked(folder) if each.startswith(f"steps/hello.html:{line}: remark: {said}")]
 
 
-def test_questions_and_tags_that_are_fine(folder: Path) -> None:
+def test_good_questions_and_tags_get_no_finding(folder: Path) -> None:
     page(
         folder,
         f"""<h1>Hello<br></h1><p>One<p>Two<ul><li>a<li>b</ul>
@@ -246,7 +246,7 @@ def test_questions_and_tags_that_are_fine(folder: Path) -> None:
     assert looked(folder) == []
 
 
-def test_what_was_answered_before_is_there(folder: Path) -> None:
+def test_earlier_answers_are_available_to_pages(folder: Path) -> None:
     page(
         folder,
         '<input type="number" name="age" required><input type="number" name="more"><input type="radio" name="r" value="1">',
@@ -264,14 +264,14 @@ def test_what_was_answered_before_is_there(folder: Path) -> None:
     assert "remark: a participant without the answer gets" in looked(folder)[0]
 
 
-def test_a_page_that_no_step_shows(folder: Path) -> None:
+def test_a_page_without_a_step_is_remarked(folder: Path) -> None:
     page(folder, "<p>Hi</p>", "forgotten")
     assert looked(folder) == [
         "steps/forgotten.html: remark: no step shows this page; name it under project.steps, or delete it"
     ]
 
 
-def test_pages_that_no_step_shows_are_one_remark(folder: Path) -> None:
+def test_several_pages_without_a_step_are_one_remark(folder: Path) -> None:
     for name in ("left", "forgotten"):
         page(folder, "<p>Hi</p>", name)
     assert looked(folder) == [
@@ -281,7 +281,7 @@ def test_pages_that_no_step_shows_are_one_remark(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
-def test_no_page_makes_it_fail(folder: Path, text: str) -> None:
+def test_no_page_makes_the_check_crash(folder: Path, text: str) -> None:
     page(folder, text)
     looked(folder)
 
@@ -319,7 +319,7 @@ def test_a_last_page_without_a_code_is_remarked(on_aws: Path) -> None:
         "<a href='more.html'>more</a>",
     ],
 )
-def test_what_shows_no_code(on_aws: Path, text: str) -> None:
+def test_pages_without_a_visible_code_are_remarked(on_aws: Path, text: str) -> None:
     page(on_aws, text, "end")
     assert of_codes(on_aws) == [NO_CODE]
 
@@ -333,7 +333,7 @@ def test_what_shows_no_code(on_aws: Path, text: str) -> None:
         '<a href="https://recruiter.example/?id={{ participant.userId }}">Return</a>',
     ],
 )
-def test_a_code_or_a_link_back_is_enough(on_aws: Path, text: str) -> None:
+def test_a_code_or_a_link_back_gets_no_remark(on_aws: Path, text: str) -> None:
     page(on_aws, text, "end")
     assert of_codes(on_aws) == []
 

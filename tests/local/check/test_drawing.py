@@ -72,7 +72,7 @@ def test_the_example_of_the_docs_plays_without_a_remark(folder: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_remarked_at_render(folder: Path, old: str, new: str, said: str) -> None:
+def test_scenes_that_cannot_be_drawn_are_remarked_at_render(folder: Path, old: str, new: str, said: str) -> None:
     (folder / "assets").mkdir()
     (folder / "assets" / "ball.png").write_bytes(image())
     changed(folder, old, new)
@@ -132,7 +132,7 @@ def test_several_objects_with_places_in_pixels_are_one_remark(folder: Path) -> N
 @pytest.mark.parametrize(
     "place", ['"x": -0.5, "y": 0.5,', '"x": 2, "y": 2,', '"x": 3 * self.x, "y": 30 - 300 * self.x,']
 )
-def test_an_object_that_waits_beside_the_picture_is_no_remark(folder: Path, place: str) -> None:
+def test_an_object_beside_the_picture_gets_no_remark(folder: Path, place: str) -> None:
     changed(folder, '"x": self.x, "y": self.y,', place)
     assert tried(folder) == []
 

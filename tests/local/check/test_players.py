@@ -113,7 +113,7 @@ def test_between_two_choices_a_policy_does_what_it_does_on_a_server(folder: Path
     assert tried(folder, "agent:Partner", "maxEpisodes", f"frameSkip: 4\n  input: {input}\n  maxEpisodes") == []
 
 
-def test_players_that_the_environment_has_not_are_told_with_those_it_has(folder: Path) -> None:
+def test_unknown_players_are_reported_with_those_of_the_environment(folder: Path) -> None:
     (line,) = tried(folder, "random", "right:", "rigth:")
     assert line.endswith('trial.players: names "rigth", but the environment has "left", "right"')
     assert line.startswith("config.yml:")
@@ -121,7 +121,7 @@ def test_players_that_the_environment_has_not_are_told_with_those_it_has(folder:
     assert line.endswith('trial.players: must say who plays "right"; the environment has "left", "right"')
 
 
-def test_without_players_nobody_plays_the_others(folder: Path) -> None:
+def test_without_the_key_players_check_asks_who_plays_the_others(folder: Path) -> None:
     (line,) = tried(folder, "random", "  players: {left: human, right: PLAYS}\n", "")
     assert line.endswith('trial.players: must say who plays "right"; the environment has "left", "right"')
 
@@ -136,7 +136,7 @@ def test_without_players_nobody_plays_the_others(folder: Path) -> None:
         ("agent:Partnr", "there is no class Partnr in agent.py; classes with act() there: Partner"),
     ],
 )  # fmt: skip
-def test_a_policy_that_cannot_play_is_told_where_config_yml_names_it(folder: Path, plays: str, said: str) -> None:
+def test_a_policy_that_cannot_play_is_reported_at_its_line_in_config_yml(folder: Path, plays: str, said: str) -> None:
     policies = folder / "policies"
     onnx_files.linear(policies / "wide.onnx", np.zeros((5, 3)))
     onnx_files.linear(policies / "many.onnx", np.zeros((2, 4)))
@@ -156,13 +156,13 @@ def test_a_policy_that_cannot_play_is_told_where_config_yml_names_it(folder: Pat
         ("class Partner:", "class Partner:\n    def __init__(self):\n        self.y = x\n", "agent.py:31: making the policies fails: NameError"),
     ],
 )  # fmt: skip
-def test_a_policy_of_agent_py_that_fails_is_told_at_its_line(folder: Path, old: str, new: str, said: str) -> None:
+def test_a_policy_of_agent_py_that_fails_is_reported_at_its_line(folder: Path, old: str, new: str, said: str) -> None:
     (folder / "agent.py").write_text(AGENT.replace(old, new))
     (line,) = tried(folder, "agent:Partner")
     assert line.startswith(said)
 
 
-def test_a_file_that_takes_hours_is_told_where_config_yml_names_it(folder: Path) -> None:
+def test_a_policy_file_that_takes_hours_is_reported_at_its_line_in_config_yml(folder: Path) -> None:
     onnx_files.endless(folder / "policies/p.onnx")
     (line,) = tried(folder, "policies/p.onnx", seconds=3)
     said = "trial.players.right: act() of policies/p.onnx has not come back within 3 s"
@@ -211,7 +211,7 @@ def test_players_who_take_turns_in_real_time_are_remarked(folder: Path) -> None:
     assert tried(folder, "random") == [], "the same player acts at each step"
 
 
-def test_what_the_agent_returns_of_players_that_there_are_not(folder: Path) -> None:
+def test_values_for_unknown_players_are_reported(folder: Path) -> None:
     (folder / "agent.py").write_text(AGENT.replace('{"left": 1}', '{"lift": 1}'))
     (line,) = tried(folder, "random")
     assert line == "agent.py:18: step() returned something of 'lift'; the players are left, right"
@@ -241,7 +241,7 @@ def test_more_names_than_actions(folder: Path) -> None:
 # ---- drawn by objects
 
 
-def test_a_scene_is_drawn_and_what_cannot_be_is_remarked(folder: Path) -> None:
+def test_scenes_of_several_players_are_checked(folder: Path) -> None:
     objects = '[{"id": "a", "type": "circle", "x": 0.5, "y": 0.5, "radius": 4}, {"id": "b", "type": "sprite", "image": "cat", "x": 0, "y": 0}]'
     (folder / "agent.py").write_text(AGENT.replace("numpy.zeros((8, 8, 3), numpy.uint8)", objects))
     (line,) = tried(folder, "random")
@@ -312,13 +312,13 @@ def test_an_idle_action_that_changes_the_picture_is_remarked_with_one_that_does_
 @pytest.mark.parametrize(
     ("wind", "still"), [("0", "0"), ("1", "3"), ("property(lambda _: __import__('random').randrange(9))", "3")]
 )
-def test_an_idle_action_of_which_that_cannot_be_said_is_not_remarked(folder: Path, wind: str, still: str) -> None:
+def test_an_idle_action_without_a_clear_effect_gets_no_remark(folder: Path, wind: str, still: str) -> None:
     """Action 0 does nothing; the game moves by itself; it plays differently each time."""
     world(folder, wind, still)
     assert not [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
 
 
-def test_callbacks_are_told_of_all_players(folder: Path) -> None:
+def test_callbacks_get_the_values_of_all_players(folder: Path) -> None:
     (folder / "agent.py").write_text(
         AGENT.replace(
             "    def close(self):",

@@ -36,7 +36,7 @@ def test_the_advice_fits_the_error(code: str, advice: str) -> None:
 
 
 @pytest.mark.parametrize(("module", "package"), [("sklearn", "scikit-learn"), ("cv2", "opencv-python-headless")])
-def test_packages_with_another_name_are_called_by_it(module: str, package: str) -> None:
+def test_the_advice_names_the_package_and_not_the_module(module: str, package: str) -> None:
     assert remedy("ModuleNotFoundError", f"ModuleNotFoundError: No module named '{module}'") == PIP.format(package)
 
 

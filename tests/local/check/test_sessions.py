@@ -69,7 +69,7 @@ def test_the_substitute_plays_in_each_place_for_a_while(folder: Path) -> None:
     assert (folder / "played").read_text() == "0" * 20 + "1" * 20
 
 
-def test_a_substitute_that_cannot_play_is_told_where_config_yml_names_it(folder: Path) -> None:
+def test_a_substitute_that_cannot_play_is_reported_at_its_line_in_config_yml(folder: Path) -> None:
     (line,) = tried(configured(folder, trial="  substitute: agent:Partnr\n"))
     assert line.endswith("trial.substitute: there is no class Partnr in agent.py; classes with act() there: Partner")
     (line,) = tried(configured(folder, trial="  substitute: agent:Partner\n"))  # which asserts that it plays right
@@ -77,7 +77,7 @@ def test_a_substitute_that_cannot_play_is_told_where_config_yml_names_it(folder:
     assert "AssertionError" in line
 
 
-def test_an_environment_with_one_player_is_not_for_two_people(tmp_path: Path) -> None:
+def test_an_environment_with_one_player_is_refused_for_two_people(tmp_path: Path) -> None:
     single = configured(write_study(tmp_path / "single", start=2))
     (line,) = tried(single)
     assert line == (
@@ -86,7 +86,7 @@ def test_an_environment_with_one_player_is_not_for_two_people(tmp_path: Path) ->
     )
 
 
-def test_an_agent_that_asks_for_its_participant_as_it_starts_is_told(folder: Path) -> None:
+def test_an_agent_that_reads_its_group_at_the_start_is_reported(folder: Path) -> None:
     agent = folder / "agent.py"
     agent.write_text("import os\n" + agent.read_text().replace("pass\n", 'self.id = os.environ.get("GROUP")\n', 1))
     (folder / "steps/hello.html").rename(folder / "steps/hello-0.html")
@@ -106,12 +106,12 @@ def test_an_agent_that_asks_for_its_participant_as_it_starts_is_told(folder: Pat
         ("word", ["no page before the game asks word; there are the fields language, age"]),  # asked after it
     ],
 )
-def test_people_are_matched_by_what_they_were_asked(folder: Path, field: str, said: list[str]) -> None:
+def test_a_matching_field_must_be_asked_before_the_game(folder: Path, field: str, said: list[str]) -> None:
     found = looked(configured(folder, f"  matching: {{same: {field}}}\n"))
     assert [line.partition("project.matching: ")[2] for line in found] == said
 
 
-def test_a_field_that_a_pages_script_makes_is_believed(folder: Path) -> None:
+def test_a_matching_field_may_be_made_by_a_pages_script(folder: Path) -> None:
     (folder / "steps/hello.html").write_text(ASKS + "<script>addField('town')</script>")
     assert looked(configured(folder, "  matching: {different: town}\n")) == []
 
@@ -189,7 +189,7 @@ class Agent(Agent):
     assert told == {"USER_ID": None, "SESSION": f"s.{'0' * 20}", "GROUP": ""}
 
 
-def test_how_many_they_were_is_known_after_the_game_only(folder: Path) -> None:
+def test_the_number_of_members_is_known_only_after_the_game(folder: Path) -> None:
     count = "{{ '%d people'|format(participant.members) }}"
     (folder / "steps/bye.html").write_text(SPEAKS + count)
     assert looked(folder) == []
@@ -198,12 +198,12 @@ def test_how_many_they_were_is_known_after_the_game_only(folder: Path) -> None:
     assert line.startswith("steps/hello.html:1: ")
 
 
-def test_a_function_that_matches_must_be_there(folder: Path) -> None:
+def test_the_function_match_must_exist(folder: Path) -> None:
     (line,) = tried(configured(folder, "  matching: match\n"))
     assert line == "agent.py:5: there is no function match(waiting), and config.yml says matching: match"
 
 
-def test_a_function_that_matches_stands_beside_the_class(folder: Path) -> None:
+def test_the_function_match_must_stand_beside_the_class(folder: Path) -> None:
     inside = "    def match(self, waiting):\n        return []\n\n    def close"
     (folder / "agent.py").write_text(AGENT.replace("    def close", inside))
     (line,) = tried(configured(folder, "  matching: match\n"))
@@ -211,7 +211,7 @@ def test_a_function_that_matches_stands_beside_the_class(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("fits", ["==", "!="])
-def test_made_up_people_choose_differently_and_some_choose_alike(folder: Path, fits: str) -> None:
+def test_invented_participants_give_different_and_equal_answers(folder: Path, fits: str) -> None:
     roles = "".join(f"<input type=radio name=role value={role} required>" for role in ("guide", "seeker"))
     (folder / "steps/hello.html").write_text(f"{ASKS}{roles}")
     (folder / "agent.py").write_text(
@@ -221,7 +221,7 @@ def test_made_up_people_choose_differently_and_some_choose_alike(folder: Path, f
     assert tried(configured(folder, "  matching: match\n")) == []
 
 
-def test_a_function_that_matches_is_asked_for_in_config_yml(folder: Path) -> None:
+def test_a_function_match_without_its_key_is_remarked(folder: Path) -> None:
     (folder / "agent.py").write_text(f"{AGENT}\n\ndef match(waiting):\n    return []\n")
     (line,) = looked(folder)
     assert re.fullmatch(
@@ -252,7 +252,7 @@ def test_a_player_without_keys_is_remarked_on_where_players_have_keys_of_their_o
         ("return [nobody]", "match() fails: NameError: name 'nobody' is not defined"),
     ],
 )
-def test_match_is_called_with_made_up_people(folder: Path, code: str, said: str | None) -> None:
+def test_match_is_called_with_invented_participants(folder: Path, code: str, said: str | None) -> None:
     before = f"{AGENT}\n\n"
     (folder / "agent.py").write_text(f"{before}def match(waiting):\n    {code}\n")
     found = tried(configured(folder, "  matching: match\n"))
@@ -263,7 +263,7 @@ def test_match_is_called_with_made_up_people(folder: Path, code: str, said: str 
 @pytest.mark.parametrize(
     ("code", "line"), [("time.sleep(99)", 2), ("return sleepy()", 5)], ids=["itself", "its groups"]
 )
-def test_a_match_that_does_not_return_is_named_after_the_seconds_that_a_server_gives_it(
+def test_a_match_that_does_not_return_is_reported_after_the_time_limit_of_a_server(
     folder: Path, code: str, line: int
 ) -> None:
     before = f"import time\n{AGENT}\n\n"
@@ -277,7 +277,7 @@ def test_a_match_that_does_not_return_is_named_after_the_seconds_that_a_server_g
     assert time.monotonic() - began < 30, "not the 60 s in which the agent must have played"
 
 
-def test_after_match_the_agent_has_the_rest_of_its_time(folder: Path) -> None:
+def test_the_agent_has_the_rest_of_the_time_after_match(folder: Path) -> None:
     matches = "def match(waiting):\n    return [[one['id'] for one in waiting[:2]]]\n"
     hangs = AGENT.replace("def reset(self, seed=None):", "def reset(self, seed=None):\n        time.sleep(99)")
     (folder / "agent.py").write_text(f"import time\n{hangs}\n\n{matches}")

@@ -16,7 +16,7 @@ PIECES = ["{{", "}}", "{%", "%}", "{#", "#}", "{", "}", "%", "x", "\n", " ", "ra
 
 
 @given(some.lists(some.sampled_from(PIECES), max_size=12).map("".join))
-def test_they_are_those_of_a_regular_expression(text: str) -> None:
+def test_spans_are_those_of_a_regular_expression(text: str) -> None:
     expected = re.sub(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}", "_", text, flags=re.DOTALL)
     assert spans.replace(text, lambda span: "_", spans.VALUE, spans.BLOCK, spans.NOTE) == expected
     raw = re.sub(r"\{%-?\s*raw\b.*?endraw\s*-?%\}", "_", text, flags=re.DOTALL)
@@ -50,14 +50,14 @@ def look(text: str) -> None:
 
 @pytest.mark.parametrize("piece", PAGES)
 @pytest.mark.parametrize("then", ["", "}}", "%}"])
-def test_ten_times_the_marks_without_an_end_take_no_hundred_times_as_long(piece: str, then: str) -> None:
+def test_the_time_for_marks_without_an_end_grows_linearly(piece: str, then: str) -> None:
     """Thirty times is far from both: ten is what grows with the text, and a hundred what grows with its square."""
     small, large = (piece * count + then for count in (2_000, 20_000))
     assert seconds(lambda: look(large)) < 30 * max(seconds(lambda: look(small)), 0.001)
 
 
 @pytest.mark.parametrize(("kind", "piece"), MARKS)
-def test_the_same_of_marks_that_the_parser_of_html_reads_again(kind: spans.Marks, piece: str) -> None:
+def test_the_time_of_the_html_parser_grows_linearly(kind: spans.Marks, piece: str) -> None:
     small, large = (piece * count for count in (2_000, 20_000))
     few, many = (seconds(lambda text=text: list(spans.spans(text, kind))) for text in (small, large))
     assert many < 30 * max(few, 0.001)

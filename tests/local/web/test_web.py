@@ -97,7 +97,7 @@ def test_a_get_becomes_an_event_of_format_2(site: Site) -> None:
         ("", b"nothing said", False),
     ],
 )
-def test_bodies_travel_as_text_or_in_base64(site: Site, kind: str, body: bytes, text: bool) -> None:
+def test_bodies_are_sent_as_text_or_in_base64(site: Site, kind: str, body: bytes, text: bool) -> None:
     event = site.event("POST", "/next", content=body, headers={"content-type": kind})
     assert event["isBase64Encoded"] is not text
     assert (event["body"].encode() if text else base64.b64decode(event["body"])) == body
@@ -128,7 +128,7 @@ def test_other_requests_are_not_found(site: Site, method: str, path: str) -> Non
     assert site.events == []
 
 
-def test_who_mistypes_an_address_gets_a_page(site: Site) -> None:
+def test_an_unknown_address_gets_an_error_page(site: Site) -> None:
     answer = site.http.get("/nothing", headers={"accept": "text/html,*/*"})
     assert (answer.status_code, answer.headers["content-type"]) == (404, "text/html; charset=utf-8")
     assert "There is nothing here" in answer.text
@@ -137,13 +137,13 @@ def test_who_mistypes_an_address_gets_a_page(site: Site) -> None:
     assert (event["rawPath"], event["requestContext"]["http"]["path"]) == ("/next", "/next")
 
 
-def test_a_path_arrives_decoded(site: Site) -> None:
+def test_functions_get_the_decoded_path(site: Site) -> None:
     event = site.event("GET", "/steps/p/my%20picture.png")
     assert event["rawPath"] == "/steps/p/my picture.png"
     assert event["pathParameters"]["file"] == "my picture.png"
 
 
-def test_a_response_with_everything(site: Site) -> None:
+def test_a_response_keeps_status_headers_cookies_and_body(site: Site) -> None:
     site.answer = lambda event: {
         "statusCode": 303,
         "headers": {"Location": "/next?x=1", "Content-Type": "text/html; charset=utf-8", "X-N": 5},
@@ -172,7 +172,7 @@ def test_a_response_in_base64(site: Site) -> None:
     assert site.http.head("/steps/p/a.png").headers["content-length"] == "256"
 
 
-def test_what_is_no_response_is_the_body(site: Site) -> None:
+def test_a_value_that_is_no_response_becomes_the_body(site: Site) -> None:
     site.answer = lambda event: {"hello": "you"}
     answer = site.http.get("/next")
     assert (answer.status_code, answer.json()) == (200, {"hello": "you"})
@@ -180,7 +180,7 @@ def test_what_is_no_response_is_the_body(site: Site) -> None:
 
 
 @pytest.mark.parametrize("result", [lambda event: 1 / 0, lambda event: {"statusCode": "many"}, lambda event: {1, 2}])
-def test_a_function_that_fails_tells_the_terminal_and_not_the_participant(
+def test_the_error_of_a_function_is_printed_and_not_sent_to_the_participant(
     site: Site, result: Callable[[Event], Any]
 ) -> None:
     site.answer = result
@@ -189,7 +189,7 @@ def test_a_function_that_fails_tells_the_terminal_and_not_the_participant(
     assert "Traceback" in site.said[0]
 
 
-def test_ten_megabytes_and_no_more(site: Site) -> None:
+def test_bodies_may_have_ten_megabytes(site: Site) -> None:
     assert site.http.post("/next", content=b"x" * web_app.LARGEST_BODY).status_code == 200
     site.events.clear()
     assert site.http.post("/next", content=b"x" * (web_app.LARGEST_BODY + 1)).status_code == 413
@@ -226,7 +226,7 @@ def test_a_taken_port_leads_to_the_next_free_one() -> None:
         assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + server.PORTS_TRIED
 
 
-def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_free_port_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "PORTS_TRIED", 0)
     with server.listen(0) as first:
         port = first.getsockname()[1]
@@ -242,7 +242,7 @@ def test_only_ports_that_were_tried_are_named(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("port", [-1, 65536, 80000])
-def test_a_number_that_is_no_port_is_said(port: int) -> None:
+def test_an_invalid_port_is_refused(port: int) -> None:
     said = rf"{port} is no port: a port is a number from 1 to 65535 \(PORT=, --port\)"
     with pytest.raises(server.NoPort, match=said):
         server.listen(port)
@@ -284,7 +284,9 @@ FOREIGN: list[tuple[str, str, dict[str, str]]] = [
 
 
 @pytest.mark.parametrize(("method", "path", "headers"), FOREIGN)
-def test_pages_of_other_sites_start_nothing_here(site: Site, method: str, path: str, headers: dict[str, str]) -> None:
+def test_requests_from_pages_of_other_sites_are_refused(
+    site: Site, method: str, path: str, headers: dict[str, str]
+) -> None:
     answer = site.http.request(method, path, headers=headers)
     assert answer.status_code == 403
     assert "other sites" in answer.text
@@ -366,7 +368,7 @@ def ends(connection: socket.socket) -> bool:
         b"GET /next HTTP/1.1\r\nHost: localhost\r\n\r\nGET /next",
     ],
 )
-def test_who_sends_slowly_is_cut_off(site: Site, monkeypatch: pytest.MonkeyPatch, begin: bytes) -> None:
+def test_slow_senders_are_disconnected(site: Site, monkeypatch: pytest.MonkeyPatch, begin: bytes) -> None:
     monkeypatch.setattr(connections, "HEADER_SECONDS", 0.4)
     monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.8)
     with raw(site) as slow:
@@ -389,7 +391,7 @@ def test_who_sends_slowly_is_cut_off(site: Site, monkeypatch: pytest.MonkeyPatch
             dripping.join()
 
 
-def test_many_silent_connections_keep_nobody_out(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_silent_connections_do_not_block_others(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
     silent = [raw(site) for _ in range(12)]
     try:
