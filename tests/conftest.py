@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures, hooks and settings of all tests."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _group(nodeid: str) -> int | None:
 
 
 def _turn(item: pytest.Item) -> int:
-    """What takes long and cannot be divided begins first; the many short tests fill the other workers."""
+    """The rank of a test: groups that take long begin first; the many short tests fill the other workers."""
     group = _group(item.nodeid)
     return len(ONE_AFTER_ANOTHER) if group is None else group
 

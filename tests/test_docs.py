@@ -1,4 +1,4 @@
-"""What the documentation shows, works."""
+"""The examples, links, files and messages in the documentation are right."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The examples that `make test` plays are always the same."""
+"""`make test` always tries the same examples of each property."""
 
 from __future__ import annotations
 

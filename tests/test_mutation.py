@@ -1,4 +1,4 @@
-"""`make mutants` counts right: it sees a mutant that no test kills, and one that hangs is killed."""
+"""`make mutants` counts correctly: it reports survivors, and kills mutants that hang."""
 
 from __future__ import annotations
 

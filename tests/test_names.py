@@ -1,4 +1,4 @@
-"""No two classes share a name: who reads it, or looks for it, finds one thing."""
+"""No two public classes share a name, so a search for a name finds one class."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small projects, and studies held with them in processes of their own."""
+"""Fixtures: small projects, and studies that run with them in processes of their own."""
 
 from __future__ import annotations
 
@@ -106,5 +106,5 @@ def hold(tmp_path: Path) -> Iterator[Hold]:
 
 @pytest.fixture
 def free_port() -> int:
-    """A port nobody listens on."""
+    """A free port."""
     return ports.free()

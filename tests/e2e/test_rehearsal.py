@@ -1,4 +1,4 @@
-"""`make try`: bots through a study, what they say about it, and nothing left over whatever happens."""
+"""`make try`: bots walk through a study, report on it, and leave nothing behind in any case."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ HASHED = "sabcdefghijklmnopqrst-1.servers.example.org"
 
 
 def test_ministack_is_installed_where_it_is_required() -> None:
-    """Without it no role is judged, in no test; CI sets REQUIRE_MINISTACK."""
+    """Without ministack no test judges roles; CI sets REQUIRE_MINISTACK."""
     if evaluator() is None:
         if os.environ.get("REQUIRE_MINISTACK"):
             pytest.fail(MISSING)
@@ -108,7 +108,7 @@ def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
 
 
 def walk(world: MotoWorld, cluster: str) -> None:
-    """Whatever functions do, done once: three studies, relays, lost servers, leftovers, sweeps."""
+    """Make the functions do everything once: three studies, relays, lost servers, leftovers, sweeps."""
     study = StudyOnMoto(world, cluster=cluster)
     page = "<p>{{ answers['2'].age }}, {{ participant.completionCode }}, {{ participant.link }}</p>"
     study.put(f"{PROJECT}/steps/debrief.html", page.encode())
@@ -141,7 +141,7 @@ def walk(world: MotoWorld, cluster: str) -> None:
     study.deliver()
     served(world, carol.user, ("GET", f"{{folder}}/trials/{{label}}-1/{GAME}-trial.jsonl.gz"))
 
-    dave = Person(study, "R_dave")  # whose server is stopped before it runs, and whose task comes too late
+    dave = Person(study, "R_dave")  # their server is stopped before it runs, and their task starts too late
     dave.to_the_game()
     study.deliver("start")
     late = [arn for arn in study.living() if arn not in study.begun]
@@ -153,7 +153,7 @@ def walk(world: MotoWorld, cluster: str) -> None:
         study.happen(world.task_event(arn, "RUNNING"))
     study.deliver()
 
-    erin = Person(study, "R_erin")  # for whom there is no room anywhere
+    erin = Person(study, "R_erin")  # there is no capacity for this participant
     erin.to_the_game()
     full = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time."}]}
     world.answer("ecs:RunTask", full, times=2)
@@ -185,7 +185,7 @@ def sweeps(world: MotoWorld, study: StudyOnMoto, carol: Person, dave: Person) ->
             study.ended.add(arn)
             kept = {**study.record("R_erin"), "requested": "2026-01-01T00:00:00Z"}
             study.put(server.key(ids.server_label(PROJECT, "R_erin")), json.dumps(kept).encode())
-    frank = Person(study, "R_frank")  # whose task runs without anybody having heard of it
+    frank = Person(study, "R_frank")  # no function has got the event of this task
     frank.to_the_game()
     study.deliver("start")
     study.put(
@@ -418,11 +418,11 @@ def test_a_variable_that_is_missing_in_the_template_is_noticed(world: MotoWorld)
     assert world.task_arns() == []
 
 
-# What no walk tries
+# Calls that the walk does not make
 
 
 class Facts:
-    """For calls that are made up."""
+    """The ids of an installation, for invented calls."""
 
     region, account = "us-east-1", "123456789012"
 

@@ -100,7 +100,7 @@ def test_no_action_of_the_policy_shows_a_secret() -> None:
 
 
 class Played:
-    """Alice plays, bob has played, both on servers that had waited for them; and what is secret of all that."""
+    """Alice plays and bob has played, both on warm servers; with the secrets of that."""
 
     def __init__(self, world: MotoWorld) -> None:
         self.study = StudyOnMoto(world, warmServers=1)
@@ -130,7 +130,7 @@ class Played:
             self._told |= {one["value"] for one in environment if one["name"] in {"TOKEN", "CREDENTIAL"}}
 
     def shown(self, judge: Judge, who: str = POLICY) -> list[str]:
-        """The documents that show one of the secrets to whoever has this policy or role."""
+        """The documents that show a secret to a holder of this policy or role."""
         found = []
         for entry in self.study.world.platform.documents.list(""):
             arn = f"arn:aws:s3:::{self.study.world.env['BUCKET']}/{entry.key}"
@@ -177,7 +177,7 @@ def test_answers_of_the_function_that_researchers_may_invoke_hold_no_secret(worl
         assert [what for what, secret in played.secrets.items() if secret in answer] == []
 
 
-# Every other way
+# Other ways to a secret
 
 
 BUCKET = "arn:aws:s3:::the-bucket"

@@ -1,4 +1,4 @@
-"""The template is held against every rule of the book, and a template that breaks a rule is noticed."""
+"""The template obeys every rule of `RULES`, and a template that breaks a rule is noticed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INSTALLATIONS = list(installations())
 
 
 def faults(rule: Rule, there: list[Installation]) -> list[str]:
-    """What these installations have against a rule, each thing once."""
+    """The violations of a rule in these installations, each once."""
     return sorted({fault for one in there for fault in rule.faults(one)})
 
 

@@ -98,7 +98,7 @@ def write_study(
 
 
 class Local:
-    """A study held by a process of its own. `kill` and `run` again go on with the same folders."""
+    """A study that runs in a process of its own. After `kill`, `run` continues with the same folders."""
 
     def __init__(self, folder: Path, place: Path) -> None:
         self.folder = folder
@@ -110,8 +110,8 @@ class Local:
         self.through_pipe = False  # so that what it says arrives even if it may write no file
         self.process: preloaded.Forked | subprocess.Popen[str] | None = None
 
-    def goes_on(self) -> None:
-        """A game that holds goes on."""
+    def let_go_on(self) -> None:
+        """Let a game that waits go on."""
         (self.folder.parent / "hold").unlink()
 
     def begin(self, *options: str) -> preloaded.Forked | subprocess.Popen[str]:
@@ -131,17 +131,17 @@ class Local:
 
     def run(self, *options: str) -> Local:
         self.begin(*options)
-        self.url = self.told(r"(http://127\.0\.0\.1:\d+)/next")[1]
+        self.url = self.wait_for_text(r"(http://127\.0\.0\.1:\d+)/next")[1]
         return self
 
     def text(self) -> str:
         return self.output.read_text()
 
-    def told(self, pattern: str, seconds: float = 20) -> re.Match[str]:
-        """Wait until the terminal shows it."""
+    def wait_for_text(self, pattern: str, seconds: float = 20) -> re.Match[str]:
+        """Wait until the terminal shows a match of this pattern."""
         until = time.monotonic() + seconds
         while not (found := re.search(pattern, self.text())):
-            assert time.monotonic() < until, f"{pattern!r} was not told:\n{self.text()}"
+            assert time.monotonic() < until, f"{pattern!r} was not printed:\n{self.text()}"
             time.sleep(0.05)
         return found
 
@@ -162,7 +162,7 @@ class Local:
 
 @pytest.fixture
 def local(tmp_path: Path) -> Iterator[Callable[..., Local]]:
-    """Makes a study and the folder to hold it in; nothing is left running."""
+    """Makes a study and the folder in which it runs, and ends its processes after the test."""
     made: list[Local] = []
 
     def make(**options: object) -> Local:

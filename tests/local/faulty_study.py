@@ -42,7 +42,7 @@ STARTS = 3  # at most, until no message waits
 
 
 class Stranded(AssertionError):
-    """What should come does not come."""
+    """Something that must happen has not happened in time."""
 
 
 class FaultyStudy:
@@ -87,7 +87,7 @@ class FaultyStudy:
         self.look()
 
     def look(self) -> None:
-        """If the process was killed, begin the next one."""
+        """Start the next process if this one was killed."""
         if self.injector.dead.is_set():
             self._bury()
             self.begin()
@@ -133,7 +133,7 @@ class FaultyStudy:
     # The participant
 
     def _start_again(self) -> None:
-        """The button that the page shows."""
+        """Press the page's button that starts the game again."""
         with self.injector.unharmed():
             [project] = json.loads((self.data / MASTER_LIST).read_bytes())["projects"]
             secret = derived.project_secret((self.data / KEY).read_bytes(), project)
@@ -147,7 +147,7 @@ class FaultyStudy:
         accept: str = "application/json",
         function: Handler = next_step.handler,
     ) -> dict[str, Any]:
-        """A request, tried again until there is an answer."""
+        """Send a request until there is an answer."""
         query = urlencode({"projectId": PROJECT, "userId": USER})
         headers = {"accept": accept, "content-type": aws_events.FORM, "host": "localhost"}
         event = aws_events.http_event(method, query, urlencode(form or {}), headers=headers)
@@ -193,7 +193,7 @@ class FaultyStudy:
             connection.close()
 
     def tell_server(self, path: str, attempt: int = 1) -> dict[str, Any]:
-        """Reach the server; if it has gone in between, the one that follows it."""
+        """Send a request to the server, or to its replacement if it has ended meanwhile."""
         while True:
             page = self.ready(attempt)
             if self._reaches(page, path):
@@ -208,7 +208,7 @@ class FaultyStudy:
             time.sleep(0.03)
 
     def kill_server(self, page: dict[str, Any]) -> None:
-        """The server's own process, as the kernel does it when memory runs out."""
+        """Kill the server's own process, as the kernel does when memory runs out."""
         with self.injector.unharmed():
             for process in self.servers(page):
                 os.kill(process.pid, signal.SIGKILL)
@@ -231,7 +231,7 @@ class FaultyStudy:
     # What must be so in the end
 
     def wrong(self) -> list[str]:
-        """What was lost sight of, left over, or not kept."""
+        """Whatever was forgotten, left over or lost."""
         found = [f"a process of {name}" for name in marked(self.state)]
         for path in sorted((self.data / "_servers").glob("*.json")):
             record = json.loads(path.read_bytes())
@@ -319,7 +319,7 @@ JOURNEYS: dict[str, Callable[[FaultyStudy], None]] = {
 
 @contextlib.contextmanager
 def hurried() -> Iterator[None]:
-    """Everything that waits waits a little."""
+    """Shorten every wait."""
     with contextlib.ExitStack() as stack:
         for owner, name, value in (
             (bus, "RETRY", (0.02, 0.05, 0.1, 0.1)),

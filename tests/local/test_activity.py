@@ -1,4 +1,4 @@
-"""What the terminal of `make run` says of the answers that servers write."""
+"""The terminal of `make run` reports the answers that servers write."""
 
 import io
 import json
@@ -96,7 +96,7 @@ def test_a_game_on_a_warm_server_that_ended_before_the_next_look_is_printed(tmp_
     record = {"projectId": "study", "userId": "P1", "attempt": 1, "state": "starting", "nonce": "n", "spare": "warm-1"}
     log._look(cast(ProcessTasks, Running(warm)), tmp_path)
     log.wrote("_servers/s.json", json.dumps(record).encode())
-    log._look(cast(ProcessTasks, Running(warm)), tmp_path)  # its document is not there yet
+    log._look(cast(ProcessTasks, Running(warm)), tmp_path)  # its document does not exist yet
     answer(tmp_path, "P1", "3")
     log._look(cast(ProcessTasks, Running(given)), tmp_path)
     log.close()

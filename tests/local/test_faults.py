@@ -43,7 +43,7 @@ def points(study: FaultyStudy) -> Iterator[OsFault]:
 
 
 def went_wrong(journey: str, folder: Path, fault: OsFault | None) -> list[str]:
-    """What is wrong after a journey with this fault."""
+    """Run a journey with this fault. Returns what is wrong afterwards."""
     try:
         return run(journey, folder, fault).wrong()
     except Stranded as stranded:

@@ -1,4 +1,4 @@
-"""What the functions log: the terminal gets what the researcher should look at, the log gets all of it."""
+"""The functions' log: the terminal shows what concerns the researcher, the file holds everything."""
 
 from __future__ import annotations
 

@@ -75,9 +75,9 @@ def test_a_participant_plays_with_the_agent_in_app(tmp_path: Path) -> None:
         walker.answer(word="hi")
         assert walker.play(walker.until("ready"))["score"] == 12
         assert "<h1>bye</h1>" in walker.page()
-        here.told(r"server gone \(stopped\)")
+        here.wait_for_text(r"server gone \(stopped\)")
         (here.folder / "App/levels.py").write_text("FRAMES = 13\n")
-        here.told(r"App/levels\.py changed: servers that start from now on run it")
+        here.wait_for_text(r"App/levels\.py changed: servers that start from now on run it")
     finally:
         here.kill()
         end_everything(here.state)

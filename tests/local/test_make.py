@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def make(*arguments: str, **environment: str) -> str:
-    """What make would run, and what it says."""
+    """Run `make -n`. Returns the commands that it would run, and its output."""
     env = {name: value for name, value in os.environ.items() if name not in ("HOST", "DATA", "MAKEFLAGS", "MAKELEVEL")}
     ran = subprocess.run(
         ["make", "-n", *arguments], cwd=ROOT, env={**env, **environment}, capture_output=True, text=True, check=True
@@ -49,7 +49,7 @@ def test_variables_that_are_not_given_are_not_passed_on() -> None:
 
 @pytest.mark.parametrize("empty", ["DATA=", "DATA= ", "PORT=", "PROJECT="])
 def test_an_empty_variable_counts_as_not_given(empty: str) -> None:
-    """Else the data would lie in the current folder, or below the root."""
+    """Otherwise the data would be in the current folder, or below the root."""
     assert re.search(r'-m local "\.?" --data "\./data" --port 8000 ', make("run", empty))
     assert "--data" not in make("try", empty)
     assert "--from" not in make("data", empty)
@@ -75,7 +75,7 @@ def test_what_the_commands_read_from_the_environment_may_be_given_to_make(given:
 
 @pytest.fixture
 def somewhere(tmp_path: Path) -> Path:
-    """Another clone, where nothing is installed, and where `uname`, `python3` and pip are a test's own."""
+    """A clone in which nothing is installed, with the test's own `uname`, `python3` and pip."""
     (tmp_path / "Makefile").write_text((ROOT / "Makefile").read_text())
     shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
     (tmp_path / "bin").mkdir()

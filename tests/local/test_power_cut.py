@@ -31,7 +31,7 @@ STEPS = st.lists(
 
 
 class Study:
-    """What was done, and what is promised since which moment of the disk's record."""
+    """The writes of a study, and its promises, each from a moment of the disk's record on."""
 
     def __init__(self, root: Path, disk: Disk) -> None:
         self.disk = disk
@@ -69,7 +69,7 @@ class Study:
             self._play(f"p/users/u{number}/trials/s-1/{count}.jsonl.gz", body)
 
     def _play(self, key: str, line: bytes) -> None:
-        """As the trial does: written in the spool, stored, removed there."""
+        """Write a recording as the trial does: into the spool, then into the store, then removed from the spool."""
         kept = Recording(self.state / "spool" / f"{key}.part", key)
         kept.add(line + b"\n")
         kept.flush()
@@ -80,7 +80,7 @@ class Study:
 
 
 def cut(study: Study, root: Path, moment: int) -> list[str]:
-    """What is broken of the promises that were made before that moment."""
+    """The broken ones of the promises that were made before that moment."""
     broken = []
     documents = FolderDocuments(root / "data", root / "state")
     for key, bodies in study.written.items():

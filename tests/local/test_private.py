@@ -17,7 +17,7 @@ Make = Callable[..., Local]
 
 @pytest.fixture(autouse=True)
 def usual_umask() -> Iterator[None]:
-    """The one that most machines have, under which everybody may read new files."""
+    """Set the umask of most machines, under which everybody may read new files."""
     before = os.umask(0o022)
     yield
     os.umask(before)
@@ -26,7 +26,7 @@ def usual_umask() -> Iterator[None]:
 def open_to_others(*folders: Path) -> list[str]:
     found = []
     for path in (path for folder in folders for path in (folder, *folder.rglob("*"))):
-        with suppress(FileNotFoundError):  # a message that has been delivered meanwhile
+        with suppress(FileNotFoundError):  # this message has been delivered meanwhile
             mode = path.stat().st_mode
             found += [f"{path} {mode:o}"] if mode & 0o077 else []
     return found
@@ -38,7 +38,7 @@ def test_only_the_owner_may_read_the_files_of_a_study(local: Make) -> None:
     walker.answer(word="one")
     assert walker.play(walker.until("ready"))["score"] == 30
     walker.answer(word="two")
-    here.told(r"server gone \(stopped\)")
+    here.wait_for_text(r"server gone \(stopped\)")
     made = {path.name for path in here.data.rglob("*")} | {path.name for path in here.state.rglob("*")}
     assert {"2.json", "2-episode-0001.jsonl.gz", "functions.log", "names.json", "spool"} <= made
     assert open_to_others(here.data, here.state.parent) == []
@@ -49,7 +49,7 @@ def test_open_folders_of_an_earlier_version_are_closed_or_reported(local: Make) 
     here.state.mkdir(parents=True)
     here.data.mkdir()
     here.run()
-    here.told("Other users of this machine can read the folder data. To change that: chmod -R go-rwx data")
+    here.wait_for_text("Other users of this machine can read the folder data. To change that: chmod -R go-rwx data")
     assert here.state.parent.stat().st_mode & 0o077 == 0, "what is ours alone is closed"
     assert here.data.stat().st_mode & 0o777 == 0o755, "what is the researcher's is left as it is"
 

@@ -47,12 +47,12 @@ def limited(here: Local, what: int, to: int) -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(ProcessLookupError):  # it may have been killed meanwhile
+        with suppress(ProcessLookupError):  # the process may have been killed meanwhile
             resource.prlimit(here.process.pid, what, before)
 
 
 def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
-    """A participant who has played for a while, and what their page knows of the server."""
+    """A participant who has played for a while, and the server's state on their page."""
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
     state = walker.until("ready")
@@ -68,7 +68,7 @@ def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
 def kill_server(here: Local) -> None:
     for process in servers_of(here.data, {"P1"}):
         os.kill(process.pid, signal.SIGKILL)
-    here.goes_on()
+    here.let_go_on()
 
 
 def goes_on(here: Local, walker: Walker) -> None:
@@ -111,7 +111,7 @@ def test_a_server_lost_while_no_files_can_be_opened_is_replaced(local: Make, res
     used = len(os.listdir(f"/proc/{here.process.pid}/fd"))
     with limited(here, resource.RLIMIT_NOFILE, used):
         kill_server(here)
-        here.told("cannot open more files")
+        here.wait_for_text("cannot open more files")
         time.sleep(1)
         if restart:
             here.kill()
@@ -149,14 +149,14 @@ def _well(here: Local) -> bool:
 @linux
 @pytest.mark.parametrize("restart", [False, pytest.param(True, marks=pytest.mark.hunt)], ids=["", "killed meanwhile"])
 def test_a_server_lost_while_nothing_can_be_written_is_replaced(local: Make, restart: bool) -> None:
-    """No file may have a byte (RLIMIT_FSIZE), as on a full disk."""
+    """No file may grow (RLIMIT_FSIZE is 0), as on a full disk."""
     here = local(frames=240, holds=120)
     here.through_pipe = True
     here.run()
     walker, _ = begun(here)
     with limited(here, resource.RLIMIT_FSIZE, 0):
         kill_server(here)
-        here.told("it is tried again until it works")
+        here.wait_for_text("it is tried again until it works")
         time.sleep(1)
         if restart:
             here.kill()
@@ -188,7 +188,7 @@ def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: M
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(2 if exploration.TIMES < 2 else 8))
 def test_a_study_survives_random_refusals_and_kills(local: Make, seed: int) -> None:
-    """Four participants walk while calls are refused and the process is killed; then all is as if nothing had been."""
+    """Four participants take part while calls are refused and the process is killed; at the end nothing is missing."""
     here = local(frames=120)
     said = ""
     dice = random.Random(seed)
@@ -224,7 +224,7 @@ def test_a_study_survives_random_refusals_and_kills(local: Make, seed: int) -> N
 
 
 def refused_by_chance(here: Local, port: int, seed: int) -> None:
-    """Hold the study with calls that fail by chance."""
+    """Run the study with calls that fail at random."""
     with here.output.open("ab") as output:
         here.process = subprocess.Popen(
             [sys.executable, "-m", "tests.local.local_refused_by_chance", str(here.folder), "--port", str(port)],

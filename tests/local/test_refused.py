@@ -47,7 +47,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def refusing(tmp_path: Path) -> Iterator[Callable[..., OsFaultInjector]]:
-    """Lets calls for files below the folder be refused as the fault says, from now on."""
+    """Makes calls for files below the folder fail with the given fault."""
     injector = OsFaultInjector(tmp_path)
     with injector.installed():
 
@@ -147,7 +147,7 @@ def test_data_that_cannot_be_listed_do_not_count_as_deleted(
         injector = refusing(*call, reach=OsReach.SPELL, error=errno.EIO)
         until(lambda: injector.struck)
         until(lambda: [line for line in told if "Input/output error" in line])
-        time.sleep(0.6)  # longer than the spell, and some looks
+        time.sleep(0.6)  # longer than the fault lasts, and for several looks
     finally:
         platform.close(1)
     assert not [line for line in told if "DELETED" in line]
@@ -186,7 +186,7 @@ def test_files_of_a_project_that_cannot_be_listed_do_not_count_as_deleted(
 
 
 def test_an_exit_status_that_could_not_be_written_is_still_known(here: Here) -> None:  # noqa: F811
-    """As on a full disk: the shell cannot write it."""
+    """On a full disk the shell cannot write the exit status."""
     tasks = here.tasks()
     tasks.run(request(FAKE_STATUS="3"))
     here.wait("RUNNING")
@@ -197,7 +197,7 @@ def test_an_exit_status_that_could_not_be_written_is_still_known(here: Here) -> 
 
 
 def _free(here: Here) -> None:  # noqa: F811
-    """When the server has ended, the folder in the way goes."""
+    """Remove the folder that blocks the write once the server has ended."""
     if not here.processes():
         with suppress(FileNotFoundError):
             (here.state / "tasks" / f"{NAME}.exit").rmdir()

@@ -34,7 +34,7 @@ def study(tmp_path: Path) -> Path:
 
 
 def installing(study: Path) -> str:
-    """What the command says. pip installs into the folder `there`."""
+    """Run the command. Returns its output. pip installs into the folder `there`."""
     place = study.parent
     env = {
         **os.environ,

@@ -39,7 +39,7 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
     assert last["score"] == 30
     walker.answer(word="more secrets")
     assert "<h1>end</h1>" in walker.page()
-    here.told(r"server gone \(stopped\)")
+    here.wait_for_text(r"server gone \(stopped\)")
 
     users = here.data / "quick" / "users" / "P-123456789"
     assert sorted(path.name for path in (users / "answers").iterdir()) == ["1.json", "2.json", "3.json"]
@@ -90,7 +90,7 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
     assert len(here.servers()) == 1
 
     here.run()
-    here.told(r"1 server\(s\) of the last run play on")
+    here.wait_for_text(r"1 server\(s\) of the last run play on")
     again = Walker(here.url, "quick", "P1")
     assert again.until("ready")["url"] == state["url"]
     seen = len(played)
@@ -104,7 +104,7 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
         assert time.monotonic() < until + 90
         time.sleep(0.05)
     again.answer(word="two")
-    here.told(r"server gone")
+    here.wait_for_text(r"server gone")
     _gone(here)
     answers = here.data / "quick" / "users" / "P1" / "answers"
     assert sorted(path.name for path in answers.iterdir()) == ["1.json", "2.json", "3.json"]
@@ -119,7 +119,7 @@ def test_a_trial_that_ended_between_two_runs_is_not_replaced(local: Make) -> Non
     walker.play(state)
     _gone(here)
     here.run()
-    here.told(r"server gone \(the trial ended\)")
+    here.wait_for_text(r"server gone \(the trial ended\)")
     assert "<h1>bye</h1>" in Walker(here.url, "quick", "P1").page()
     assert here.servers() == []
 
@@ -132,7 +132,7 @@ def test_a_server_that_was_lost_between_two_runs_is_replaced(local: Make) -> Non
     here.kill()
     os.killpg(_group(here), signal.SIGKILL)
     here.run()
-    here.told(r"server gone \(it was lost\)")
+    here.wait_for_text(r"server gone \(it was lost\)")
     again = Walker(here.url, "quick", "P1")
     state = again.until("ready")
     assert state["attempt"] == 2
@@ -156,7 +156,7 @@ def test_ctrl_c_ends_everything_and_keeps_what_was_played(local: Make) -> None:
     lines = gzip.decompress(recording.read_bytes()).splitlines()
     assert len(lines) > 30
 
-    here.run()  # and the participant may go on
+    here.run()  # and the participant can go on
     again = Walker(here.url, "quick", "P1")
     assert again.until("ended")["again"] is True
 
@@ -165,7 +165,7 @@ def test_ctrl_c_ends_everything_and_keeps_what_was_played(local: Make) -> None:
 def test_other_signals_end_the_study_too(local: Make, number: int) -> None:
     here = local().run()
     Walker(here.url, "quick", "P1").page()
-    here.told("server ready")
+    here.wait_for_text("server ready")
     assert here.end(number) == 0
     assert here.servers() == []
 
@@ -213,7 +213,7 @@ def test_a_port_in_use_leads_to_the_next(local: Make) -> None:
         port = taken.getsockname()[1]
         here.run("--port", str(port))
         assert here.url != f"http://127.0.0.1:{port}"
-        here.told(f"Port {port} is in use")
+        here.wait_for_text(f"Port {port} is in use")
         assert httpx.get(f"{here.url}/healthz").text == "ok\n"
 
 
@@ -228,7 +228,7 @@ def test_mistakes_in_the_project_are_reported_and_nothing_starts(local: Make) ->
 
 def test_a_study_that_is_not_live_says_so(local: Make) -> None:
     here = local(live=False).run()
-    here.told("live: false")
+    here.wait_for_text("live: false")
     assert httpx.get(f"{here.url}/next?projectId=quick").status_code == 404
 
 
@@ -237,7 +237,7 @@ def test_a_study_with_signed_links_shows_one_that_is_let_in(local: Make) -> None
     config = here.folder / "config.yml"
     config.write_text(config.read_text().replace("live: true", "live: true\n  signedLinks: true"))
     here.run()
-    link = here.told(r"Link\s+(http://\S+)")[1]
+    link = here.wait_for_text(r"Link\s+(http://\S+)")[1]
     assert httpx.get(link, follow_redirects=True).status_code == 200
     assert httpx.get(link.partition("&")[0]).status_code == 403
 
@@ -247,20 +247,20 @@ def test_an_edited_page_is_shown_after_a_reload(local: Make) -> None:
     walker = Walker(here.url, "quick", "P1")
     assert "<h1>hello</h1>" in walker.page()
     (here.folder / "steps" / "hello.html").write_text("<h1>Good day</h1>")
-    here.told("steps/hello.html changed")
+    here.wait_for_text("steps/hello.html changed")
     until = time.monotonic() + 20
-    while "<h1>Good day</h1>" not in walker.page():  # it is told first, then published
+    while "<h1>Good day</h1>" not in walker.page():  # the change is printed before it is published
         assert time.monotonic() < until
         time.sleep(0.05)
 
     config = here.folder / "config.yml"
     good = config.read_text()
     config.write_text(good.replace("1: hello", "1: nowhere"))
-    here.told("The study goes on as it was")
-    here.told("nowhere.html")
+    here.wait_for_text("The study goes on as it was")
+    here.wait_for_text("nowhere.html")
     assert "<h1>Good day</h1>" in walker.page()
     config.write_text(good.replace("live: true", "live: false"))
-    here.told("live: false")
+    here.wait_for_text("live: false")
     assert httpx.get(walker.link).status_code == 404
 
 
@@ -270,7 +270,7 @@ def test_the_error_of_a_broken_agent_is_printed(local: Make) -> None:
     agent.write_text(agent.read_text().replace("self.env = Env()", "self.env = Envy()"))
     here.run()
     Walker(here.url, "quick", "P1").page()
-    here.told("name 'Envy' is not defined")
+    here.wait_for_text("name 'Envy' is not defined")
 
 
 def test_the_error_of_an_agent_that_cannot_start_comes_with_the_advice_of_make_check(local: Make) -> None:
@@ -279,7 +279,9 @@ def test_the_error_of_an_agent_that_cannot_start_comes_with_the_advice_of_make_c
     agent.write_text("import cv2_of_nobody\n" + agent.read_text())
     here.run()
     Walker(here.url, "quick", "P1").page()
-    here.told(r"agent\.py:1: ModuleNotFoundError: No module named 'cv2_of_nobody'; install its package: \.venv/bin/pip")
+    here.wait_for_text(
+        r"agent\.py:1: ModuleNotFoundError: No module named 'cv2_of_nobody'; install its package: \.venv/bin/pip"
+    )
 
 
 def test_fresh_moves_the_data_aside(local: Make) -> None:
@@ -290,7 +292,7 @@ def test_fresh_moves_the_data_aside(local: Make) -> None:
     here.kill()
     here.run("--fresh")
     assert here.servers() == []
-    here.told("Earlier data are in .hippodrome/earlier/data-")
+    here.wait_for_text("Earlier data are in .hippodrome/earlier/data-")
     [moved] = (here.place / ".hippodrome" / "earlier").rglob("answers/1.json")
     assert "one" in moved.read_text()
     assert "<h1>hello</h1>" in Walker(here.url, "quick", "P1").page()
@@ -321,7 +323,7 @@ def test_repeated_kills_lose_nothing_and_leave_nothing(local: Make) -> None:
         here.kill()
         if n % 2:
             here.begin("--port", port)
-            time.sleep(dice.uniform(0.3, 1.0))  # in the middle of getting up
+            time.sleep(dice.uniform(0.3, 1.0))  # while the process starts
             here.kill()
         here.run("--port", port)
         assert here.url.endswith(port)
@@ -342,7 +344,7 @@ def test_repeated_kills_lose_nothing_and_leave_nothing(local: Make) -> None:
 
 
 def _walk_whatever_happens(url: str, user: str) -> None:
-    """As a participant would who reloads the page whenever it does not answer."""
+    """Take part, and reload the page whenever it does not answer."""
     walker = Walker(url, "quick", user)
     while True:
         try:
@@ -366,11 +368,11 @@ def test_a_broken_page_is_reported_with_its_line(local: Make) -> None:
     (here.folder / "steps" / "hello.html").write_text("<h1>Hello</h1>\n{{ nobody( }}")
     here.run()
     assert httpx.get(f"{here.url}/next?projectId=quick&userId=P1").status_code == 500
-    here.told(r"broken \(file hello, line 2\)")
+    here.wait_for_text(r"broken \(file hello, line 2\)")
 
 
 def test_a_participant_whose_documents_were_deleted_gets_another_server(local: Make) -> None:
-    """The server that played on has the name of the new one, and its end must not be taken for the new one's."""
+    """The old server has the same name as the new one, and its end must not count as the new one's end."""
     here = local(start=1).run()
     walker = Walker(here.url, "quick", "P1")
     walker.answer(word="one")
@@ -398,13 +400,13 @@ def test_deleted_data_are_reported_and_the_study_goes_on(local: Make, what: str)
     time.sleep(1.2)  # it looks twice a second
     path = here.data if what == "data" else here.data / what
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    here.told("WAS DELETED")
-    here.told("published again")
+    here.wait_for_text("WAS DELETED")
+    here.wait_for_text("published again")
     time.sleep(1.5)
     assert here.text().count("WAS DELETED") == here.text().count("published again") == 1
     again = Walker(here.url, "quick", "P1")
     if what == "data":
-        here.told(r"1 server\(s\) whose records were deleted")
+        here.wait_for_text(r"1 server\(s\) whose records were deleted")
         assert "<h1>hello</h1>" in again.page()
         again.answer(word="two")
     assert (here.data / "_secret.json").read_text() == kept["_secret.json"]

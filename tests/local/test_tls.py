@@ -37,7 +37,7 @@ def hold(local: Make, *options: str, front_end: bool = True) -> Local:
         keys = f"plainClients: true\n  frontEnd: [{FRONT_END}]\n  subdomain: userId"
         config.write_text(config.read_text().replace("live: true", f"live: true\n  {keys}"))
     one.begin("--tls", *options)
-    one.url = one.told(r"(https://localhost:\d+)/next")[1]
+    one.url = one.wait_for_text(r"(https://localhost:\d+)/next")[1]
     return one
 
 
@@ -46,12 +46,12 @@ def trusting(one: Local) -> ssl.SSLContext:
 
 
 class FrontEnd:
-    """What HIPPO's front end asks next_step, and how it finds its server (src/main.js, src/utils/constants.js)."""
+    """The requests of HIPPO's front end to next_step, and its address of the server (src/main.js, src/utils/constants.js)."""
 
     def __init__(self, one: Local) -> None:
         self.user_id = new_user_id()
         self.trusted = trusting(one)
-        self.port = int(one.told(r"names below localhost, at port (\d+)")[1])
+        self.port = int(one.wait_for_text(r"names below localhost, at port (\d+)")[1])
         self.api = one.url.replace("localhost", "api.localhost") + "/next"
         self.address = one.url.partition("//")[2]
         self.client = httpx.Client(
@@ -105,7 +105,7 @@ def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Ma
 def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> None:
     one = hold(local, "--names", "userId", front_end=False)
     trusted = trusting(one)
-    port = int(one.told(r"names below localhost, at port (\d+)")[1])
+    port = int(one.wait_for_text(r"names below localhost, at port (\d+)")[1])
     with httpx.Client(verify=trusted) as client:
         link = {"projectId": "quick", "userId": "Ada"}
         client.get(f"{one.url}/next", params=link)
@@ -117,7 +117,7 @@ def test_our_own_page_has_the_address_of_its_name_and_its_port(local: Make) -> N
 
 
 def test_servers_of_a_run_with_other_addresses_are_replaced(local: Make) -> None:
-    """A run that was killed, and the next one without TLS."""
+    """A run is killed, and the next one has no TLS."""
     one = hold(local, front_end=False)
     link = {"projectId": "quick", "userId": "Ada"}
     with httpx.Client(verify=trusting(one)) as client:
@@ -148,7 +148,7 @@ def poll(client: httpx.Client, one: Local, link: dict[str, str], attempt: int = 
 
 def test_a_name_that_no_server_has_is_refused_in_the_handshake(local: Make) -> None:
     one = hold(local, front_end=False)
-    port = int(one.told(r"names below localhost, at port (\d+)")[1])
+    port = int(one.wait_for_text(r"names below localhost, at port (\d+)")[1])
     for name in ("nobody.localhost", "localhost", "study.example.org"):
         with (
             socket.create_connection(("127.0.0.1", port)) as plain,

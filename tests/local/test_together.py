@@ -19,7 +19,7 @@ def test_make_run_prints_a_link_for_all_and_one_for_each_place(local: Callable[.
     (held.folder / "agent.py").write_text(AGENT)
     configured(held.folder, f"  patience: 60\n  signedLinks: {str(signed).lower()}\n")
     held.run()
-    said = held.told(r"To play in both places yourself(.|\n)*Ctrl-C")[0]
+    said = held.wait_for_text(r"To play in both places yourself(.|\n)*Ctrl-C")[0]
     links = re.findall(r"http://\S+", said)
     assert len(set(links)) == 2
     for link in links:
@@ -39,5 +39,5 @@ def test_the_links_are_of_participants_who_may_play_together(local: Callable[...
     page.unlink()
     configured(held.folder, f"  matching: group\n  signedLinks: {str(signed).lower()}\n")
     held.run()
-    links = re.findall(r"http://\S+", held.told(r"To play in both places yourself(.|\n)*Ctrl-C")[0])
+    links = re.findall(r"http://\S+", held.wait_for_text(r"To play in both places yourself(.|\n)*Ctrl-C")[0])
     assert len({re.findall("<h1>.*</h1>", urlopen(link).read().decode())[0] for link in links}) == 1

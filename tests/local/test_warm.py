@@ -21,8 +21,8 @@ Make = Callable[..., Local]
 
 
 def ready(here: Local, number: int) -> None:
-    """Wait until so many servers have come to wait since the start. The sweep sees to it, after 20 s, where one failed."""
-    here.told(rf"(?s)(a warm server is ready.*?){{{number}}}", seconds=60)
+    """Wait until so many servers have become warm since the start. The sweep replaces a failed one after 20 s."""
+    here.wait_for_text(rf"(?s)(a warm server is ready.*?){{{number}}}", seconds=60)
 
 
 def wait_for(here: Local, number: int) -> None:
@@ -42,9 +42,9 @@ def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_plac
     assert walker.play(state)["score"] == 30
     walker.answer(word="two")
     assert "<h1>end</h1>" in walker.page()
-    here.told(r"has a warm server at ws://127\.0\.0\.1:\d+")
-    here.told("played step 2")
-    here.told(r"server gone \(stopped\)")
+    here.wait_for_text(r"has a warm server at ws://127\.0\.0\.1:\d+")
+    here.wait_for_text("played step 2")
+    here.wait_for_text(r"server gone \(stopped\)")
 
     users = here.data / "quick" / "users" / "P1"
     assert json.loads((users / "answers" / "2.json").read_text())["answers"]["score"] == 30
@@ -87,7 +87,7 @@ def test_warm_servers_are_replaced_whether_lost_while_waiting_or_in_play(local: 
             game.recv(timeout=20)
         for process in servers_of(here.data, {"P1"}):
             os.kill(process.pid, signal.SIGKILL)
-        here.goes_on()
+        here.let_go_on()
     again = walker.until("ready", attempt=2)
     assert walker.play(again)["score"] == 240
 
@@ -98,7 +98,7 @@ def test_a_changed_agent_replaces_the_warm_servers(local: Make) -> None:
     (before,) = here.servers()
     agent = here.folder / "agent.py"
     agent.write_text(agent.read_text().replace(">= 30", ">= 40"))
-    here.told(r"a warm server is gone \(stopped\)")
+    here.wait_for_text(r"a warm server is gone \(stopped\)")
     ready(here, 2)
     wait_for(here, 1)
     assert here.servers() != [before]

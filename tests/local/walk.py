@@ -1,4 +1,4 @@
-"""A participant over HTTP and WebSocket, as a browser would be one."""
+"""A participant who takes part over HTTP and WebSocket, as a browser does."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Walker:
         assert sent.status_code == 303, sent.text
 
     def until(self, wanted: str, seconds: float = 40, *, attempt: int | None = None) -> dict[str, Any]:
-        """Wait for the game's server (of this attempt, if given) to be in that state."""
+        """Wait until the game's server (of this attempt, if given) is in that state."""
         until = time.monotonic() + seconds
         while (state := self.state()).get("state") != wanted or attempt not in (None, state.get("attempt")):
             assert time.monotonic() < until, state
@@ -50,13 +50,13 @@ class Walker:
 
     @contextmanager
     def connect(self, state: dict[str, Any]) -> Iterator[ClientConnection]:
-        """The open game."""
+        """Connect to the game. Returns the connection."""
         with connect(state["url"], close_timeout=1) as game:
             game.send(json.dumps({"userId": self.user, "token": state["token"]}))
             yield game
 
     def play(self, state: dict[str, Any], action: str = "left") -> dict[str, Any]:
-        """Play until the trial says that it is over; the last message before."""
+        """Play until the trial reports its end. Returns the last message before it."""
         last: dict[str, Any] = {}
         with self.connect(state) as game:
             game.send(json.dumps({"command": "start"}))
@@ -65,7 +65,7 @@ class Walker:
                     break
                 message = json.loads(text)
                 if "frame" in message:
-                    with suppress(ConnectionClosedOK):  # it may be over while we still see its last frames
+                    with suppress(ConnectionClosedOK):  # the trial may be over before its last frames have arrived
                         game.send(json.dumps({"action": action}))
                 else:
                     last = message

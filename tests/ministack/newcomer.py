@@ -91,7 +91,7 @@ def arrived(world: MinistackWorld, home: Path) -> Iterator[Newcomer]:
             "AWS_CONFIG_FILE": os.devnull,
             "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
             "HIPPODROME_TARGET": "here",
-            "PYTHONDONTWRITEBYTECODE": "",  # the next command finds its modules compiled
+            "PYTHONDONTWRITEBYTECODE": "",  # then the next command finds its modules compiled
             "PYTHONUTF8": "1",
             "COLUMNS": "160",
         }

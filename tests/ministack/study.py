@@ -14,7 +14,7 @@ import yaml
 
 PROJECT = "tiny"
 GAME, AFTER = "3", "4"
-SECRET_WORD = "kumquat"  # what somebody answers; it must be nowhere but in their answer
+SECRET_WORD = "kumquat"  # a participant's answer, which must be stored nowhere else
 
 CONFIG: dict[str, Any] = {
     "project": {
@@ -117,13 +117,13 @@ class Person:
         assert self.at == GAME
 
     def poll(self) -> Any:
-        """What the waiting page is told."""
+        """The answer to a poll of the waiting page."""
         found = self.browser.get(f"{self.link}&poll={GAME}", headers={"Accept": "application/json"})
         assert found.status_code == 200, found.text
         return found.json()
 
     def is_told(self, state: str) -> Any:
-        """The waiting page's answer if it says this, else None."""
+        """The answer to a poll of the waiting page if it has this state, else None."""
         told = self.poll()
         return told if told["state"] == state else None
 
@@ -132,7 +132,7 @@ class Member(Person):
     """A participant of the study when it is played in pairs."""
 
     def poll(self) -> Any:
-        """What the lobby's page is told: it asks with its ticket."""
+        """The answer to a poll of the lobby's page, which sends its ticket."""
         link = f"{self.link}&poll={GAME}&ticket={self.proof['hippodrome-ticket']}"
         found = self.browser.get(link, headers={"Accept": "application/json"})
         assert found.status_code == 200, found.text
@@ -148,12 +148,12 @@ class Trial:
         self.told = {one["name"]: one["value"] for one in overrides["environment"]}
 
     def asks(self, method: str, key: str, body: bytes = b"", **change: str) -> httpx.Response:
-        """What the site says to who asks for this request."""
+        """The site's answer to a server that asks for this presigned request."""
         who = {"server": self.told["SERVER"], "credential": self.told["CREDENTIAL"], **change}
         return self.browser.post("/sign", json={**who, "requests": [{"method": method, "key": key, "size": len(body)}]})
 
     def does(self, method: str, key: str, body: bytes = b"") -> httpx.Response:
-        """Ask for a request, and make it."""
+        """Ask for a presigned request, and send it."""
         answer = self.asks(method, key, body)
         assert answer.status_code == 200, answer.text
         (request,) = answer.json()["requests"]
@@ -163,5 +163,5 @@ class Trial:
 
 
 def trial_done(score: int) -> bytes:
-    """What the trial writes when somebody has finished playing."""
+    """The documents that the trial writes at the end of a game."""
     return json.dumps({"step": GAME, "answers": {"score": score}}).encode()

@@ -84,7 +84,7 @@ def test_problems_of_dns_are_reported_in_the_words_of_the_page(
 
 
 def refused(newcomer: Newcomer, line: str, message: str) -> None:
-    """The line ends with this message of the page, and a remedy below it."""
+    """Run a command that fails; check its last lines: this message of the page, and a remedy below it."""
     assert message in first_hour.failures()
     code, printed = newcomer.types(line)
     assert code, printed
@@ -101,7 +101,7 @@ def test_problems_are_reported_in_the_words_of_the_page(
 
 
 def types(newcomer: Newcomer, command: str, exit_code: int = 0, answer: str = "") -> None:
-    """Type a command of the page; it prints what the page shows."""
+    """Run a command of the page, and check that it prints what the page shows."""
     code, printed = newcomer.types(command, answer=answer)
     assert code == exit_code, printed
     assert first_hour.differs(first_hour.shown()[command], printed) == "", printed

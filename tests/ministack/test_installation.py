@@ -122,7 +122,7 @@ def test_a_second_apply_changes_nothing(world: MinistackWorld, installed: Minist
 
 
 def events(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
-    """What CloudFormation has done to a stack: the types of resources, by the events' ids."""
+    """The events of a stack: the types of their resources, by the events' ids."""
     pages = world.client("cloudformation").get_paginator("describe_stack_events").paginate(StackName=stack)
     return {event["EventId"]: event["ResourceType"] for page in pages for event in page["StackEvents"]}
 
@@ -196,7 +196,7 @@ def people(installed: MinistackInstallation, study: dict[str, Any]) -> Iterator[
 
 
 def fires_in(installed: MinistackInstallation, name: str, seconds: int) -> None:
-    """Let a timer fire so long from now, and change nothing else about it."""
+    """Set a timer to fire after this time, and change nothing else of it."""
     scheduler = installed.world.client("scheduler")
     found = scheduler.get_schedule(GroupName=installed.outputs["ScheduleGroup"], Name=name)
     keep = [
@@ -348,7 +348,7 @@ Call = tuple[str, str, dict[str, Any]]  # service, operation, arguments
 
 
 def refused(installed: MinistackInstallation, role: str, call: Call) -> bool:
-    """Whether whoever has this role is refused the call."""
+    """Whether a caller with this role is refused the call."""
     service, operation, arguments = call
     keys = installed.world.assume(role, TRESPASSER)
     try:
@@ -498,7 +498,7 @@ def resource(installed: MinistackInstallation, what: str) -> str:
 
 
 def test_each_role_allows_its_own_calls(installed: MinistackInstallation, people: People) -> None:
-    """The other side of the refusals: were everything refused to everybody, they would prove nothing."""
+    """If every role refused every call, the refusals above would prove nothing."""
     known = calls(installed)
     assert not refused(installed, installed.role("next_step"), known["write an answer"])
     assert not refused(installed, installed.role("next_step"), known["send a stop message"])
@@ -629,7 +629,7 @@ def test_a_pair_has_one_server_and_each_member_an_answer(installed: MinistackIns
     registration = installed.stored("project_master_list.json")["projects"][0]
     trial_of_two = {**registration["trial"], "players": {"first_0": "human", "second_0": "human"}}
     register_again(installed, players=2, trial=trial_of_two)
-    time.sleep(FRESH.total_seconds() + 1)  # until then functions may see the project as it was
+    time.sleep(FRESH.total_seconds() + 1)  # until then functions may still have the earlier registration
     erin, frank = pair = [Member(people.alice.browser, f"R_{name}") for name in ("erin", "frank")]
     for member in pair:
         member.look()

@@ -1,4 +1,4 @@
-"""The account itself: callers are checked, and nothing of it outlives the tests."""
+"""The account on the emulator: callers are checked, and the emulator ends with the tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a rule is, and the forms that most of them have."""
+"""The class of a rule, and functions that make the usual kinds of rules."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def first(template: Template, kind: str) -> dict[str, Any]:
 
 
 def setting(kind: str, path: str, new: Any) -> Spoil:
-    """Spoils a template by one value."""
+    """A function that breaks a template by one value."""
     return lambda template: put(first(template, kind), path, new)
 
 

@@ -26,7 +26,7 @@ QUICK = (0.02, 0.02, 0.02, 0.02)
 
 
 class Functions:
-    """Handlers that remember what came, and answer as told."""
+    """Handlers that record their batches, and return what a test sets."""
 
     def __init__(self, answer: Callable[[Event], Any] = lambda event: None) -> None:
         self.events: list[Event] = []
@@ -45,7 +45,7 @@ class Functions:
         return [json.loads(record["body"]) for event in self.events for record in event["Records"]]
 
     def wait(self, count: int, seconds: float = 10) -> None:
-        """Until so many records came."""
+        """Wait until the handlers have received so many records."""
         with self.came:
             assert self.came.wait_for(lambda: len(self.bodies()) >= count, seconds), self.bodies()
 
@@ -97,7 +97,7 @@ def test_no_message_is_taken_while_it_is_checked_whether_the_queue_is_idle(
     queue = _bus(tmp_path, made, start=Functions())._queues["start"]
 
     class Watched(list[Any]):
-        """Whenever somebody sees how many wait, another thread takes them, if it may."""
+        """When its length is read, another thread takes the messages, if the lock is free."""
 
         def __len__(self) -> int:
             count = super().__len__()
@@ -177,7 +177,7 @@ def test_after_five_receives_a_message_is_a_dead_letter(
 def test_each_wait_between_receives_has_its_length(
     tmp_path: Path, made: list[FolderBus], monkeypatch: pytest.MonkeyPatch, waits: tuple[float, ...]
 ) -> None:
-    """Lower bounds alone hold on a busy machine: what took a later wait would not come in time at all."""
+    """Only lower bounds are checked, because a busy machine delays; with a later, longer wait the message would miss the test's deadline."""
     monkeypatch.setattr(bus_module, "RETRY", (*waits, 600))
     times: list[float] = []
     start = Functions(lambda event: times.append(time.monotonic()) or 1 / 0)

@@ -134,7 +134,7 @@ def test_no_key_leads_out_of_the_folder(documents: FolderDocuments, tmp_path: Pa
 
 def test_listings_are_in_the_order_of_s3(documents: FolderDocuments) -> None:
     keys = ["a", "b/c", "b-d", "b.e", "b0", "b/c.d/e", "b/cé", "b/cz", "B", "é", "b/c0/x"]
-    keys.remove("b/c")  # a folder and a file cannot have one name; S3 would allow it
+    keys.remove("b/c")  # a folder and a file cannot have the same name, which S3 would allow
     for key in keys:
         documents.create(key, b"")
     assert [entry.key for entry in documents.list("")] == sorted(keys, key=str.encode)

@@ -1,4 +1,4 @@
-"""The ports together: what `start` and `close` do."""
+"""The ports together: `start` delivers and cleans up, `close` ends."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Here:
         return made
 
     def wait(self, status: str, name: str = NAME, seconds: float = 15) -> dict[str, Any]:
-        """The detail of the event with this status."""
+        """Wait for the event with this status. Returns its detail."""
         until = time.monotonic() + seconds
         while True:
             for event in list(self.events):
@@ -192,7 +192,7 @@ def test_a_server_that_ignores_sigterm_is_killed(here: Here) -> None:
     here.wait("RUNNING")
     tasks.stop(arn, "hippodrome", "hippodrome: enough")
     assert here.wait("STOPPED")["containers"][0]["exitCode"] == 137
-    until(lambda: not here.processes())  # SIGKILL was sent to its group; the system takes a moment to carry it out
+    until(lambda: not here.processes())  # SIGKILL was sent to its group, and takes a moment to have its effect
 
 
 def test_a_server_can_be_stopped_before_its_process_starts(here: Here) -> None:
@@ -256,7 +256,7 @@ def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
     arguments = [here.state, here.data, here.project, moment, seconds]
     command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
-    if moment != "before":  # then there is no process that writes it
+    if moment != "before":  # no process could write it in that case
         until((here.state / "tasks" / f"{NAME}.pid").exists, 10)
 
 
@@ -313,14 +313,14 @@ def test_an_event_that_may_not_have_been_sent_is_sent_again(here: Here) -> None:
     here.forget()
     file = here.state / "tasks" / f"{NAME}.json"
     kept = json.loads(file.read_text())
-    file.write_text(json.dumps({**kept, "status": "RUNNING", "version": 2, "stopped": None}))  # killed before writing
+    file.write_text(json.dumps({**kept, "status": "RUNNING", "version": 2, "stopped": None}))  # killed before the write
     file.with_suffix(".exit").write_text("0\n")
     here.tasks().start()
     assert here.wait("STOPPED")["version"] == 3
 
 
 def test_a_process_id_that_another_program_has_now_is_left_alone(here: Here) -> None:
-    """As after a restart of the machine: the record says it runs, and its process id is another program's."""
+    """After a restart of the machine, the record says that the server runs, but another program has its process id."""
     bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
     try:
         tasks = here.tasks()
@@ -389,7 +389,7 @@ def test_a_recording_is_not_kept_if_the_study_keeps_none(here: Here) -> None:
     assert not (here.data / folder).exists()
 
 
-# --- warm servers, which are somebody's only later
+# --- warm servers, which get their participant only later
 
 OWN = "saaaaaaaaaaaaaaaaaaab-3"
 SESSION = "s.0123456789abcdef0123"
@@ -402,7 +402,7 @@ def warm_server_request(**environment: str) -> TaskRequest:
 
 
 def give(here: Here) -> Path:
-    """What the control plane writes when a participant takes the warm server."""
+    """Write the handover, as the control plane does when a participant takes the warm server."""
     document = here.data / f"study/spares/{NAME}.json"
     document.parent.mkdir(parents=True)
     document.write_bytes(Handover("P1", None, OWN).to_json())
@@ -415,7 +415,7 @@ def half_a_game(here: Here) -> None:
 
 
 def kill(here: Here) -> None:
-    """The server's own process, as the kernel does it when memory runs out."""
+    """Kill the server's own process, as the kernel does when memory runs out."""
     pid = int((here.state / "tasks" / f"{NAME}.pid").read_text())
     os.kill(pid, signal.SIGKILL)
 
@@ -445,7 +445,7 @@ def test_the_document_of_a_warm_server_may_be_deleted_before_its_process_ends(he
     document = give(here)
     half_a_game(here)
     tasks.stop(arn, "hippodrome", "hippodrome: enough")
-    document.unlink()  # as the control plane does when it has stopped the server
+    document.unlink()  # the control plane deletes it after the stop
     here.wait("STOPPED")
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
 

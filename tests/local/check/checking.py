@@ -1,4 +1,4 @@
-"""A study in which a test makes a mistake, and what `make check` says of it."""
+"""Helpers that make a mistake in a study and return what `make check` prints about it."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def agent(folder: Path, old: str, new: str) -> None:
 
 
 def looked(folder: Path) -> list[str]:
-    """What is said without trying the agent."""
+    """The findings without a try of the agent."""
     return [str(problem) for problem in check_project(folder, read_project(folder))]
 
 
 def tried(folder: Path, seconds: float = 60) -> list[str]:
-    """What is said of the agent."""
+    """The findings of a try of the agent."""
     return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds)]
 
 

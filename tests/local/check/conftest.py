@@ -1,4 +1,4 @@
-"""What the tests of this folder share."""
+"""Fixtures for the tests of `make check`."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ def forked(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A small study, in which all is well."""
+    """A small study without mistakes."""
     return write_study(tmp_path / "study", start=2)

@@ -1,4 +1,4 @@
-"""`python -m local.check`: every mistake and remark, and nothing about what is fine."""
+"""`python -m local.check`: it reports every mistake and remark, and nothing else."""
 
 from __future__ import annotations
 
@@ -127,9 +127,9 @@ def test_make_run_says_why_a_page_is_broken(local: Callable[..., Local]) -> None
     here = local(start=2)
     page(here.folder, "<h1>Hello</h1>\n{{ nobody( }}")
     here.run()
-    here.told(r"steps/hello\.html:2: Jinja cannot read this: unexpected '}'")
+    here.wait_for_text(r"steps/hello\.html:2: Jinja cannot read this: unexpected '}'")
     page(here.folder, "<h1>Hello</h1>")
-    here.told("No mistakes are left")
+    here.wait_for_text("No mistakes are left")
 
 
 def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path) -> None:

@@ -200,7 +200,7 @@ def test_slow_functions_do_not_hold_up_each_other(site: Site) -> None:
     together = threading.Barrier(10)
 
     def slow(event: Event) -> Any:
-        together.wait(20)  # raises unless ten are here at once
+        together.wait(20)  # raises unless ten requests are here at the same time
         return {"statusCode": 200}
 
     site.answer = slow
@@ -348,7 +348,7 @@ def raw(site: Site) -> socket.socket:
 
 
 def ends(connection: socket.socket) -> bool:
-    """Whether the server ends it within twenty seconds."""
+    """Whether the server closes the connection within twenty seconds."""
     try:
         while connection.recv(65536):
             pass
