@@ -62,8 +62,8 @@ class Together:
 
     @property
     def wrong(self) -> list[str]:
-        """The faults of the sessions, as `session_checks.wrong` finds them."""
-        return session_checks.wrong(self.world.platform.documents.kept, self.project, self.came)
+        """The faults of the sessions, as `session_checks.faults` finds them."""
+        return session_checks.faults(self.world.platform.documents.kept, self.project, self.came)
 
     @property
     def waits(self) -> list[float]:

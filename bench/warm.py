@@ -71,7 +71,7 @@ def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends
     Raises RuntimeError if one of them did not come to a server before the second `ends`.
     """
     world = SimulatedWorld(SEED, project=msgspec.structs.replace(PROJECT, warm_servers=warm))
-    world.open()
+    world.ask_for_warm_servers()
     people = [SimulatedParticipant(world, number, read=READS) for number in range(len(arrivals))]
     for person, comes in zip(people, arrivals, strict=True):
         world.clock.spawn(person.walk, delay=comes)

@@ -229,7 +229,7 @@ def _moment_text(control: Control, random: Random) -> str:
     if kind == "week" and low is None and value is None:
         base = Decimal(4 * 86400)  # the first Monday after 1970 began
     seconds = _on_grid(low, high, base, length, random)
-    return _write(kind, int(seconds))
+    return _to_text(kind, int(seconds))
 
 
 def _moment(kind: str, text: str | None) -> Decimal | None:
@@ -249,7 +249,7 @@ def _moment(kind: str, text: str | None) -> Decimal | None:
         return None
 
 
-def _write(kind: str, count: int) -> str:
+def _to_text(kind: str, count: int) -> str:
     """The text of which `_moment` reads this number: a date, a time, a month (`count`: months) or a week."""
     if kind == "month":
         return f"{1970 + count // 12:04d}-{count % 12 + 1:02d}"

@@ -216,7 +216,7 @@ def _note_idle(
 
     picture = player.render if isinstance(player, AgentAdapter) else player.pictures
     with contextlib.suppress(Exception):
-        still = idle.moves(player.reset, step, picture, len(human.action_space), human.idle)
+        still = idle.actions_without_effect(player.reset, step, picture, len(human.action_space), human.idle)
         if still is not None:
             names = [human.action_space[action] for action in still]
             progress.known["idle"] = {"action": human.action_space[human.idle], "still": names}

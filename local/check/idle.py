@@ -18,10 +18,12 @@ _STATES = (0, 2, 5, 9)  # each state by its number of steps after a reset
 _MOST_ACTIONS = 10
 
 
-def moves(
+def actions_without_effect(
     begin: Callable[[int], Any], step: Callable[[int], bool], picture: Callable[[], Any], count: int, idle: int
 ) -> list[int] | None:
-    """If the idle action changes the picture, return the actions that do not. Otherwise, or if it is not known, None.
+    """If the idle action changes the picture where another does not, return the actions that never do; otherwise None.
+
+    It also returns None if that is not known: the game is random, or the time is over.
 
     `begin(seed)` begins an episode. `step(action)` takes a step, and returns whether the episode is over. `picture`
     returns the picture. `count` is the number of actions.

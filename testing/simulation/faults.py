@@ -217,7 +217,7 @@ def run(
     world.cloud.fault = fault
     if watched:
         world.watch()
-    world.open()
+    world.ask_for_warm_servers()
     if journey.closes is not None:
         world.clock.after(journey.closes, world.close)
     people = journey.people(world)
@@ -228,7 +228,7 @@ def run(
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in documents]
     first, *others = [person.visit for person in people]
     members = [person for person in people if isinstance(person, SimulatedMember)]
-    wrong = tuple(session_checks.wrong(documents, world.project, members))
+    wrong = tuple(session_checks.faults(documents, world.project, members))
     outcome = FaultOutcome(
         journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong
     )

@@ -17,7 +17,7 @@ PRESENT = timedelta(seconds=10)  # a participant counts as present for so long a
 ANSWERS = timedelta(seconds=30)  # a request may take so long; those present at its beginning count
 
 
-def wrong(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
+def faults(documents: StoredDocuments, project: Project, people: Sequence[SimulatedMember]) -> list[str]:
     """Return a sentence for each fault. It begins with the kind of fault: "split:", "merged:" or "ghost:"."""
     return [
         *_split(documents, project, people),

@@ -212,8 +212,8 @@ class SimulatedWorld:
         lines = [f"{seconds:9.2f} s  {text}" for seconds, text in self.cloud.timeline]
         return "\n".join([f"seed {self.clock.seed}", *lines])
 
-    def open(self) -> None:
-        """Send the message that registering a project with warm servers sends."""
+    def ask_for_warm_servers(self) -> None:
+        """If the project has warm servers, send the message that its registration sends."""
         if self.project.warm_servers:
             self.clock.spawn(lambda: self.publish(Topic.START, to_message(KeepWarm(self.project.id))))
 
@@ -222,7 +222,7 @@ class SimulatedWorld:
         self.project = msgspec.structs.replace(self.project, live=False)
         documents = self.platform.documents
         documents.keep(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
-        self.open()
+        self.ask_for_warm_servers()
 
     def _owner(self, task: TimedTask) -> str:
         """Return the id of the participant or session to whom this server belongs: a warm server by its handover.

@@ -65,7 +65,7 @@ def crowd(people, seconds, conditions=None, *, project=PAIRS, habits=lambda numb
 
 def assert_fair(world, came):
     """Check that nothing is left or wrong, and that each participant came to the end, left, or saw why not."""
-    assert session_checks.wrong(world.platform.documents.kept, world.project, came) == [], world.story()
+    assert session_checks.faults(world.platform.documents.kept, world.project, came) == [], world.story()
     assert not any(world.left().values()), (world.left(), world.story())
     assert all(faults.served_or_told(person.visit) for person in came), [p.visit.reason for p in came]
     assert not world.cloud.dropped, "no chain of messages is taken for a loop"
@@ -191,7 +191,7 @@ class Judged:
 
     @property
     def wrong(self):
-        return [text.split(":")[0] for text in session_checks.wrong(self.kept, PAIRS, self.came)]
+        return [text.split(":")[0] for text in session_checks.faults(self.kept, PAIRS, self.came)]
 
     def write(self, key, body):
         self.kept[key] = (body, "etag", self.world.clock.now())

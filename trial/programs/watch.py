@@ -106,7 +106,7 @@ class Watching:
         try:
             async for data in self._websocket:
                 if rate.exceeded(loop.time()):
-                    raise CloseConnection(4429, "too many messages")
+                    raise CloseConnection(4429, f"too many messages: at most {MESSAGES_A_SECOND} a second")
                 try:
                     answer = self._answer(data)
                 except CommandRefused as error:

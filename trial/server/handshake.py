@@ -151,7 +151,7 @@ async def show_refusal(websocket: ServerConnection, words: str) -> None:
     rate, loop = RateLimit(REFUSED_MESSAGES_A_SECOND), asyncio.get_running_loop()
     async for _ in websocket:
         if rate.exceeded(loop.time()):
-            raise CloseConnection(4429, "too many messages")
+            raise CloseConnection(4429, f"too many messages: at most {REFUSED_MESSAGES_A_SECOND} a second")
 
 
 def _origin(websocket: ServerConnection) -> str | None:

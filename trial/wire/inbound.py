@@ -58,7 +58,7 @@ class Inbound:
     def read(self, data: str | bytes, now: float) -> Message:
         """Read a message. Raises BadMessage and NotAMessage, whose words are for the client, and CloseConnection."""
         if self._rate.exceeded(now):
-            raise CloseConnection(4429, "too many messages")
+            raise CloseConnection(4429, f"too many messages: at most {MESSAGES_A_SECOND} a second")
         try:
             message = (plain.parse if self._window is None else messages.parse)(data, self._words)
         except NotAMessage as error:
