@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -27,6 +26,7 @@ from bots.links import with_project, with_user
 from local.new import LEFT_OUT
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
 from testing import preloaded
+from testing.waiting import until
 from trial.recordings.recording import read
 
 TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the system call that names a thread
@@ -122,10 +122,7 @@ def test_bots_play_a_game_with_pages_keys_and_limits_to_its_end(project: Any, tm
 def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, number: int) -> None:
     data = tmp_path / "data"
     process = rehearsal(project(length=3000), "--bots", "2", "--play", "100", "--data", data)
-    until = time.monotonic() + 60
-    while len(servers_of(data)) < 2:
-        assert time.monotonic() < until
-        time.sleep(0.1)
+    until(lambda: len(servers_of(data)) >= 2, 60)
     process.send_signal(number)
     text = said(process, 60)
     assert process.returncode == 130, text
@@ -136,17 +133,12 @@ def test_nothing_is_left_when_it_is_interrupted(project: Any, tmp_path: Path, nu
 def test_its_study_and_servers_end_also_if_it_is_killed(project: Any, tmp_path: Path) -> None:
     data = tmp_path / "data"
     process = rehearsal(project(length=3000), "--bots", "1", "--play", "100", "--data", data)
-    until = time.monotonic() + 60
-    while not servers_of(data):
-        assert time.monotonic() < until
-        time.sleep(0.1)
+    until(lambda: servers_of(data), 60)
     in_use = (tmp_path / ".hippodrome" / "data.lock").read_text()
     study = psutil.Process(int(re.findall(r"process (\d+)", in_use)[0]))
     process.kill()
     said(process)
-    while study.is_running() or servers_of(data):
-        assert time.monotonic() < until + 60
-        time.sleep(0.1)
+    until(lambda: not study.is_running() and not servers_of(data), 60)
 
 
 def interrupted(pid: int) -> bool:
@@ -159,13 +151,8 @@ def interrupted(pid: int) -> bool:
 def test_ctrl_c_ends_it_whichever_thread_the_signal_reaches(project: Any, tmp_path: Path) -> None:
     data = tmp_path / "data"
     process = rehearsal(project(length=3000), "--bots", "1", "--play", "100", "--data", data)
-    until = time.monotonic() + 60
-    while not servers_of(data):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    while not interrupted(process.pid):  # there is no other thread yet, or it has just ended
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    until(lambda: servers_of(data), 60)
+    until(lambda: interrupted(process.pid), 60)  # there may be no other thread yet, or it has just ended
     text = said(process, 30)
     assert process.returncode == 130, text
     assert servers_of(data) == []

@@ -166,7 +166,7 @@ class Recorder:
     # ---- the end
 
     async def save(self, answers: Mapping[str, Any] | None) -> None:
-        """Wait until all recordings are stored, then store the answer: so whoever finds the answer finds them, too.
+        """Wait until all recordings are stored, then store the answer: a reader of the answer finds the recordings too.
 
         The answer waits for `recordings_first_seconds` at most, and not after `hurry`. An answer that exists is not
         changed. `answers` is None in a session, where each member's own answer follows (`save_member`), or if there is

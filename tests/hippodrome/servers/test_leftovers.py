@@ -18,6 +18,13 @@ from tests.hippodrome.model.test_server import LABEL, LATER, NOW, WARM_SERVER, n
 
 FIRST, SECOND, THIRD = (ids.server_name(LABEL, attempt) for attempt in (1, 2, 3))
 WARM_NAME = ids.server_name(ids.server_label("maze", WARM_SERVER), 1)
+IF_REPLACED = {
+    "SWEEP": LeftoverReason.REPLACED,
+    "EARLY": LeftoverReason.REPLACED,
+    "STOP": LeftoverReason.REPLACED,
+    "STOP_MAZE": LeftoverReason.REPLACED,
+    "ERASE": LeftoverReason.ERASED,
+}
 OPEN = new_record(attempt=2)
 CLOSED = server.close(OPEN, Reason.STOPPED, LATER)
 ON_WARM = msgspec.structs.replace(OPEN, warm_server_name=WARM_NAME)
@@ -49,13 +56,7 @@ TABLE: list[tuple[str, str, Server | None, bool, dict[str, LeftoverReason | None
         FIRST,
         OPEN,
         False,
-        {
-            "SWEEP": LeftoverReason.REPLACED,
-            "EARLY": LeftoverReason.REPLACED,
-            "STOP": LeftoverReason.REPLACED,
-            "STOP_MAZE": LeftoverReason.REPLACED,
-        }
-        | {"ERASE": LeftoverReason.ERASED},
+        IF_REPLACED,
     ),
     ("of an attempt to come", THIRD, OPEN, True, {"ERASE": LeftoverReason.ERASED}),
     ("of an attempt after a closed one", THIRD, CLOSED, True, {"ERASE": LeftoverReason.ERASED}),
@@ -64,13 +65,7 @@ TABLE: list[tuple[str, str, Server | None, bool, dict[str, LeftoverReason | None
         SECOND,
         ON_WARM,
         False,
-        {
-            "SWEEP": LeftoverReason.REPLACED,
-            "EARLY": LeftoverReason.REPLACED,
-            "STOP": LeftoverReason.REPLACED,
-            "STOP_MAZE": LeftoverReason.REPLACED,
-        }
-        | {"ERASE": LeftoverReason.ERASED},
+        IF_REPLACED,
     ),
     ("of an assigned warm server", WARM_NAME, ON_WARM, True, {"ERASE": LeftoverReason.ERASED}),
     (
