@@ -61,6 +61,15 @@ def chromium_path() -> str:
     return path
 
 
+def headless_path() -> str:
+    """Return the path of Chromium without windows, which shows the same pages for less, if Debian has installed it; else of Chromium.
+
+    It has no cache of pages that one comes back to. Raises NoChromium.
+    """
+    path = Path("/usr/bin/chromium-headless-shell")
+    return str(path) if path.exists() else chromium_path()
+
+
 @contextlib.contextmanager
 def chromium() -> Iterator[Any]:
     """Run Chromium without a window within the block, as a Browser of Playwright. Raises NoChromium."""

@@ -1,8 +1,9 @@
-"""Processes of `python -m MODULE` or `python SCRIPT` that begin with their imports done: a process that has loaded them forks for each test.
+"""Starts processes of `python -m MODULE` or `python SCRIPT` whose imports are already done.
 
-To load numpy and gymnasium takes a trial server longer than most tests with it. What a process does from there on, and all that
-the system shows of it, is its own: memory, files, time, signals, session; only its command line is another's. Tests of the
-first moments of a process start it as its users do.
+A trial server takes longer to import numpy and gymnasium than most tests take with it. So one process makes the imports
+once, and forks for each test (it is called the forker here). A forked process has its own memory, files, time, signals and
+session, and the system shows them as its own; only its command line is the forker's. Tests of the first moments of a
+process start it as users do.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     # Only what every experiment of Interactive Gym imports itself: what it has loaded becomes part of its project.
     EXPERIMENT: (("trial.interactive_gym.server_app", "gymnasium", "yaml"), {"PYTHONDONTWRITEBYTECODE": "1"}),
 }
-"""Modules and scripts that are forked from a process of their own: what that has loaded, and the variables with which it started."""
+"""The modules and scripts with a forker of their own: the modules that this forker has loaded, and its variables."""
 
-_ASKS = "ASKS_FOR_PROCESSES"  # names the file at which a process that `starts` others asks for them
+_ASKS = "ASKS_FOR_PROCESSES"  # the variable with the file descriptor at which a process asks its forker for others
 _asks_at = os.environ.pop(_ASKS, "")
 
 
 class Forked:
-    """A process, as `subprocess.Popen` tells of it."""
+    """A process that a forker has made, with the methods of `subprocess.Popen` that tests use."""
 
     def __init__(self, told: socket.socket, stdout: IO[str] | None) -> None:
         self._told = told
@@ -61,13 +62,13 @@ class Forked:
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
-        """The exit code; None while it runs."""
+        """Return the exit code; None while the process runs."""
         with contextlib.suppress(BlockingIOError):
             self._look(0)
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """The exit code, once it has ended. Raises TimeoutExpired after `timeout` seconds."""
+        """Wait until the process has ended, and return its exit code. Raises TimeoutExpired after `timeout` seconds."""
         try:
             self._look(timeout)
         except TimeoutError:
@@ -76,7 +77,7 @@ class Forked:
         return self.returncode
 
     def communicate(self, timeout: float) -> tuple[str, None]:
-        """All of the output that is still to be read, once it is closed and the process has ended."""
+        """Wait until the process has ended, and return the rest of its output, and None. Raises TimeoutExpired."""
         assert self.stdout is not None
         until, read = time.monotonic() + timeout, [b""]
         while select.select([self.stdout], [], [], max(0.0, until - time.monotonic()))[0]:
@@ -93,18 +94,18 @@ class Forked:
             self._told.close()
 
     def send_signal(self, number: int) -> None:
-        """Nothing happens if it has ended."""
+        """Send a signal to the process, unless it has ended."""
         if self.poll() is None:
             with contextlib.suppress(ProcessLookupError):  # it has ended since
                 os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """End it at once."""
+        """End the process at once."""
         self.send_signal(9)
 
 
 def interruptible() -> None:
-    """Let SIGINT end this process. A shell has what it runs in the background ignore it, and children inherit that."""
+    """Let SIGINT end this process. A shell lets its background processes ignore it, and their children, too."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -121,13 +122,14 @@ def start(
     starts: bool = False,
     copied: bool = False,
 ) -> Forked | subprocess.Popen[str]:
-    """Run `python -m MODULE ARGUMENTS`; the other arguments are Popen's, and `safe_path` is Python's -P.
+    """Run `python -m MODULE ARGUMENTS` in a forked process. The other arguments are Popen's; `safe_path` is Python's -P.
 
-    A process that `starts` others by this function has them forked by the process that forked it.
-    Where the project in `cwd` is `copied`, its own modules are loaded; if its code has changed since, they are loaded again.
+    A `module` that ends with `.py` is a script in `cwd`: `python SCRIPT ARGUMENTS` runs. `stdout` may be PIPE, `stderr`
+    STDOUT. `starts`: the process itself calls `start`; its forker then forks for it, too. `copied`: the project in `cwd`
+    is a copy, whose own modules are loaded, and loaded again after each change of its code.
 
-    A `module` that ends with `.py` is a script in `cwd`: `python SCRIPT ARGUMENTS`.
-    `stdout` may be PIPE, `stderr` STDOUT. With variables that change how Python starts, or where nothing can be forked, it starts anew.
+    Popen starts the process if the system has no pidfd_open, or, unless it is `copied`, if variables in `env` change how
+    Python starts.
     """
     kind = module if module in OTHERS else ""
     if not hasattr(os, "pidfd_open") or not (copied or _of_python(env) == _of_python(_environment(kind))):
@@ -177,7 +179,7 @@ def start(
 
 
 def popen(command: Sequence[str], **options: Any) -> Forked | subprocess.Popen[str] | subprocess.Popen[bytes]:
-    """`subprocess.Popen`, but the process in which `make check` tries an agent is forked."""
+    """Call `subprocess.Popen`, except for the process in which `make check` tries an agent: that one is forked."""
     tries_agent = [sys.executable, "-P", "-m", AGENT]
     if command[: len(tries_agent)] != tries_agent:
         return subprocess.Popen(command, **options)
@@ -190,7 +192,7 @@ def _is_script(module: str) -> bool:
 
 
 def _of_python(env: Mapping[str, str]) -> dict[str, str]:
-    """The variables that Python reads as it starts; `_text` heeds PYTHONUNBUFFERED."""
+    """Return the variables that Python reads when it starts, except PYTHONUNBUFFERED, which `_text` obeys."""
     return {name: value for name, value in env.items() if name.startswith("PYTHON") and value} | {
         "PYTHONUNBUFFERED": ""
     }
@@ -202,14 +204,20 @@ def _environment(kind: str) -> dict[str, str]:
 
 @functools.cache
 def _forker(kind: str) -> socket.socket:
-    """The process that forks these (one of `OTHERS`, or empty); it ends with the tests."""
+    """Return a socket to the forker of this kind (a key of `OTHERS`, or empty), which ends with the tests."""
     if _asks_at and not kind:
         return socket.socket(fileno=int(_asks_at))
     return _new_forker(kind, ROOT, _environment(kind))
 
 
+def start_all() -> None:
+    """Start all forkers. Processes that are forked from this one use the same forkers."""
+    for kind in ("", *OTHERS):
+        _forker(kind)
+
+
 def _forker_of_copy(kind: str, root: Path, env: Mapping[str, str]) -> socket.socket:
-    """The same for the copy of the project in `root`, as its code is now."""
+    """Return a socket to the forker that has loaded the present code of the copy of the project in `root`."""
     read = _of_python(env) | {name: env[name] for name in _SIZE if name in env}
     return _forker_of_code(kind, root, tuple(sorted(read.items())), _state_of_code(root))
 
@@ -221,7 +229,7 @@ def _forker_of_code(kind: str, root: Path, read: tuple[tuple[str, str], ...], _c
 
 
 def _state_of_code(root: Path) -> str:
-    """Another one whenever a module below `root` has changed."""
+    """Return a text that changes whenever a module below `root` does."""
     files = ((str(path), path.stat()) for path in sorted(root.rglob("*.py")))
     return hashlib.sha256(repr([(path, s.st_mtime_ns, s.st_size) for path, s in files]).encode()).hexdigest()
 
@@ -243,11 +251,14 @@ def _new_forker(kind: str, root: Path, env: Mapping[str, str]) -> socket.socket:
     return ours
 
 
-# -- in that process
+# -- in the forker
 
 
 def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[str, Any] | None:
-    """Fork for each request, and tell the exit code of each process. Returns a request in its new process, None at the end."""
+    """Fork for each request, and send the exit code of each process that has ended.
+
+    It returns twice: in a new process its request, and in the forker, at the end, None.
+    """
     running: dict[int, tuple[socket.socket, int]] = {}  # by the file that tells of the end
     asking = {requests.fileno(): requests}  # the tests, and processes that start others
     while True:
@@ -285,7 +296,7 @@ def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[
 
 
 def _become(request: dict[str, Any], stdout: int, stderr: int, asks: int | None) -> None:
-    """Have what a new process has: files, folder, variables, arguments."""
+    """Give this process the files, folder, variables and arguments of a new one."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if request["session"]:
         os.setsid()
@@ -306,7 +317,7 @@ def _become(request: dict[str, Any], stdout: int, stderr: int, asks: int | None)
 
 
 def _run_script(path: Path) -> None:
-    """As `python SCRIPT` does; `runpy.run_path` would change sys.argv."""
+    """Run a script as `python SCRIPT` does. `runpy.run_path` would change sys.argv."""
     main = sys.modules["__main__"] = ModuleType("__main__")
     main.__file__ = str(path)
     exec(compile(path.read_bytes(), path, "exec"), vars(main))

@@ -8,7 +8,8 @@ import os
 import signal
 import socketserver
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,19 @@ from _pytest.unraisableexception import gc_collect_iterations_key
 from werkzeug.serving import BaseWSGIServer
 
 from testing import exploration, memoized_aws
+from tests.forked_workers import pytest_xdist_setupnodes  # noqa: F401 - it is a hook
+from tests.scheduling import interleaved
 
 TESTS = Path(__file__).resolve().parent
 HUNT_TIMEOUT = 900  # seconds of a test that takes all its cases, where `make test` takes one of twelve
+_STUDIES = ("examples", "german_study", "gridworld_browser", "teaching")
 ONE_AFTER_ANOTHER = (
+    ("tests/browser/test_together_browser.py",),
+    ("tests/browser/test_study.py", *(f"tests/browser/test_{name}.py" for name in _STUDIES)),
+    ("tests/browser/test_two_players_browser.py", "tests/browser/test_two_participants.py"),
     ("tests/browser/",),
-    ("tests/trial/gym/",),
-    ("tests/browser/test_together_browser.py", "tests/browser/test_study.py"),
-    ("tests/browser/test_pages_browser.py",),
     ("tests/ministack/test_installation.py", "tests/ministack/test_world.py"),
+    ("tests/trial/gym/",),
     ("tests/ministack/test_first_hour.py",),
     ("tests/certificate/",),
     ("tests/deploy/code/test_build.py",),
@@ -37,6 +42,8 @@ ONE_AFTER_ANOTHER = (
 
 Of two places that fit a test, the longer one counts.
 """
+WAITING = ("tests/e2e/", "tests/examples/", "tests/local/", "tests/trial/")
+"""Folders whose tests mostly wait for processes. They run beside tests that compute: a machine is best used by both at once."""
 _PLACES = sorted(
     ((place, number) for number, places in enumerate(ONE_AFTER_ANOTHER) for place in places),
     key=lambda entry: -len(entry[0]),
@@ -68,15 +75,18 @@ def _turn(item: pytest.Item) -> int:
     return len(ONE_AFTER_ANOTHER) if group is None else group
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
-    """Each worker begins with other files: on a fresh clone it compiles a part of them, and finds the rest compiled."""
-    config = session.config
-    if hasattr(config, "workerinput") and [Path(place).resolve() for place in config.args] == [TESTS]:
-        files = sorted(map(str, TESTS.rglob("test_*.py")))
-        number = int(config.workerinput["workerid"].removeprefix("gw"))
-        begin = number * len(files) // config.workerinput["workercount"]
-        config.args = files[begin:] + files[:begin]
+def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
+    """Groups first; then the files of both kinds, `WAITING` or not. The last tests are none that wait while the machine has no more to do."""
+    others = Counter(sorted(_file(item) for item in items if _group(item.nodeid) is None))
+    places = {
+        file: place * (0.85 if file.startswith(WAITING) else 1)
+        for file, place in interleaved(others, lambda file: file.startswith(WAITING)).items()
+    }
+    return sorted(items, key=lambda item: (_turn(item), places.get(_file(item), 0), item.path))
+
+
+def _file(item: pytest.Item) -> str:
+    return item.nodeid.split("::")[0]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -89,7 +99,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return explores or bool(getattr(getattr(item, "obj", None), "is_hypothesis_test", False))
 
     left_out = [item for item in items if not wanted(item)]
-    items[:] = sorted((item for item in items if wanted(item)), key=lambda item: (_turn(item), item.path))
+    items[:] = _in_order([item for item in items if wanted(item)])
     config.hook.pytest_deselected(items=left_out)
     if exploration.TIMES:
         for item in items:

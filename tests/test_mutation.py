@@ -65,9 +65,13 @@ def test_each_mutant_is_one_small_change_of_what_runs() -> None:
     ]
 
 
-@pytest.mark.parametrize("line", ['Size = Literal["small", "large"]', 'self._emit(Log(20, "small"))'])
+@pytest.mark.parametrize("line", ['Size = Literal["small", "large"]', 'self._emit(WriteLog(20, "small"))'])
 def test_types_and_log_calls_are_not_mutated(line: str) -> None:
     assert len(Mutants("core.py", line)) == 0
+
+
+def test_the_trial_writes_its_log_by_the_call_that_is_left_out() -> None:
+    assert "self._emit(WriteLog(" in (ROOT / "trial/core/session.py").read_text()
 
 
 def test_a_mutant_that_a_test_notices_is_killed_and_another_survives(project: Path) -> None:

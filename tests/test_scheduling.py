@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from tests.conftest import ONE_AFTER_ANOTHER, TESTS, _group
-from tests.scheduling import MOST, TURNS, InUnits, units
+from tests.scheduling import MOST, TURNS, InUnits, interleaved, units
 
 WORKERS = 3
 FILES = [f"tests/test_{number}.py" for number in range(30)]
@@ -93,3 +93,9 @@ def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
     assert not config.option.loadscopereorder
     (alone,) = (worker for worker in workers if NAMES[0] in worker.done)
     assert alone.done[:100] == NAMES[:100]
+
+
+def test_files_of_two_kinds_take_turns_by_their_numbers_of_tests() -> None:
+    files = {"a/1": 10, "a/2": 30, "b/1": 1, "b/2": 2, "b/3": 1}
+    found = interleaved(files, lambda file: file[0])
+    assert found == {"a/1": 0, "a/2": 0.25, "b/1": 0, "b/2": 0.25, "b/3": 0.75}

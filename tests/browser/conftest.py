@@ -15,7 +15,7 @@ import pytest
 
 from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
-from testing.browser import ARGUMENTS, NoChromium, chromium_path
+from testing.browser import ARGUMENTS, NoChromium, chromium_path, headless_path
 from testing.held_study import HeldStudy
 from trial.recordings.recording import read
 
@@ -23,22 +23,28 @@ NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromiu
 HERE = Path(__file__).parent
 SHOTS = ROOT / "shots"
 PATIENCE = 45_000  # ms
+WHOLE_STUDIES = (
+    *("test_study.py", "test_german_study.py", "test_two_participants.py", "test_two_players_browser.py"),
+    *("test_examples.py", "test_gridworld_browser.py", "test_teaching.py"),
+)
 
 
 class SharedBrowser:
-    """One Chromium for all tests of this folder, because its start takes as long as some tests."""
+    """One Chromium for many files of this folder, because its start takes as long as some tests."""
 
     def __init__(self) -> None:
         self._open = contextlib.ExitStack()
         self._browser: Any = None
+        self._path = ""
 
-    def browser(self) -> Any:
-        """The browser, started if it does not run. Raises NoChromium."""
-        if self._browser is None or not self._browser.is_connected():
-            path = chromium_path()
+    def browser(self, path: str | None = None) -> Any:
+        """The browser in this file, or the one that runs, or else `headless_path`. Started if it does not run. Raises NoChromium."""
+        path = path or self._path or headless_path()
+        if self._browser is None or not self._browser.is_connected() or path != self._path:
             from playwright.sync_api import sync_playwright
 
             self.close()
+            self._path = path
             playwright = self._open.enter_context(sync_playwright())
             self._browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
             self._open.callback(self._browser.close)
@@ -46,7 +52,7 @@ class SharedBrowser:
 
     def close(self) -> None:
         """End the browser, if it runs."""
-        self._browser = None
+        self._browser, self._path = None, ""
         self._open.close()
 
 
@@ -64,13 +70,15 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
+def chromium(request: pytest.FixtureRequest) -> Iterator[Any]:
     """The browser. Without one, its tests are skipped; with BROWSER_TESTS=required they fail.
 
+    Participants walk through whole studies in the Chromium that people have; other tests of pages need no window.
     Contexts that a file leaves open are closed after its last test.
     """
     try:
-        browser = SHARED_BROWSER.browser()
+        whole = request.path.name in WHOLE_STUDIES
+        browser = SHARED_BROWSER.browser(chromium_path() if whole else headless_path())
     except NoChromium:
         if os.environ.get("BROWSER_TESTS") == "required":
             pytest.fail(NO_CHROMIUM)

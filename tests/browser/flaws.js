@@ -1,5 +1,7 @@
 // What keeps people out of a page, as far as a script can see it. Evaluates to a list of sentences.
 () => {
+  // A button that was released a moment ago is between two colours.
+  for (const each of document.getAnimations()) if (each instanceof CSSTransition) each.finish();
   const flaws = [];
   const all = (selector) => [...document.querySelectorAll(selector)];
   const seen = (element) => element.checkVisibility({ visibilityProperty: true });

@@ -14,9 +14,6 @@ from tests.browser.conftest import SHOTS, Hold
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
-pytest.importorskip("onnxruntime")
-pytest.importorskip("slime_volleyball")
-pytest.importorskip("cogrid")
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SIZES = [(1280, 800), (360, 740)]

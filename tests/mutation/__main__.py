@@ -1,7 +1,7 @@
-"""`make mutants`: how many small changes of the pure core the quick tests notice.
+"""`make mutants`: counts how many small changes of the pure core the quick tests notice.
 
-A random sample of all mutants (SAMPLE=150; 0 takes all), repeatable by its SEED. MODULES= names files, separated by spaces.
-Ends with 1 if less than GOAL percent are killed.
+It tries a random sample of all mutants (SAMPLE=150; 0 takes all). The same SEED takes the same sample. MODULES= names
+files, separated by spaces. The exit status is 1 if the tests kill less than GOAL percent.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ GOAL = 90
 
 
 def equivalent() -> set[tuple[str, str, str]]:
-    """Changes that change nothing, each with its reason, by hand."""
+    """Read the changes that change no behaviour, which `equivalent.toml` lists."""
     listed = tomllib.loads((Path(__file__).parent / "equivalent.toml").read_text()).get("mutant", [])
     return {(entry["module"], entry["was"], entry["becomes"]) for entry in listed}
 
 
 def sample(modules: list[str], size: int, seed: int) -> list[Mutant]:
-    """So many mutants of these modules, at random; all for 0."""
+    """Choose `size` mutants of these modules at random (0: all), and return them without those of `equivalent`."""
     lists = [Mutants(module, (ROOT / module).read_text()) for module in modules]
     every = [(mutants, index) for mutants in lists for index in range(len(mutants))]
     print(f"{len(every)} mutants in {len(modules)} modules; SAMPLE={size or len(every)} SEED={seed}", flush=True)

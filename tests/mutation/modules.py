@@ -1,4 +1,4 @@
-"""What is mutated, and the quick tests that judge it: the pure core, and services on the platform in memory."""
+"""The modules that are mutated (the pure core, and services), and the quick tests that judge the mutants of each."""
 
 from __future__ import annotations
 
@@ -197,6 +197,6 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
 
 
 def concerned(module: str) -> list[str]:
-    """The files of tests, the nearest first."""
+    """Return the files of tests that judge a module's mutants, the most likely to kill one first."""
     names = dict.fromkeys(TESTED_BY[module])
     return [f"tests/{name}.py" for name in names]

@@ -1,11 +1,11 @@
 """The mutants of a module: its source with one small change each, made on the syntax tree.
 
-Only what runs is changed, and nothing that is wording: annotations, decorators, docstrings, log calls, f-strings and strings
-of several words stay as they are.
+Annotations, decorators, docstrings, log calls, f-strings and strings of several words stay as they are: no test should
+judge wording.
 
-The syntax tree of the standard library, and not a package: mutmut 3.8 leaves out what stands outside of functions (tables,
-regular expressions) and every property; a fifth of the mutants of cosmic-ray 8.7 change an annotation, which nothing evaluates,
-it never leaves a statement out, and it changes the sources where they lie; neither takes a sample.
+No package does this well. mutmut 3.8 leaves out every property, and all code outside of functions (tables, regular
+expressions). cosmic-ray 8.7 never leaves a statement out, changes the sources in their own folder, and a fifth of its
+mutants change an annotation, which nothing evaluates. Neither takes a sample.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ UNTOUCHED = ("annotation", "returns", "decorator_list", "type_params")
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: `was` and `becomes` are the lines that differ, as `ast.unparse` writes them."""
+    """A module with one change. `was` and `becomes` are the lines that differ, as `ast.unparse` writes them."""
 
     module: str
     line: int
@@ -62,7 +62,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Change:
-    """One place in a tree and what can stand there instead: an attribute of a node, or an entry of a list."""
+    """A place in a syntax tree (an attribute of a node, or an entry of a list), and a node that can replace it."""
 
     holder: Any
     place: str | int
@@ -70,7 +70,7 @@ class Change:
     new: Any
 
     def swap(self, value: Any) -> Any:
-        """Put `value` there; return what was there."""
+        """Put `value` at the place, and return what was there."""
         if isinstance(self.holder, list):
             self.holder[self.place], before = value, self.holder[self.place]  # type: ignore[index]
         else:
@@ -80,7 +80,7 @@ class Change:
 
 
 class Mutants:
-    """All the changes of a module. They are cheap to list; the source of one is written when it is asked for."""
+    """All mutants of a module, as a sequence. The source of each is written only when it is asked for."""
 
     def __init__(self, module: str, source: str) -> None:
         self.module = module
@@ -120,19 +120,19 @@ def _changes(node: ast.AST) -> Iterator[Change]:
 
 
 def _is_wording(node: ast.AST) -> bool:
-    """Docstrings, what is logged, and what only readers and type checkers look at."""
+    """Whether a node is a docstring, a log call, or something that only readers and type checkers use."""
     if isinstance(node, ast.Assign):
         name = ast.unparse(node.targets[0])
         return ast.unparse(node).startswith(("__all__ =", f"{name} = TypeVar(", f"{name} = Literal["))
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
     call = node.value
-    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log(", "self._emit(Log("))
+    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log(", "self._emit(WriteLog("))
     return logs or isinstance(call, ast.Constant)
 
 
 def _instead(node: ast.AST, *, tests: bool) -> Iterator[ast.AST]:
-    """What a node can be replaced by."""
+    """Yield the nodes that can replace a node. `tests`: the node is a condition, which can be negated."""
     if tests and not isinstance(node, ast.Compare | ast.UnaryOp):  # those are turned round below
         yield ast.UnaryOp(ast.Not(), node)  # type: ignore[arg-type]
     match node:

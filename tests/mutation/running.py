@@ -1,4 +1,4 @@
-"""Runs tests against mutants: a process each, forked from one that has already imported all that is not ours.
+"""Runs tests against mutants, each in a process that is forked from one that has already imported the libraries.
 
 Sources are changed in copies of the folder, one for each process at a time, never in the folder itself.
 """
@@ -44,7 +44,7 @@ settings.register_profile(
 
 @dataclass
 class Run:
-    """Tests that run in a process of their own."""
+    """A process that runs tests against a mutant. `until` is the time at which it is killed."""
 
     process: int
     folder: Path
@@ -53,7 +53,7 @@ class Run:
 
 
 class Fails(Exception):
-    """The tests fail without any mutation."""
+    """The tests fail, or do not exist, without any mutation."""
 
 
 class Runner:
@@ -82,7 +82,9 @@ class Runner:
             gc.freeze()
 
     def judge(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mutant, bool]]:
-        """Each mutant, and whether its module's tests have killed it. One that hangs or eats the memory is killed too.
+        """Yield each mutant, and whether its module's tests have killed it.
+
+        One that hangs or takes all memory counts as killed.
 
         Raises Fails if a module's tests kill the module as it is: they would kill each of its mutants.
         """
@@ -95,12 +97,12 @@ class Runner:
             yield mutant, code != 0
 
     def _unchanged(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Sequence[Mutant]:
-        """A module as it is for each selection of tests that these mutants need."""
+        """Return an unchanged module for each selection of tests that these mutants need."""
         modules = {tuple(tests[mutant.module]): mutant.module for mutant in mutants}
         return [Mutant(module, 0, "", "", (self._root / module).read_text()) for module in modules.values()]
 
     def _run_each(self, mutants: Sequence[Mutant], tests: Mapping[str, Sequence[str]]) -> Iterator[tuple[Mutant, int]]:
-        """Each mutant, and with which exit code its module's tests have ended."""
+        """Yield each mutant, and the exit code of its module's tests."""
         with tempfile.TemporaryDirectory(prefix="mutants-") as name:
             free = [self._copy(f"{name}/{number}") for number in range(self._at_once)]
             sources = {module: (free[0] / module).read_text() for module in tests}
@@ -129,7 +131,7 @@ class Runner:
 
 
 def _write(path: Path, source: str) -> None:
-    """Write a source that no cached bytecode can be taken for."""
+    """Write a source, and remove its cached bytecode, which Python could take for the new source's."""
     path.write_text(source)
     cache = Path(importlib.util.cache_from_source(str(path)))
     cache.unlink(missing_ok=True)
@@ -152,7 +154,10 @@ def _fork(folder: Path, tests: Sequence[str], seconds: float, loaded: Path | Non
 
 
 def _run(folder: Path, tests: Sequence[str], loaded: Path | None) -> int:
-    """Run tests with the sources of `folder`, in this process."""
+    """Run tests with the sources of `folder` in this process, and return the exit code.
+
+    The names of the libraries that they have imported are written to `loaded`, if it is given.
+    """
     os.chdir(folder)
     said = os.open(folder.parent / "said", os.O_RDWR | os.O_CREAT | os.O_TRUNC)
     for stream in (0, 1, 2):
@@ -163,11 +168,11 @@ def _run(folder: Path, tests: Sequence[str], loaded: Path | None) -> int:
     sys.path[:] = [str(folder), *(path for path in sys.path if path not in ("", str(Path.cwd())))]
     before = set(sys.modules)
     options = [*OPTIONS, "--rootdir", str(folder), "--hypothesis-profile", "mutants"]
-    # The nearest tests first, by themselves: most mutants die there, before the others are even collected.
+    # The first file of tests runs by itself: it kills most mutants before the other files are even collected.
     groups = [group for group in (tests[:1], tests[1:]) if group]
     code = next((code for group in groups if (code := int(pytest.main([*options, *group])))), 0)
     if loaded:
-        # In the order of their imports: asyncio is two halves if _asyncio is imported before it.
+        # In the order of their imports: asyncio does not work if _asyncio is imported before it.
         new = [name for name in sys.modules if name not in before and name.partition(".")[0] not in ours]
         loaded.write_text("\n".join(new))
     return code
