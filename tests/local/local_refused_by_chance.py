@@ -1,4 +1,7 @@
-"""`python -m local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many."""
+"""`python -m local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
+
+One of the first calls is refused in any case, so that no run goes without. Each refusal is a line `refused: …` on stderr.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,17 @@ from testing.os_faults import ERRORS, OsCall, OsFaultInjector
 
 
 class ByChance(OsFaultInjector):
-    """Refuses calls by chance; one in ten times all that can be refused for this reason, for a moment."""
+    """Refuses calls by chance."""
 
     dice = random.Random(int(os.environ["SEED"]))
     chance = float(os.environ["CHANCE"])
+    until_sure = dice.randrange(300)  # calls until one is refused in any case; a start makes more than that
 
     def _error(self, call: OsCall) -> int | None:  # type: ignore[override]
-        if self.dice.random() > self.chance:
+        self.until_sure -= 1
+        if self.until_sure != 0 and self.dice.random() > self.chance:
             return None
+        os.write(2, f"refused: {call.operation}\n".encode())
         return self.dice.choice(ERRORS[call.operation])
 
 

@@ -56,7 +56,10 @@ def test_the_section_with_its_defaults_is_accepted_again() -> None:
         ({"toggle": True}, "ui.toggle: the game's server knows this word already; give the control another name"),
         ({"requestUI": True}, "ui.requestUI: the game's server knows this word already; give the control another name"),
         ({"x" * 65: True}, f"ui.{'x' * 65}: must be at most 64 characters long, not 65"),
-        ({"a\nb": True}, "ui.a\nb: must be the name of a control; without tabs, line ends and invisible characters"),
+        (
+            {"a\nb": True},
+            "ui.a\nb: must be the name of a control; take out its tabs, line ends and invisible characters",
+        ),
         (
             {f"word{number}": True for number in range(33)},
             "ui: must have at most 32 controls of your own, not 33",

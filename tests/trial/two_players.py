@@ -1,4 +1,8 @@
-"""An agent.py with two players, and a partner for one of them, for tests on real trial servers."""
+"""An agent.py with two players, and a partner for one of them, for tests on real trial servers.
+
+An observation is the number of the step and a number that depends on the seed. The latter is never 0: there are policies of tests that answer
+zeros otherwise.
+"""
 
 TWO = '''
 import time
@@ -17,7 +21,7 @@ class Agent:
         return self.seen(), {{"left": {{}}, "right": {{}}}}
 
     def seen(self):
-        return {{name: np.array([self.t, self.seed % 100], np.float32) for name in self.possible_agents}}
+        return {{name: np.array([self.t, 1 + self.seed % 100], np.float32) for name in self.possible_agents}}
 
     def step(self, actions):
         self.t += 1

@@ -202,7 +202,7 @@ def test_other_imports_during_play_are_not_reported(folder: Path) -> None:
 
 
 def needed(folder: Path) -> list[str]:
-    return [str(problem) for problem in agent_imports.of_players(folder, read_project(folder))]
+    return [str(problem) for problem in agent_imports.missing_for_players(folder, read_project(folder))]
 
 
 def policies(folder: Path) -> None:

@@ -15,6 +15,14 @@ STAND_IN = "; what stands in for Gym here has no {}: use Gymnasium's, or leave i
 PIP = "; install its package: .venv/bin/pip install {}"
 
 
+@pytest.fixture(autouse=True)
+def without_gym(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the process of `make check`: tests before this one may have loaded an agent in this process, and with it `gym`."""
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if Path(place) != OLD_GYM])
+    for name in [name for name in sys.modules if name.partition(".")[0] == "gym"]:
+        monkeypatch.delitem(sys.modules, name)
+
+
 @pytest.mark.parametrize(
     ("code", "advice"),
     [

@@ -210,6 +210,17 @@ def test_a_press_acts_only_while_the_game_plays_and_a_held_key_as_soon_as_it_pla
         game.act("jump", True)
 
 
+@pytest.mark.parametrize(("how", "acts"), [("held", True), ("single", False)])
+def test_a_key_that_goes_down_and_up_in_a_pause_acts_on_the_first_step_after_it(how, acts):
+    game = playing(input=how)
+    game.pause()
+    game.act("left", True)
+    game.act("left", False)
+    game.start()
+    first = Action(2, "left", "human") if acts else Action(0, "noop")
+    assert [game.next_actions()[PLAYER] for _ in range(2)] == [first, Action(0, "noop")]
+
+
 def test_taps_are_forgotten_and_held_keys_are_not():
     controls = Controls(SPACE, 5)
     controls.press("left")
