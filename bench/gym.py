@@ -37,8 +37,8 @@ from bench.table import Row, each, row
 from testing.gym_server import gym_server
 
 ROOT = Path(__file__).resolve().parent.parent
-REQUESTS = 2000  # of one measurement, of all clients together
-ROUNDS = 15  # of each measurement, ours and the yardsticks' in turn; the quickest of each counts
+REQUESTS = 2000  # requests of one measurement, of all clients together
+ROUNDS = 15  # repetitions of each measurement, ours and the yardsticks' in turn; the quickest of each counts
 MANY = 64  # steps in one request
 IDLE = 500  # connections that send no request
 THEIRS = {1: (4371, 136), 8: (11067, 88)}  # clients: Gymie 0.5.4's steps/s, and µs of server CPU per step
@@ -89,7 +89,7 @@ def frame(message: str | bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class GymRun:
-    """A measurement: µs of server CPU per request, requests per second, and the time of each answer in µs."""
+    """The figures of one measurement: µs of server CPU per request, requests per second, each answer's time in µs."""
 
     cpu: float
     rate: float
@@ -101,11 +101,11 @@ class GymRun:
 
 
 Next = Callable[[bytes], bytes]
-"""Gives the next request of a connection, from the answer to the last one."""
+"""A function that makes a connection's next request from the answer to the last one."""
 
 
 def drive(pid: int, clients: Sequence[tuple[FrameConnection, Next]], requests: int) -> GymRun:
-    """Let each client send a request after each answer, so many requests in all; `pid` is the server's process."""
+    """Let each client send a request after each answer, `requests` in all. `pid` is the server's process."""
     selector = selectors.DefaultSelector()
     sent, waits = {}, []
     begun, used = time.perf_counter(), cpu(pid)
@@ -211,7 +211,7 @@ def alone() -> float:
 
 
 def cartpole(url: str) -> tuple[FrameConnection, Next]:
-    """Make a client as Gymie's, with an environment of its own, which it steps, and resets after each episode."""
+    """Make a client like Gymie's. It steps an environment of its own, and resets it after each episode."""
     connection = FrameConnection(url)
     instance = connection.ask(frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')).decode()
     reset = frame(json.dumps({"method": "reset", "params": {"instance_id": instance}}, separators=(",", ":")))

@@ -37,7 +37,7 @@ from trial.recordings import recording
 
 RATE = 30  # frames a second
 SETTLE = 2.0  # seconds of play before the measurement
-SECONDS = 8.0  # of the measurement
+SECONDS = 8.0  # of play that are measured
 MOST_CPU = 1.2  # the goal for a frame of the example: ms of processor time
 TRIALS = 32  # trials that one core has to serve
 MOST_MEMORY = 45.0  # the goal for the memory of each trial: MB
@@ -92,7 +92,7 @@ class Partner:
 
 @dataclass
 class ServerLoad:
-    """What a server delivered and cost.
+    """The figures of one server: what it delivered and cost.
 
     `share` is that of the frames that were due, `cpu` is in ms per frame, memory in MB.
     """
@@ -111,7 +111,7 @@ def frame_id(data: bytes) -> int:
 
 @dataclass
 class Count:
-    """What one client has received."""
+    """The numbers of pictures and bytes that one client has received."""
 
     pictures: int = 0
     bytes: int = 0
@@ -150,7 +150,7 @@ class Acknowledging:
 
 @dataclass
 class Delivered:
-    """What one server delivered to each of its clients during the measurement. `cpu` is in seconds."""
+    """The deliveries of one server to each of its clients during the measurement. `cpu` is in seconds."""
 
     due: float  # pictures for each client
     clients: list[Count]
@@ -180,7 +180,7 @@ async def play(url: str, count: Count) -> None:
 async def delivered(
     servers: Sequence[tuple[str, int]], plays: Sequence[Callable[[str, Count], Coroutine[Any, Any, None]]]
 ) -> list[Delivered]:
-    """Play on all of these servers at once, on each with these clients; return what each delivered and cost.
+    """Play on all of these servers at once, on each with these clients. Return what each delivered and cost.
 
     Raises RuntimeError if a server ends its connection, TimeoutError if the clients get no pictures within 120 seconds.
     """
@@ -219,7 +219,7 @@ def _since(now: Count, before: Count) -> Count:
 
 
 async def played(servers: Sequence[tuple[str, int]]) -> list[ServerLoad]:
-    """Play on all of these servers at once; return what each delivered and cost."""
+    """Play on all of these servers at once, and return what each delivered and cost."""
     found = await delivered(servers, [play])
     return [_played(pid, one) for (_, pid), one in zip(servers, found, strict=True)]
 
@@ -238,7 +238,7 @@ def memory(pid: int) -> tuple[float, float]:
 
 @contextlib.contextmanager
 def example(count: int = 1) -> Iterator[list[tuple[str, int]]]:
-    """Run so many servers of the example's game; give their addresses and pids. More than one share a core."""
+    """Run `count` servers of the example's game for the block, and give their addresses and pids. They share a core."""
     cores = os.sched_getaffinity(0)
     core = cores if count == 1 else {max(cores)}
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as running:
@@ -340,7 +340,7 @@ def slow_policy() -> Iterator[Row]:
 
 
 def beside(partner: str) -> tuple[float, float]:
-    """Play beside this partner; return the share of the ticks delivered, and that of steps for which it was late."""
+    """Play beside this partner. Return the share of ticks delivered, and the share of steps for which it was late."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as store:
         Path(folder, "agent.py").write_text(SLOW, encoding="utf-8")
         trial = {"startingFrameRate": RATE, "actionSpace": ["noop", "up"]}

@@ -62,6 +62,7 @@ class MotoServer:
         )
 
     def put(self, key: str, body: bytes) -> None:
+        """Store a document in the bucket."""
         self.s3.put_object(Bucket="hippodrome", Key=key, Body=body)
 
     def requests(self) -> list[str]:
@@ -69,6 +70,7 @@ class MotoServer:
         return re.findall(r'"([A-Z]+ /\S*) HTTP/', self._log.read_text())
 
     def close(self) -> None:
+        """End the server's process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -80,6 +82,7 @@ class MotoServer:
 
 @contextlib.contextmanager
 def moto_server() -> Iterator[MotoServer]:
+    """Run moto's server within the block."""
     with tempfile.TemporaryDirectory() as folder:
         server = MotoServer(Path(folder, "moto.log"))
         try:

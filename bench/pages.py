@@ -139,24 +139,24 @@ Walk = Callable[[int, Callable[..., Awaitable[Exchange]]], Awaitable[None]]
 
 
 class PageCrowd(NamedTuple):
-    """How long a crowd took, and how long each of its requests took, in seconds."""
+    """The seconds that a crowd took, and that each of its requests took."""
 
     seconds: float
     waits: list[float]
 
     @property
     def rate(self) -> float:
-        """Requests per second."""
+        """The requests per second."""
         return len(self.waits) / self.seconds
 
     @property
     def p99(self) -> float:
-        """The 99th percentile of a request, in seconds."""
+        """The 99th percentile of a request's time, in seconds."""
         return statistics.quantiles(self.waits, n=100)[-1]
 
 
 async def send_crowd(address: str, people: int, walk: Walk) -> PageCrowd:
-    """Let so many participants walk at once, each on a connection of their own. Raises TimeoutError after SECONDS."""
+    """Let `people` participants walk at once, each on their own connection. Raises TimeoutError after SECONDS."""
     waits: list[float] = []
 
     async def person(number: int) -> None:

@@ -14,7 +14,7 @@ from trial.pictures.frames import Frame, as_frame
 
 ROOT = Path(__file__).parents[1]
 GAME = "ALE/MsPacman-v5"
-FRAMES = 300  # of each kind
+FRAMES = 300  # frames of each kind of picture
 
 
 def example_agent() -> Any:

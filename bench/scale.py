@@ -82,14 +82,14 @@ class ServedCrowd:
 
     @property
     def waits(self) -> list[float]:
-        """From the answer that starts a server until the page has its address, or until now if it never got one."""
+        """The waits from the answer that starts a server until the page has its address, or until now without one."""
         now = self.world.clock.seconds
         asked = [(visit, visit.asked) for visit in self.visits if visit.asked is not None]
         return [(now if visit.ready is None else visit.ready) - at for visit, at in asked]
 
     @property
     def alone(self) -> list[float]:
-        """How long the same participants would wait with AWS alone."""
+        """The times that the same participants would wait with AWS alone."""
         return aws_alone([visit.asked for visit in self.visits if visit.asked is not None], self.seed, self.conditions)
 
 

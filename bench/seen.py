@@ -119,7 +119,7 @@ LEFT = {"Ms. Pac-Man": 3, "CartPole, 600 x 400": 1, "scrolling texture, 600 x 40
 
 @dataclass
 class Seen:
-    """Figures of one page, by frames per second. Times are milliseconds."""
+    """The figures of one page, by frames per second. Times are milliseconds."""
 
     share: dict[int, float] = field(default_factory=dict)
     """The share of the frames that were due; above 1 if earlier frames were drawn late."""
@@ -128,9 +128,9 @@ class Seen:
     cpu: dict[int, float] = field(default_factory=dict)
     """The server's processor time per drawn frame."""
     waits: list[float] = field(default_factory=list)
-    """From each key event to the draw that shows its effect, at one rate."""
+    """The times from each key event to the draw that shows its effect, at one rate."""
     since_opened: dict[int, float] = field(default_factory=dict)
-    """All draws, as a share of the frames that were due since the page was opened."""
+    """The number of all draws, as a share of the frames that were due since the page was opened."""
 
 
 @contextlib.contextmanager
@@ -196,7 +196,7 @@ def _jpeg(frame: Frame, corner: int) -> bytes:
 
 
 def look(browser: Any, setting: Any, picture: str, rates: tuple[int, ...], pressed_at: int) -> Seen:
-    """Play in a page at each rate, with keys at `pressed_at`; return the figures. `setting` is `ours` or `bare`."""
+    """Play in a page at each rate, and press keys at the rate `pressed_at`. `setting` is `ours` or `bare`."""
     seen = Seen()
     for rate in rates:
         with setting(picture, rate) as (address, pid):

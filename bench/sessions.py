@@ -67,25 +67,25 @@ class Together:
 
     @property
     def waits(self) -> list[float]:
-        """From the lobby to the first picture, of the participants who saw one."""
+        """The waits from the lobby to the first picture, of the participants who saw one."""
         seen = [(one.lobby, one.first_picture) for one in self.came]
         return [picture - came for came, picture in seen if came is not None and picture is not None]
 
     @property
     def matched(self) -> list[float]:
-        """From the lobby until the page says that the participant is matched, or unmatched."""
+        """The waits from the lobby until the page says that the participant is matched, or unmatched."""
         return [one.matched - one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
 
     @property
     def alone(self) -> list[float]:
-        """How long the participants who stayed in the lobby would wait with AWS alone."""
+        """The times that the participants who stayed in the lobby would wait with AWS alone."""
         asked = [one.visit.asked for one in self.came if one.visit.asked is not None]
         there = [one.lobby for one in self.came if one.lobby is not None and one.matched is not None]
         return aws_alone_together(asked, there, self.project.players, self.world.clock.seed, self.world.conditions)
 
     @property
     def at_best(self) -> list[float]:
-        """How long they would wait if each ready server went to the next session at once, in the order of arrival."""
+        """Their waits if each ready server were given to the next session at once, in the order of arrival."""
         found = (from_json(body, Server) for key, (body, _, _) in self._documents.items() if key.startswith(RECORDS))
         ready = sorted((one.ready - EPOCH).total_seconds() for one in found if one.ready)
         there = sorted(one.lobby for one in self.came if one.lobby is not None and one.matched is not None)
@@ -108,7 +108,10 @@ def crowd(
     within: float = WITHIN,
     seed: int = SEED,
 ) -> Together:
-    """Simulate so many participants who come within so many seconds, until nothing is left, or for HOURS at most."""
+    """Simulate `people` participants who come within `within` seconds, until nothing is left, or for `HOURS` hours.
+
+    `habits` says how the participant of this number behaves.
+    """
     begun = time.perf_counter()
     world = SimulatedWorld(seed, conditions, project)
     came = [SimulatedMember(world, number, habits=habits(number)) for number in range(people)]

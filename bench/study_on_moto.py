@@ -75,6 +75,7 @@ class MeasuredStudy:
         self.calls.clear()
 
     def upload(self, key: str, body: bytes) -> None:
+        """Store a document in the bucket."""
         self.world.client("s3").put_object(Bucket=self.world.env["BUCKET"], Key=key, Body=body)
 
     def invoke(self, function: ModuleType, event: Mapping[str, Any]) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def number(value: Any) -> str:
 
 
 def line(found: Mapping[str, Any]) -> str:
-    """Write a row in one line, for the progress."""
+    """Write a row in one line, which is shown while the others are measured."""
     if not measured(found):
         return f"{found.get('name')}: could not be measured"
     return f"{found['name']}: {number(found['value'])} {found['unit']}"

@@ -97,7 +97,7 @@ WATCH = """(() => {
 
 @dataclass
 class TogetherLoad:
-    """What one server delivered and cost. `cpu` is in ms per tick, `memory` in MB."""
+    """The figures of one server: what it delivered and cost. `cpu` is in ms per tick, `memory` in MB."""
 
     shares: list[float]  # by member: the share of the ticks that were due
     bytes_a_tick: float  # to each member
@@ -232,7 +232,7 @@ def judged_core(found: Sequence[TogetherLoad]) -> Iterator[Row]:
 
 @dataclass
 class PairSeen:
-    """What two participants saw. Times are milliseconds."""
+    """The figures of what two participants saw. Times are milliseconds."""
 
     shares: list[float]  # by participant: the share of the ticks that were due
     waits: list[list[float]]  # by participant: the times from a key event to its effect

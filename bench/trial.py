@@ -20,7 +20,7 @@ from testing.browser import chromium
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, Decoder, Frame, jpeg_message
 
-ROUNDS = 3  # of each measurement of processor time; the quickest counts
+ROUNDS = 3  # repetitions of each measurement of processor time; the quickest counts
 IDLE_SECONDS = 5.0
 RATES = (30, 60)  # frames a second
 PRESSED_AT = 30  # frames a second while keys are pressed

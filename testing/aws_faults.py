@@ -48,7 +48,7 @@ class FaultKind(StrEnum):
 
 
 class Reach(StrEnum):
-    """How long a fault lasts; the module's docstring says what each value means."""
+    """The duration of a fault. The module's docstring says what each value means."""
 
     ATTEMPT = "one attempt"
     CALL = "the call"
@@ -160,7 +160,7 @@ class AwsFaultInjector:
     """Counts the calls of one botocore session, and injects `fault` into the call that it names."""
 
     def __init__(self) -> None:
-        """To be made while a `MotoWorld` is open."""
+        """Make the injector while a `MotoWorld` is open."""
         self.session = botocore.session.get_session()
         self.session.register("before-call", self._before_call)
         self.session.register("after-call", self._after_call)

@@ -12,7 +12,7 @@ EPOCH = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
 
 
 class Clock:
-    """The seconds since the beginning, and the calls that are due. Calls of one second are made in the order of `after`."""
+    """Keeps the seconds since the beginning, and makes calls that are due; those of one second in the order of `after`."""
 
     def __init__(self, began: datetime = EPOCH) -> None:
         self.seconds = 0.0
@@ -42,7 +42,7 @@ class Clock:
         act()
 
     def forget(self) -> None:
-        """Drop all calls that are due."""
+        """Drop all calls that were to be made."""
         self._due.clear()
 
     @property

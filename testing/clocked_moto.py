@@ -79,7 +79,10 @@ HORIZON = 4 * 3600.0  # seconds until everything must be over
 
 
 class ClockedPlatform(AwsPlatform):
-    """The AWS adapters with the installation's clock. Functions share clients: making some takes longer than a journey."""
+    """The AWS adapters with the installation's clock.
+
+    Functions share clients: making some takes longer than a journey.
+    """
 
     def __init__(self, env: Any, clock: Clock, session: Any, clients: dict[str, Any]) -> None:
         super().__init__(env, session)
@@ -89,7 +92,7 @@ class ClockedPlatform(AwsPlatform):
         return self._clock.now()
 
     def run_all(self, acts: Any) -> Any:
-        """Run them one after the other, so that the n-th call is the same in every run."""
+        """Run `acts` one after the other, so that the n-th call is the same in every run."""
         return [act() for act in acts]
 
 
@@ -214,7 +217,7 @@ class TimedInstallation:
         self.clock.after(SWEEP_EVERY, self._sweep)
 
     def live(self) -> None:
-        """Let time pass until no participant and no resource is left, but for HORIZON seconds at most."""
+        """Let time pass until no participant and no resource is left, for at most HORIZON seconds."""
         end = self.clock.seconds + HORIZON
         self._collect()
         while not self._quiet() and self.clock.seconds < end:
@@ -337,7 +340,7 @@ class TimedInstallation:
                     self._send(queue, mail.body, AGAIN, mail.receives + 1)
 
     def _collect(self) -> None:
-        """Take up what the functions' calls have caused: messages that were sent, tasks that were run or stopped."""
+        """Schedule what the functions' calls have caused: messages that were sent, tasks that were run or stopped."""
         for name, url in (("start", "start_queue"), ("stop", "stop_queue"), ("task", "task_queue")):
             messages = self._queues[self.world.ids[url].rpartition("/")[2]]._messages
             for message in messages:

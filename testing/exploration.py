@@ -21,22 +21,26 @@ from hypothesis.internal.conjecture import providers
 T = TypeVar("T")
 
 TIMES = int(os.environ.get("HUNT") or 0)
-"""The factor by which the hunt multiplies the examples of a property; 0 in `make test`."""
+"""The factor by which `make hunt` multiplies the examples of a property; 0 in `make test`."""
 
 SECONDS = float(os.environ.get("HUNT_SECONDS") or "inf")
-"""The seconds after which the hunt begins no new test; it reports the tests that are left as skipped."""
+"""The seconds after which `make hunt` begins no new test, and reports the remaining tests as skipped."""
 
 PAGE = 1000 if TIMES else 40
-"""The number of keys in a page of S3's listings while a test has the fixture `pages`; on AWS, and in the hunt, 1,000."""
+"""The number of keys in a page of S3's listings while a test has the fixture `pages`; on AWS, and in the hunt,
+1,000."""
 
 
 def examples(number: int) -> int:
-    """Return how many examples of a property to run: `number` in `make test`, `TIMES` times as many in the hunt."""
+    """Return how many examples of a property to run: `number` in `make test`, `TIMES` times as many in `make hunt`."""
     return number * max(1, TIMES)
 
 
 def sample(cases: Iterable[T], share: int, seed: int = 0) -> list[T]:
-    """Return all cases in the hunt; else one of each `share` cases, in order. The same `seed` chooses the same cases."""
+    """Return all cases in `make hunt`, else one of each `share` cases, in order.
+
+    The same `seed` chooses the same ones.
+    """
     all_cases = list(cases)
     if TIMES:
         return all_cases
@@ -48,8 +52,8 @@ def sample(cases: Iterable[T], share: int, seed: int = 0) -> list[T]:
 def load_profile() -> None:
     """Make one profile of hypothesis the default of all tests.
 
-    In `make test` examples hold no constants from our modules: hypothesis 6.170 takes constants from the modules that the
-    process has loaded, so the tests that a worker has run before would decide which examples it runs.
+    In `make test` examples hold no constants from our modules: hypothesis 6.170 takes constants from the modules that
+    the process has loaded, so the tests that a worker has run before would decide which examples it runs.
 
     The profile has no deadline, because a slow machine is no fault of the code; no database, because an example that
     failed once belongs in a test; and no health checks, because they measure time, too, and because no example changes

@@ -73,7 +73,7 @@ class FakeDocuments:
         self._write(key, body)
 
     def keep(self, key: str, body: bytes) -> None:
-        """Write as another process does: `calls` does not have it, and no function of `before_write` is called."""
+        """Write as another process does: the call is not in `calls`, and no function of `before_write` is called."""
         self._write(key, body)
 
     def _interfere(self) -> None:

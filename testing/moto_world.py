@@ -62,7 +62,7 @@ from testing.iam.enforcement import ApiCall, IamEnforcement
 
 @dataclass
 class ScriptedAnswer:
-    """The answer that the next `times` calls of an operation get instead of moto's."""
+    """An answer that the next `times` calls of an operation get instead of moto's."""
 
     service: str
     operation: str
@@ -519,14 +519,14 @@ class MotoWorld:
     # -- names ----------------------------------------------------------------------------------------------------
 
     def records(self) -> dict[str, str]:
-        """Return the A records of the zone: name without the final dot → address."""
+        """Return, by name without the final dot, the addresses of the zone's A records."""
         zone = route53_backends[ACCOUNT]["aws"].get_hosted_zone(self.ids["zone"])
         return {r.name.rstrip("."): r.records[0] for r in list(zone.rrsets) if r.type == "A"}
 
     # -- timers ---------------------------------------------------------------------------------------------------
 
     def timers(self) -> dict[str, tuple[datetime, dict[str, Any]]]:
-        """Return the one-time schedules: name → time (UTC) and message."""
+        """Return the one-time schedules by name, each with its time (UTC) and message."""
         schedules = scheduler_backends[ACCOUNT][self.region].schedule_groups["hippodrome"].schedules
         found = {}
         for name, schedule in list(schedules.items()):
@@ -535,7 +535,9 @@ class MotoWorld:
         return found
 
     def fire_timer(self, name: str) -> dict[str, Any]:
-        """Publish the schedule's input to its target's topic, then delete it, as the Scheduler does. Return the message.
+        """Publish the schedule's input to its target's topic, then delete it, as the Scheduler does.
+
+        Return the message.
 
         Gap: schedules never fire in moto. Raises KeyError if there is no such schedule.
         """
@@ -558,6 +560,7 @@ def _own_client(service: str, region: str) -> Any:
 
 @pytest.fixture
 def moto_world() -> Iterator[MotoWorld]:
+    """Open a `MotoWorld` for a test."""
     with MotoWorld() as world:
         yield world
 

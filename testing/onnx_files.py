@@ -1,4 +1,4 @@
-"""Writes ONNX files for tests: small policies in the forms that researchers export, made with the package `onnx`."""
+"""ONNX files of tests: writes small policies in the forms that researchers export, with the package `onnx`; runs them."""
 
 from __future__ import annotations
 
@@ -131,3 +131,10 @@ def endless(file: Path) -> Path:
     ]
     constants = {"many": np.float32(1e12), "go_on": np.bool_(True), "start": np.zeros((1, 3), np.float32)}
     return save(file, nodes, [("obs", (1, 2))], [("output", (1, 3))], constants)
+
+
+def session(file: Path) -> Any:
+    """Return an `onnxruntime.InferenceSession` that runs the file."""
+    import onnxruntime  # it starts threads at once, which a process that forks must not have
+
+    return onnxruntime.InferenceSession(file)

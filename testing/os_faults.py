@@ -4,13 +4,10 @@ Faults are injected *below* `local/`, in the functions of Python's library that 
 identified by its operation and its kind of file (`OsCall`) and by its number among those: threads make calls in an
 order that changes from run to run, but the n-th call of one kind is nearly always the same.
 
-* `OsReach.ONCE`: this call fails.
-* `OsReach.SPELL`: this call fails, and for `SPELL_SECONDS` each call that can fail with the same errno, as on a full
-  disk.
-* `OsReach.EVER`: the data folder and the state folder are on different file systems, so no hard link can be made
-  between them.
-* `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill -9`) just before the call, or just after it. None of its
-  threads makes another call.
+* `OsReach.ONCE`: this call fails. * `OsReach.SPELL`: this call fails, and for `SPELL_SECONDS` each call that can fail
+with the same errno, as on a full disk. * `OsReach.EVER`: the data folder and the state folder are on different file
+systems, so no hard link can be made between them. * `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill
+-9`) just before the call, or just after it. None of its threads makes another call.
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ SPELL_SECONDS = 0.4
 
 
 class OsReach(StrEnum):
-    """What a fault does; the module's docstring says what each value means."""
+    """The effect of a fault: one call, several calls, or the process. The module's docstring explains the values."""
 
     ONCE = "once"
     SPELL = "for a while"
@@ -105,7 +102,7 @@ _KINDS = (
 
 
 class _Off(threading.local):
-    """How many blocks of `unharmed` this thread is in."""
+    """The number of `unharmed` blocks in which this thread is."""
 
     deep = 0
 
@@ -188,7 +185,10 @@ class OsFaultInjector:
         return result
 
     def _error(self, call: OsCall) -> int | OsReach | None:
-        """Count this call. Return the errno with which it fails, or how it is killed; None if the call is to be made."""
+        """Count this call.
+
+        Return the errno with which it fails, or how it is killed; None if the call is to be made.
+        """
         with self._lock:
             self.calls[call] += 1
             fault = self.fault

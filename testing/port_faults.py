@@ -21,7 +21,7 @@ class Unreachable(ConnectionError):
 
 
 class PortFault(StrEnum):
-    """What happens at a call; read each value after "the call"."""
+    """The kinds of faults at a call. Each value completes the sentence "The call …"."""
 
     ERROR = "is refused"
     REPLY = "is made and its reply lost"

@@ -23,7 +23,7 @@ Chance = Callable[[], bool]
 
 
 class DiskChange(NamedTuple):
-    """One change in the record."""
+    """One change of a file or folder in the record of a `Disk`."""
 
     kind: str  # "name", "bytes", "sync"
     thing: int  # the number of the file or folder that changes; of "name" the folder that holds the name
@@ -33,7 +33,7 @@ class DiskChange(NamedTuple):
 
 
 class Disk:
-    """The record of one folder."""
+    """Records the changes of one folder, and makes the folder as it may be after a power cut."""
 
     def __init__(self, root: Path) -> None:
         self.root = Path(os.path.realpath(root))
@@ -155,7 +155,10 @@ class Disk:
             self._name(found, None)
 
     def _fsync(self, do: Any, handle: int) -> None:
-        """Record the sync, but do not sync: `after_cut` needs only the record. Raises OSError if the file is not open."""
+        """Record the sync, but do not sync: `after_cut` needs only the record.
+
+        Raises OSError if the file is not open.
+        """
         os.fstat(handle)
         found = self._path(os.readlink(f"/proc/self/fd/{handle}"))
         if found is None:

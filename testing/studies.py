@@ -10,7 +10,7 @@ from testing.fake_platform import FakePlatform
 
 
 def study(**changes: object) -> Project:
-    """Return a project: consent (2 groups) → questionnaire → game → survey → debrief.
+    """Return a project with five steps: consent (with two groups), questionnaire, game, survey, debrief.
 
     Its server starts at step 2 and stops at step 4. `changes` replaces fields.
     """

@@ -45,16 +45,16 @@ def template() -> dict[str, Any]:
 
 
 def resources(kind: str, of: Mapping[str, Any] | None = None) -> dict[str, dict[str, Any]]:
-    """Return logical id → properties of the resources of a type, such as `AWS::Lambda::Function`.
+    """Return, by logical id, the properties of the resources of a type, such as `AWS::Lambda::Function`.
 
-    Here and below, `of` is the template, if it is another one than `infra/template.yml`.
+    `of`, here and in the other functions: another template than `infra/template.yml`.
     """
     found = (of or template())["Resources"]
     return {name: one.get("Properties", {}) for name, one in found.items() if one["Type"] == kind}
 
 
 def functions(of: Mapping[str, Any] | None = None) -> dict[str, str]:
-    """Return the name of each function's file in `lambdas/` → logical id."""
+    """Return, by the name of each function's file in `lambdas/`, the function's logical id."""
     return {p["Handler"].split(".")[1]: name for name, p in resources("AWS::Lambda::Function", of).items()}
 
 

@@ -49,16 +49,20 @@ def test_a_walk_leads_to_what_exists(what: str, file: Path | None, names: list[s
 
 
 def in_rooms() -> Iterator[tuple[Path, str]]:
-    """Each folder and file that the tables of rooms name, with the folder of its row."""
+    """Each folder and file that the lists of rooms name, with the folder of its item."""
     rooms = (ROOT / "docs/architecture.md").read_text().partition("\n## Rooms\n")[2].partition("\n## ")[0]
-    for row in re.finditer(r"^\| `(?P<folder>[\w/]+/)` \| (?P<there>.*) \|$", rooms, re.M):
-        yield ROOT / row["folder"], "."
-        for named in re.findall(r"`([\w/]+(?:\.py|\.js|/))`", row["there"]):
-            yield ROOT / row["folder"], named
+    folder = ROOT
+    for item in rooms.splitlines():
+        if found := re.match(r"\* `([\w/]+/)`", item):
+            folder = ROOT / found[1]
+            yield folder, "."
+        if re.match(r" *\* `", item):
+            for named in re.findall(r"`([\w/]+(?:\.py|\.js|/))`", item):
+                yield folder, named
 
 
 @pytest.mark.parametrize(("folder", "named"), list(in_rooms()))
-def test_every_file_in_the_tables_of_folders_exists(folder: Path, named: str) -> None:
+def test_every_file_in_the_lists_of_folders_exists(folder: Path, named: str) -> None:
     assert (folder / named).exists() or (ROOT / named).exists()
 
 

@@ -18,7 +18,10 @@ from testing.aws_events import last
 
 @dataclass(frozen=True)
 class Ask:
-    """An action on a resource that must be allowed, with the condition keys `context`. `about` is the kind of resource."""
+    """A permission that a call needs: an action on a resource, with the condition keys `context`.
+
+    `about` is the kind of the resource, such as `answers`.
+    """
 
     action: str
     resource: str
@@ -51,7 +54,10 @@ Params = Mapping[str, Any]
 
 
 def asks(service: str, operation: str, params: Params, facts: Facts) -> list[Ask]:
-    """Return the permissions that the call needs. Raises KeyError for an operation that the table below does not have."""
+    """Return the permissions that the call needs.
+
+    Raises KeyError for an operation that the table below does not have.
+    """
     return _TABLE[f"{service}:{operation}"](params, facts)
 
 
@@ -82,7 +88,7 @@ def _bucket(params: Params) -> str:
 
 
 def _get_object(params: Params, facts: Facts) -> list[Ask]:
-    """Without s3:ListBucket (judged without s3:prefix), S3 answers 403 instead of 404 for a missing document."""
+    """Return s3:GetObject; for a missing document also s3:ListBucket, without which S3 answers 403 instead of 404."""
     found = [_object("s3:GetObject", params)]
     if not facts.exists(params["Bucket"], params["Key"]):
         found.append(Ask("s3:ListBucket", _bucket(params)))
@@ -90,7 +96,7 @@ def _get_object(params: Params, facts: Facts) -> list[Ask]:
 
 
 def _put_object(params: Params, facts: Facts) -> list[Ask]:
-    """A write with If-Match needs s3:GetObject, too, since its result says something about the stored document.
+    """Return s3:PutObject; with If-Match also s3:GetObject, since the result tells about the stored document.
 
     (S3 User Guide, "How to prevent object overwrites with conditional writes".)
     """

@@ -67,7 +67,7 @@ class Judge:
         self._decided: dict[tuple[Any, ...], bool] = {}
 
     def may(self, principal: str, ask: Ask) -> bool:
-        """Return whether the policies of the principal allow it."""
+        """Return whether the principal's policies allow this action on this resource."""
         question = (principal, ask.action, ask.resource, *sorted(map(str, ask.context.items())))
         if question not in self._decided:  # the same questions come thousands of times in a run
             self._decided[question] = self._decide(principal, ask)
@@ -87,7 +87,7 @@ class Judge:
         return bool(self._iam.evaluate(context, self.policies(principal)).decision == "Allow")
 
     def who_may(self, ask: Ask) -> frozenset[str]:
-        """Return the functions that are allowed to do it."""
+        """Return the names of the functions whose policies allow this action on this resource."""
         return frozenset(name for name in self.functions if self.may(name, ask))
 
     def policies(self, principal: str) -> list[Any]:

@@ -31,6 +31,7 @@ EXECUTIONS = 10
 
 
 def certificates() -> None:
+    """Put Pebble in the place of Let's Encrypt's authorities, and its DNS beside the zone."""
     from hippodrome.certificates import rules as certificate
 
     # Before any module imports them.
@@ -55,6 +56,7 @@ def certificates() -> None:
 
 
 def internet() -> None:
+    """Put the tests' name server in the place of the Internet's DNS, and the emulator in that of the site."""
     import dns.resolver
 
     from deploy.operate.doctor import addresses
@@ -80,6 +82,7 @@ def internet() -> None:
 
 
 def account() -> None:
+    """Give the account a new one's quotas and scan findings of images, and let Docker count as missing."""
     import botocore.handlers
     from botocore.awsrequest import AWSResponse
 

@@ -70,7 +70,10 @@ def until(look: Callable[[], T], condition: str, seconds: float = 60) -> T:
 
 
 def _certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """Make an authority and a certificate for loopback. Return the files of the authority, the certificate and its key."""
+    """Make an authority and a certificate for loopback.
+
+    Return the files of the authority, the certificate and its key.
+    """
     made = authority("ministack", days=1)
     files = folder / "ca.pem", folder / "tls.pem", folder / "tls.key"
     for file, content in zip(files, (made.certificate, *made.issue("localhost", "127.0.0.1")), strict=True):
@@ -89,7 +92,10 @@ class CommandRun:
 
 
 class MinistackWorld:
-    """One account. `client` gives clients of root; `decisions` are ministack's about all other callers."""
+    """One account on ministack.
+
+    `client` returns clients of root; `decisions` are ministack's about all other callers.
+    """
 
     def __init__(self, venv: Path, home: Path) -> None:
         self.venv, self.home = venv, home
@@ -392,7 +398,10 @@ class MinistackInstallation:
     # -- servers
 
     def tasks(self, status: str = "RUNNING") -> dict[str, dict[str, Any]]:
-        """Return the cluster's tasks with this desired status, by `startedBy`. Raises AssertionError if two share one."""
+        """Return the cluster's tasks with this desired status, by `startedBy`.
+
+        Raises AssertionError if two share one.
+        """
         ecs = self.world.client("ecs")
         arns = ecs.list_tasks(cluster=self.cluster, desiredStatus=status)["taskArns"]
         found = ecs.describe_tasks(cluster=self.cluster, tasks=arns)["tasks"] if arns else []
@@ -407,7 +416,7 @@ class MinistackInstallation:
         return [schedule["Name"] for schedule in found]
 
     def names(self) -> dict[str, str]:
-        """Return the A records of servers: name → address."""
+        """Return, by name, the addresses of servers' A records."""
         zone = self.world.zone
         found = self.world.client("route53").list_resource_record_sets(HostedZoneId=zone)["ResourceRecordSets"]
         return {

@@ -16,7 +16,7 @@ OURS = "our assumption"
 
 
 def assumptions(conditions: Conditions) -> Mapping[str, str]:
-    """Return the assumptions that decide the figures: name → text."""
+    """Return, by name, the text of each assumption that decides the figures."""
     median, sigma, longest = conditions.starts
     rate = ", ".join(f"{name} {quota[0]:g}/s (burst {quota[1]:g})" for name, quota in QUOTAS.items())
     delays = ", ".join(f"{name} {_span(span)}" for name, span in {**LATENCY, "s3": conditions.s3}.items())

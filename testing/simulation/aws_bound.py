@@ -65,7 +65,7 @@ def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = N
 
 
 def _admitted(arrivals: Sequence[float]) -> list[float]:
-    """Return the second of RunTask for each arrival: as early as its own bucket and the bucket of launches have a token."""
+    """Return the second of RunTask for each arrival: the first at which its own bucket and the launches' have a token."""
     found = list(arrivals)
     for quota in ("ecs:RunTask", "launch:spot"):
         rate, burst = QUOTAS[quota]

@@ -247,6 +247,6 @@ def points(journey: SimulatedJourney, seed: int) -> list[FaultAt]:
 
 
 def explore(journey: SimulatedJourney, seed: int) -> Iterator[FaultOutcome]:
-    """Run a journey once with each of its faults; yield the outcomes."""
+    """Run a journey once with each of its faults, and yield the outcome of each run."""
     for fault in points(journey, seed):
         yield run(journey, seed, fault)[1]

@@ -145,7 +145,7 @@ class SimulatedFunction:
 
 
 def enter(owner: object) -> None:
-    """Give `lambdas.installed` the objects of this container; none if the owner is no container."""
+    """Give `lambdas.installed` the objects of this container; no objects if the owner is no container."""
     if isinstance(owner, Container):
         installed._platform, installed._made = owner.platform, owner.made
     else:
@@ -153,7 +153,7 @@ def enter(owner: object) -> None:
 
 
 def lineage() -> Lineage:
-    """Return the lineage for a message that is sent now: that of the present invocation, if there is one."""
+    """Return the lineage of a message that is sent now: the present invocation's, if there is one."""
     owner = getattr(greenlet.getcurrent(), "owner", None)
     return owner.lineage if isinstance(owner, Container) else NO_LINEAGE
 
@@ -174,7 +174,7 @@ def ends(owner: object) -> float:
 
 @dataclass
 class HeldMessage:
-    """A message in a queue. `receipt` is the number of its latest receive; `deleted` says whether it was."""
+    """A message in a queue. `receipt` is the number of its latest receive. `deleted`: whether it was deleted."""
 
     number: int
     body: str

@@ -38,7 +38,7 @@ def retry_delay(tries: int) -> float:
 
 @dataclass
 class SimulatedVisit:
-    """What happened to one participant. Times are virtual seconds since the world's beginning."""
+    """The record of one participant's visit. Times are virtual seconds since the world's beginning."""
 
     user: str
     arrived: float

@@ -187,7 +187,7 @@ class SimDns:
         self.records.update({record.name: record.host for record in add})
         self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
-        chance = self._propagation if add else clock.random  # no participant waits for a removal
+        chance = self._propagation if add else clock.random  # `aws_bound.py` draws the times of additions again
         spread = propagation(chance, self._conditions, clock.seed, clock.seconds)
         self._in_sync[change] = clock.seconds + spread
         self.spreads.update({record.name: spread for record in add})

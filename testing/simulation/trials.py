@@ -29,10 +29,13 @@ _parsed = functools.lru_cache(maxsize=1000)(sessions.parse)  # trials read docum
 
 
 class SimTrial:
-    """The trial of one task. `over` is empty while it goes on; then it is `done`, `lost` (with its server) or `idle`."""
+    """The trial of one task.
+
+    `over` is empty while it goes on; then it is `done`, `lost` (with its server) or `idle`.
+    """
 
     def __init__(self, trials: SimTrials, task: TimedTask, session_id: str, step: str, play: float) -> None:
-        """The game takes `play` seconds."""
+        """`play`: the seconds that the game takes."""
         self.task, self.session_id = task, session_id
         self.over = ""
         self.began: float | None = None  # when the game began
@@ -132,7 +135,7 @@ class SimTrials:
     """The trials of all tasks of a world."""
 
     def __init__(self, platform: SimPlatform, project_id: str, idle: float) -> None:
-        """A trial without members ends after `idle` seconds."""
+        """`idle`: the seconds after which a trial without members ends."""
         self.platform, self.project_id, self.idle = platform, project_id, idle
         self.played: defaultdict[str, float] = defaultdict(float)  # by session: seconds of play in its recordings
         self._trials: dict[str, SimTrial] = {}  # by task

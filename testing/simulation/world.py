@@ -134,7 +134,9 @@ class SimulatedWorld:
             queue.send(message, chance.uniform(0.5, 30), lineage)
 
     def ask(self, method: str, query: str, body: str = "") -> tuple[int, Any]:
-        """Send a request as a program does; return the status and the JSON of the answer. Raises what the function raises.
+        """Send a request as a program does; return the status and the JSON of the answer.
+
+        Raises what the function raises.
 
         The status is 429 if the site has no more requests left in this second, and 503 if the account has no
         concurrency left. AWS does not document which status an HTTP API has then (a REST API has 500); it is one of
@@ -177,8 +179,8 @@ class SimulatedWorld:
     def left(self) -> Mapping[str, int]:
         """Count what is left of each kind.
 
-        These are tasks, DNS records, timers, servers' slots, warm servers that wait, entries and decisions of the lobby,
-        handovers, open records, and dead letters.
+        These are tasks, DNS records, timers, servers' slots, warm servers that wait, entries and decisions of the
+        lobby, handovers, open records, and dead letters.
         """
         kept = self.platform.documents.kept
         records = [json.loads(body) for key, (body, _, _) in kept.items() if key.startswith(server.RECORDS)]
@@ -197,7 +199,7 @@ class SimulatedWorld:
         }
 
     def blamed(self) -> int:
-        """Count the servers that Spot took back, and whose record has another cause."""
+        """Count the servers that Spot took back although their record names another cause."""
         kept, found = self.platform.documents.kept, 0
         for task in self.platform.tasks.tasks.values():
             label, attempt = ids.parse_server_name(task.name) or ("", 0)

@@ -1,4 +1,4 @@
-"""The benches give well-formed rows; what they measure is not judged here."""
+"""The benches make well-formed rows, and report goals that are missed. The figures themselves are not judged."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ def test_waiting_counts_from_asking_to_the_page(crowd: scale.ServedCrowd) -> Non
 
 
 def test_a_start_server_with_a_concurrency_of_two_misses_the_goal_of_waiting() -> None:
-    """What waits in the topic, the queue and the function is in the row."""
+    """The row counts the waits in the topic, the queue and the function."""
     few = {**world.WIRES, "start_server": world.WIRES["start_server"]._replace(concurrency=2)}
     with quiet():
         row = scale.waiting([scale.crowd(7, 100, 10.0, wires=few)])
@@ -374,7 +374,7 @@ def test_rows_of_crowds_name_their_assumptions(crowd: scale.ServedCrowd) -> None
 
 
 def goals(file: Path) -> Iterator[tuple[str, set[str]]]:
-    """Where `row` is called in a file, and with what."""
+    """Yield each call of `row` in a file: its place, and the names of its arguments."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in {"row", "table.row"}:
             yield f"{file.name}:{node.lineno}", {str(keyword.arg) for keyword in node.keywords}
@@ -419,7 +419,7 @@ def test_a_goal_that_cannot_be_judged_is_an_error() -> None:
 @pytest.mark.parametrize("of", ["ratio", "value"])
 @pytest.mark.parametrize("goal", ["at_most", "at_least"])
 def test_every_goal_can_be_missed_on_both_sides_of_its_bound(of: Any, goal: str) -> None:
-    """All goals are judged here; what they are given by broken parts is tested above and below."""
+    """Every goal is judged with made-up figures. The tests above and below give it those of broken parts."""
     goals: dict[str, Any] = {goal: 1}
     met = [
         table.row("a", value, "", yardstick=10, judge=of, bound="ours", **goals)["met"] for value in (0.5, 1, 5, 10, 20)
@@ -462,7 +462,7 @@ def test_an_expensive_server_of_environments_misses_its_goals() -> None:
 
 
 def test_bench_installs_all_that_it_measures_with() -> None:
-    """On a fresh clone, too."""
+    """`make bench` installs them on a fresh clone, too."""
     makefile = (study_on_moto.ROOT / "Makefile").read_text(encoding="utf-8")
     (line,) = [line for line in makefile.splitlines() if line.startswith("bench:")]
     assert {"$(VENV)/dev", "$(MINISTACK)/ready"} <= set(line.split())
@@ -567,7 +567,7 @@ def test_a_warm_server_that_is_no_quicker_for_real_misses_its_goal(monkeypatch: 
 
 
 def test_a_sweep_that_its_timeout_cuts_off_misses_its_goal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its time is no more than the timeout then."""
+    """The time of such a sweep is only its timeout."""
     monkeypatch.setitem(world.TIMEOUTS, "sweep", 0.001)
     with quiet():
         found = world.SimulatedWorld(7)
@@ -771,7 +771,7 @@ SEEN_MISSED: dict[str, Any] = {
 
 
 def test_each_goal_has_a_test_that_reports_it_as_missed() -> None:
-    """A new goal needs its test, and its line in the table above."""
+    """A new goal needs a test, and a line in SEEN_MISSED."""
     functions_with_goals = set()
     for file in (study_on_moto.ROOT / "bench").glob("*.py"):
         for node in ast.parse(file.read_text(encoding="utf-8")).body:

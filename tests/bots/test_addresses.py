@@ -1,4 +1,4 @@
-"""Bots go to one installation's own site and servers, whatever a page, a redirect or a server's state tells them."""
+"""Bots open only the site and servers of one installation, wherever a page, a redirect or a server's state leads."""
 
 from __future__ import annotations
 
@@ -106,7 +106,10 @@ def test_a_refused_address_is_named_without_its_token() -> None:
 
 
 class Site:
-    """A site on loopback, over TLS, with responses that a test sets; `dialled` has the addresses that bots connected to."""
+    """A site on loopback, over TLS, with responses that a test sets.
+
+    `dialled`: the addresses to which bots connected.
+    """
 
     def __init__(self, folder: Path) -> None:
         made = authority()
@@ -131,7 +134,7 @@ class Site:
         writer.close()
 
     def walk(self, patience: float = 2) -> list[str]:
-        """Send a bot, and return its errors and troubles."""
+        """Send a bot through the study, and return its errors and troubles."""
 
         async def held() -> list[str]:
             server = await asyncio.start_server(self._serve, "127.0.0.1", 0, ssl=self._own)

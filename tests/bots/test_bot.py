@@ -13,7 +13,7 @@ from hippodrome.config.project_keys import MAX_STEPS
 
 
 def test_a_request_that_is_not_answered_in_time_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`str()` of a TimeoutError is empty."""
+    """The reason is the error's type, since `str()` of a TimeoutError is empty."""
 
     async def late(*_: object, **__: object) -> None:
         raise TimeoutError
@@ -38,7 +38,10 @@ class Walker(Bot):
         return page if self.pages else None
 
 
-@pytest.mark.parametrize(("pages", "errors"), [(MAX_STEPS + 1, []), (MAX_STEPS + 2, ["the study does not end"])])
+@pytest.mark.parametrize(
+    ("pages", "errors"),
+    [(MAX_STEPS + 1, []), (MAX_STEPS + 2, ["the study does not end: after 501 pages there is another one"])],
+)
 def test_a_bot_comes_to_the_end_of_the_longest_study(pages: int, errors: list[str]) -> None:
     bot = Walker("http://127.0.0.1:8000/next?projectId=x", "ada", Random(0))
     bot.pages = pages

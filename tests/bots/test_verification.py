@@ -1,4 +1,4 @@
-"""Bots' data are verified. A study's agent decides what a recording holds, so it can hold anything."""
+"""Bots' data are verified, whatever they hold: a study's agent decides what is in a recording."""
 
 from __future__ import annotations
 

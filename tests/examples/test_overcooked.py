@@ -11,10 +11,10 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 from PIL import Image
 
+from testing import onnx_files
 from trial.pictures.scene import as_scene, images_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "overcooked"
@@ -38,7 +38,7 @@ def cook(load_module: Callable[[str, str], ModuleType]) -> Any:
 
 @pytest.fixture
 def policy() -> Chef:
-    session = onnxruntime.InferenceSession(EXAMPLE / "policies" / "cook.onnx")
+    session = onnx_files.session(EXAMPLE / "policies" / "cook.onnx")
     return lambda _, __, seen: int(session.run(None, {"observation": seen[None]})[0][0].argmax())
 
 

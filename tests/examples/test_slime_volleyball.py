@@ -11,10 +11,10 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 from PIL import Image
 
+from testing import onnx_files
 from trial.pictures.scene import as_scene, images_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "slime-volleyball"
@@ -89,7 +89,7 @@ def test_both_see_the_game_from_their_own_side(volleyball: Any) -> None:
 
 def share_of_points(train: Any, file: str, opponent: Any) -> float:
     """The share of all points that the policy on the right wins, in 200 games at once."""
-    session = onnxruntime.InferenceSession(EXAMPLE / "policies" / file)
+    session = onnx_files.session(EXAMPLE / "policies" / file)
     games, won, lost = train.Games(200, np.random.default_rng(1)), 0, 0
     for _ in range(500):
         chosen = session.run(None, {"observation": games.observations(1)})[0].argmax(1)
@@ -113,7 +113,7 @@ def test_the_policy_is_about_as_strong_as_the_packages_opponent(train: Any) -> N
 
 
 def test_the_left_players_policy_mirrors_the_right_players(volleyball: Any) -> None:
-    left, right = (onnxruntime.InferenceSession(EXAMPLE / "policies" / f"{side}.onnx") for side in ("left", "right"))
+    left, right = (onnx_files.session(EXAMPLE / "policies" / f"{side}.onnx") for side in ("left", "right"))
     seen = np.random.default_rng(1).normal(size=(50, 12)).astype(np.float32)
     mirrored = right.run(None, {"observation": seen})[0][:, volleyball.MIRRORED]
     assert np.allclose(left.run(None, {"observation": seen})[0], mirrored, atol=1e-5)
@@ -122,7 +122,7 @@ def test_the_left_players_policy_mirrors_the_right_players(volleyball: Any) -> N
 @pytest.mark.parametrize(("file", "player"), [("right.onnx", RIGHT), ("left.onnx", LEFT)])
 def test_the_policy_returns_the_ball_in_the_environment(volleyball: Any, file: str, player: str) -> None:
     """It wins a third of the serves to its own half. A player who stands still loses nearly all of them."""
-    session = onnxruntime.InferenceSession(EXAMPLE / "policies" / file)
+    session = onnx_files.session(EXAMPLE / "policies" / file)
     env, returned, served = volleyball.Volleyball(points=1, seconds=20), 0, 0
     for seed in range(24):
         observations, _ = env.reset(seed=seed)

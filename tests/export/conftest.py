@@ -15,11 +15,11 @@ __all__ = ["installed"]
 
 @pytest.fixture
 def place(tmp_path: Path, capsys: Any) -> Place:
-    """A folder with the data of one machine, and another that `data` fills from it."""
+    """Return a folder with the data of one machine, and another folder, which `data` fills from it."""
     return Place(tmp_path, capsys)
 
 
 @pytest.fixture
 def world(installed: Installed) -> Installed:
-    """An installation, with its bucket."""
+    """Return an installation, with its bucket."""
     return installed

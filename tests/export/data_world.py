@@ -96,7 +96,7 @@ def record(
     head: Mapping[str, Any] = MappingProxyType({}),
     **more: Any,
 ) -> bytes:
-    """A recording as the trial writes it, made by the trial's own code."""
+    """Make a recording by the trial's own code, and return its bytes."""
     path = folder / f"{next(_numbers)}.gz"
     made = Recording(path, "unused")
     stamp = {"v": recording.SCHEMA, "session": server(user, attempt), "trial": "t-1"}
@@ -137,7 +137,10 @@ def recording_key(user: str, name: str = "3-episode-0001", attempt: int = 1) -> 
 
 
 def crowd(put: Put, work: Path, people: int = 3, **how: Any) -> list[str]:
-    """A small study. All participants have finished except the last one, who has not played yet."""
+    """Put the data of a small study. All participants have finished except the last, who has not played.
+
+    Return their ids.
+    """
     register(put)
     users = [f"user-{number:04d}" for number in range(people)]
     for number, user in enumerate(users):

@@ -32,7 +32,7 @@ class Place:
         return rows(self.out / f"{name}.csv")
 
     def listed(self) -> dict[str, str]:
-        """The manifest's files, and their hashes."""
+        """Return, by name, the hashes of the manifest's files."""
         return {line["path"]: line["sha256"] for line in json.loads((self.out / "manifest.json").read_text())["files"]}
 
     def done(self, *more: str) -> dict[str, Any]:

@@ -35,18 +35,18 @@ def recording_key(session: str = SID, name: str = "3-episode-0001", attempt: int
 
 
 def session(*members: str, session_id: str = SID, players: int = 2) -> SessionDocument:
-    """The document of a session of these members; an empty id stands for an erased member."""
+    """Make the document of a session with these members; an empty id stands for an erased member."""
     seated = tuple(Member(user, 1, seat) for seat, user in enumerate(members))
     return SessionDocument(session_id, players, seated, 1, TIME)
 
 
 def said(user: str) -> str:
-    """A text that only this participant has sent."""
+    """Return a text that only this participant has sent."""
     return f"words-of-{user.partition('-')[0]}"
 
 
 def round_trip(user: str) -> float:
-    """A round trip that only this participant has, in milliseconds."""
+    """Return a round trip that only this participant has, in milliseconds."""
     return 20.5 + sum(user.encode())
 
 
@@ -60,7 +60,7 @@ def lines(
     head: Mapping[str, Any] | None = None,
     replaced: Collection[int] = (),
 ) -> list[bytes]:
-    """A session's recording, line by line: both have pressed keys, given feedback, left and come back.
+    """Make the lines of a session's recording: both members press keys, give feedback, leave and come back.
 
     In the steps of `replaced` the substitute has played in the place of the right player.
     """
@@ -119,7 +119,7 @@ def lines(
 
 
 def packed(folder: Path, made: Sequence[bytes], *, close: bool = True) -> bytes:
-    """A recording with these lines, written by the trial's own code."""
+    """Write these lines by the trial's own code, and return the bytes of the recording."""
     path = folder / f"session-{next(_numbers)}.gz"
     file = Recording(path, "unused")
     for line in made:
@@ -132,20 +132,20 @@ def packed(folder: Path, made: Sequence[bytes], *, close: bool = True) -> bytes:
 
 
 def join(put: Put, user: str, seat: int, *, session_id: str = SID, score: float = 6.0) -> None:
-    """A member's own documents, with all their answers."""
+    """Put a member's own documents, with all their answers."""
     game = {**GAME, "score": score, "session": session_id, "player": PLAYERS[seat], "outcome": "finished"}
     arrive(put, user, {"1": {"consent": "yes"}, "2": {"age": "30"}, "3": game, "4": {"words": said(user)}})
     put(membership_key(PROJECT.id, user), to_json(Membership(session_id, seat, members=2, waited=2.5 * seat)))
 
 
 def unmatched(put: Put, user: str, code: str = "UNMATCHED7") -> None:
-    """The documents of a participant who was unmatched."""
+    """Put the documents of a participant for whom no partner was found."""
     arrive(put, user, {"1": {"consent": "yes"}, "2": {"age": "40"}, "3": {"outcome": "unmatched"}, "4": {"words": ""}})
     put(membership_key(PROJECT.id, user), to_json(Membership(unmatched=True, completion_code=code)))
 
 
 def pair(put: Put, work: Path, *, members: Sequence[str] = (ANN, BOB), session_id: str = SID, **how: Any) -> None:
-    """A session that is over, with the documents of its members."""
+    """Put a session that is over, with the documents of its members."""
     for seat, user in enumerate(members):
         join(put, user, seat, session_id=session_id, score=(6.0, 3.0)[seat])
     put(session_key(PROJECT.id, session_id), session(*members, session_id=session_id).to_json())
@@ -153,7 +153,7 @@ def pair(put: Put, work: Path, *, members: Sequence[str] = (ANN, BOB), session_i
 
 
 def study(put: Put, work: Path, **how: Any) -> None:
-    """A pair, and a participant who was unmatched."""
+    """Put a pair, and a participant for whom no partner was found."""
     register(put)
     pair(put, work, **how)
     unmatched(put, CY)

@@ -17,7 +17,7 @@ STUDY = Path(__file__).resolve().parents[1] / "earlier" / "study"
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that `data` fills from this study."""
+    """Return the folder that `data` fills from this study."""
     folder = tmp_path_factory.mktemp("earlier") / "out"
     assert main(["data", str(folder), "--project", "tiny", "--from", str(STUDY)]) == Exit.DONE
     return folder

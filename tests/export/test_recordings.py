@@ -233,7 +233,7 @@ def test_other_values_of_a_step_are_in_tables_and_datasets(tmp_path: Path, monke
 
 
 def test_a_dataset_ends_where_the_human_left_the_game(tmp_path: Path, monkeypatch: Any) -> None:
-    """The other players play on, and the later lines have no steps of this human."""
+    """The other players play on, and later lines have no actions of this human."""
     put = into_folder(tmp_path / "data")
     (user,) = crowd(put, tmp_path, 1)
     lines = recording.read(record(tmp_path, user, frames=6, observe=True, head={"players": {
@@ -451,7 +451,7 @@ def test_participants_numbers_are_random_and_stay_the_same_in_later_runs(tmp_pat
 
 
 def test_new_values_of_the_link_convert_recordings_again(tmp_path: Path) -> None:
-    """A recording that was converted before the link's values were known."""
+    """The recording was converted before the link's values were known."""
     put = into_folder(tmp_path / "data")
     (user,) = crowd(put, tmp_path, 1)
     put(recording_key(user), record(tmp_path, user, messages=["secret-value"]))

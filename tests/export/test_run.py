@@ -387,7 +387,7 @@ def test_a_run_interrupted_while_fetching_is_continued(place: Place, monkeypatch
 
 
 def test_a_file_that_was_not_noted_before_a_kill_is_made_again(place: Place) -> None:
-    """The file exists, and the state does not have it, so it is made again."""
+    """The file exists, but the state does not name it, so it is made again."""
     crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Fetcher, "_save", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))

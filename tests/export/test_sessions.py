@@ -249,7 +249,7 @@ def test_participants_with_different_players_have_a_dataset_for_each_player(tmp_
 
 
 def test_an_incomplete_session_is_exported_as_far_as_possible(place: Place) -> None:
-    """A recording that is cut off, and sessions whose document is missing or damaged."""
+    """One recording is cut off, and the documents of some sessions are missing or damaged."""
     study(place.put, place.tmp)
     made = lines()
     place.put(recording_key(attempt=2), packed(place.tmp, made[:9], close=False))

@@ -53,7 +53,7 @@ QUICK = settings(max_examples=examples(60))
 
 
 def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **changes: Any) -> ExportState:
-    """A state as a run leaves it."""
+    """Make a state like one that a run leaves."""
     state = ExportState(None)
     state.begin_run()
     for user, steps in people.items():
@@ -68,7 +68,7 @@ def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **chang
 def written(
     state: ExportState, folder: Path, apart: bool = False, **style: Any
 ) -> tuple[list[dict[str, str]], list[Any]]:
-    """The answers, read from CSV and from Parquet."""
+    """Write the answers, and read them back from CSV and from Parquet."""
     answers = StudyAnswers(state, PROJECT, apart)
     sheet, parquet = table_files.write(folder / "answers", answers.columns, answers.rows(), table_files.Style(**style))
     with sheet.open(encoding="utf-8-sig", newline="") as file:
@@ -77,7 +77,7 @@ def written(
 
 
 def as_sent(typed: Any, sent: str) -> Any:
-    """The text that a form sent for a value in Parquet; a column of numbers holds 5 as 5.0 if another one is 2.5."""
+    """Return the text that a form sent for a value in Parquet, where 5 is 5.0 if another number of the column is 2.5."""
     told = "" if typed is None else str(typed)
     return sent if told == f"{sent}.0" else told
 

@@ -19,7 +19,7 @@ LOCAL = """project:
 
 
 def project_folder(tmp: Path, config: str = LOCAL) -> Path:
-    """A project's folder, beside the one that the command is run in."""
+    """Make a project's folder beside the folder in which the command runs."""
     folder = tmp / "my-study"
     folder.mkdir()
     (folder / "config.yml").write_text(config)

@@ -1,4 +1,4 @@
-"""A session's recording without one of its members has nothing that they sent, and the whole game of the others."""
+"""A session's recording from which a member was removed holds nothing that they sent, and the whole game of the others."""
 
 from __future__ import annotations
 

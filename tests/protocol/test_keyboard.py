@@ -60,7 +60,7 @@ def test_a_combination_is_split_into_its_keys() -> None:
         ("F5", "F5 cannot be a key of the game: browsers have commands of their own for it"),
         ("esc", "Escape cannot be a key of the game: browsers leave the full screen with it"),
         ("ArrowLeft+Ctrl", "Control cannot be a key of the game: browsers take it for their own commands"),
-        ("a+A", "names the same key twice"),
+        ("a+A", "names the same key twice; write it once"),
         ("a+b+c+d+e", "joins 5 keys; 4 at most, since few keyboards report more at once"),
     ],
 )  # fmt: skip

@@ -13,17 +13,20 @@ import pytest
 TESTS = Path(__file__).resolve().parents[1]
 PAGE = TESTS.parent / "docs" / "security.md"
 NAMED = re.compile(r"`([\w/]+\.py)::(\w+)`")
+ITEM = re.compile(r"\* \*(Protection|Accepted|Tests)\*: (.+)")
 
 
-def lines() -> Iterator[list[str]]:
-    """The cells of each line of the tables, but for their heads."""
-    for line in PAGE.read_text(encoding="utf-8").splitlines():
-        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-        if cells and cells[0] != "threat" and set(cells[0]) != {"-"}:
-            yield cells
+def threats() -> Iterator[list[str]]:
+    """Each threat, its protection, what is accepted, and the tests; an empty text for what the page does not say."""
+    for block in PAGE.read_text(encoding="utf-8").split("\n\n"):
+        head, *items = block.strip().splitlines()
+        if found := re.fullmatch(r"\*\*(.+)\*\*", head):
+            said = [match.groups() for item in items if (match := ITEM.fullmatch(item))]
+            assert len(said) == len(items) == len(dict(said)), f"{found[1]}: each part is one line, and stands once"
+            yield [found[1], *(dict(said).get(part, "") for part in ("Protection", "Accepted", "Tests"))]
 
 
-THREATS = list(lines())
+THREATS = list(threats())
 
 
 @cache
@@ -47,6 +50,12 @@ def test_each_threat_has_a_test_that_exists(cells: list[str]) -> None:
     for file, name in named:
         assert (TESTS / file).is_file(), file
         assert name in names_in(file), name
+
+
+def test_each_list_of_tests_belongs_to_a_threat() -> None:
+    assert len(NAMED.findall(PAGE.read_text(encoding="utf-8"))) == sum(
+        len(NAMED.findall(cells[3])) for cells in THREATS
+    )
 
 
 def test_the_known_threats_are_listed() -> None:

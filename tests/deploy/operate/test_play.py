@@ -408,24 +408,31 @@ def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
 # What the documentation promises
 
 
+def claims() -> dict[str, str]:
+    """Each claim of docs/unproven.md, with the line that says how to prove it."""
+    page = (ROOT / "docs/unproven.md").read_text()
+    found = re.findall(r"^\*\*(.+)\*\*\n\* \*Here\*: .+\n\* \*Proof\*: (.+)\n", page, re.MULTILINE)
+    assert len(found) == len(dict(found)) == page.count("* *Proof*:"), "a claim has another form, or stands twice"
+    return dict(found)
+
+
 def arrows() -> dict[str, list[str]]:
-    """The lines of the transcript that each row of docs/unproven.md names, by the row's first column."""
-    rows = [line.split("|") for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|"]
-    return {row[1].strip(): re.findall(r"`(.*?)`", row[-2].partition("→")[2]) for row in rows[2:]}
+    """The lines of the transcript that each claim of docs/unproven.md names."""
+    return {claim: re.findall(r"`(.*?)`", proof.partition("→")[2]) for claim, proof in claims().items()}
 
 
-def test_rows_of_unproven_name_only_lines_of_a_transcript() -> None:
+def test_claims_of_unproven_name_only_lines_of_a_transcript() -> None:
     assert {what: keys for what, keys in arrows().items() if set(keys) - set(LINES)} == {}
 
 
 def test_each_arrow_of_unproven_leads_to_keys_alone() -> None:
-    rows = [line for line in (ROOT / "docs/unproven.md").read_text().splitlines() if line[:1] == "|" and "→" in line]
-    assert rows
-    assert [row for row in rows if not re.search(r"→ `\w+`(, `\w+`)* \|$", row) or row.count("→") > 1] == []
+    proofs = [proof for proof in claims().values() if "→" in proof]
+    assert proofs
+    assert [each for each in proofs if not re.search(r"→ `\w+`(, `\w+`)*$", each) or each.count("→") > 1] == []
 
 
 @pytest.mark.parametrize("key", LINES)
-def test_each_line_stands_in_a_row_of_unproven(key: str) -> None:
+def test_each_line_proves_a_claim_of_unproven(key: str) -> None:
     assert key == "links" or key in {key for keys in arrows().values() for key in keys}
 
 

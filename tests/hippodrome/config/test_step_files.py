@@ -259,7 +259,7 @@ def test_a_folder_is_not_a_page(folder: Path) -> None:
             'must be the name of a file in the steps folder, without folders, not "https://a.example/b"',
         ),
         ("..", 'file names may hold letters (a to z), digits, spaces, dots, dashes and underscores; rename ".."'),
-        ('"a\\0"', "must be the name of a file, or game; without tabs, line ends and invisible characters"),
+        ('"a\\0"', "must be the name of a file, or game; take out its tabs, line ends and invisible characters"),
         ("game.html", "a page cannot be called game.html; write game for the game step, or rename the page"),
         ("[a]", "must be the name of a file, or game, not a list"),
     ],

@@ -72,7 +72,8 @@ def test_a_page_is_a_file_in_the_folder_of_the_project(page: str) -> None:
     ("changes", "why"),
     [
         ({"steps": {}}, "none of its steps has a page"),
-        ({"steps": {"1": "a.html", "3": "b.html"}}, "missing"),
+        ({"steps": {"1": "a.html", "3": "b.html"}}, "it has no step 2, but later ones"),
+        ({"steps": {"2": "b.html"}}, "it has no step 1, but later ones"),
         ({"steps": {"1": "a.html", "2": "game"}}, "last step is the game"),
         ({"steps": {"1": "a\n.html"}}, "page"),
         ({"steps": {"1": ["a"]}}, "page"),
