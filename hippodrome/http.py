@@ -49,7 +49,7 @@ class Request:
     query: tuple[tuple[str, str], ...] | None  # None: malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
-    own_path: bool = True  # whether clients see the same `path`
+    own_path: bool = True  # whether clients see this `path`, too
     binary: bool = True  # the gateway decodes responses in base64; a REST API does so only if it is told to
 
     @classmethod
@@ -71,12 +71,12 @@ class Request:
         )
 
     def query_value(self, name: str) -> str | None:
-        """The value of a query field; None if it is missing or given with two different values."""
+        """Return the value of a query field; None if the field is missing, or given with two different values."""
         values = {value for key, value in self.query or () if key == name}
         return values.pop() if len(values) == 1 else None
 
     def has_query(self, name: str) -> bool:
-        """Whether the query has this field."""
+        """Return whether the query has this field."""
         return any(key == name for key, _ in self.query or ())
 
     @property
@@ -109,15 +109,15 @@ class Request:
         return self.binary and _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def steps_folder(self, project_id: str) -> str:
-        """The address of the project's files, relative to this request's address; it ends with a slash."""
+        """Return the address of the project's files, relative to this request's address; it ends with a slash."""
         return f"{'/' if self.own_path else ''}steps/{project_id}/"
 
     def url(self, **changes: str) -> str:
-        """This request's address, relative to the host, with these query fields set.
+        """Return this request's address, relative to the host, with these query fields set.
 
         The result goes into headers, so the path, which arrives decoded, is encoded again. It never begins with `//`,
-        which would name another host. If `own_path` is False, the result is the query alone, which browsers add to the
-        path that they see.
+        which would name another host. If `self.own_path` is False, the result is the query alone, which browsers add to
+        the path that they see.
         """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
         if not self.own_path:
@@ -187,10 +187,11 @@ class Response:
     headers: Mapping[str, str] = field(default_factory=dict)
 
     def to_event(self, compress: bool = False, *, https: bool = False) -> dict[str, Any]:
-        """The response in API Gateway's format. With `compress` a long text is compressed with gzip.
+        """Return the response in API Gateway's format.
 
-        API Gateway's HTTP APIs compress nothing themselves. With `https` the response gets the header HSTS, which a
-        response over plain HTTP must not have (RFC 6797, section 7.2).
+        With `compress` a long text is compressed with gzip, because API Gateway's HTTP APIs compress nothing
+        themselves. With `https` the response gets the header HSTS, which a response over plain HTTP must not have (RFC
+        6797, section 7.2).
         """
         headers, body = {**_COMMON_HEADERS, **(HSTS if https else {}), **self.headers}, self.body
         if compress and isinstance(body, str) and len(body) > MIN_GZIP_LENGTH:
@@ -205,20 +206,20 @@ class Response:
 
 
 def html(status: int, text: str, headers: Mapping[str, str] | None = None) -> Response:
-    """A response with a page."""
+    """Return a response with a page."""
     return Response(status, text, {"Content-Type": "text/html; charset=utf-8", **(headers or {})})
 
 
 def as_json(status: int, data: Any) -> Response:
-    """A response with JSON, which pages of any origin may read."""
+    """Return a response with JSON, which pages of any origin may read."""
     return Response(status, json.dumps(data), {"Content-Type": "application/json", **CORS})
 
 
 def see_other(url: str) -> Response:
-    """303: the client continues at `url` with a GET."""
+    """Return a response with status 303: the client continues at `url` with a GET."""
     return Response(303, "", {"Location": url})
 
 
 def found(url: str) -> Response:
-    """302: the client repeats its request at `url`."""
+    """Return a response with status 302: the client repeats its request at `url`."""
     return Response(302, "", {"Location": url})

@@ -174,13 +174,16 @@ class Dns(Protocol):
         """
 
     def in_sync(self, change: str) -> bool:
-        """Whether every name server of the zone has this change. Raises `ServiceBusy` if the zone is too busy now."""
+        """Return whether every name server of the zone has this change.
+
+        Raises `ServiceBusy` if the zone is too busy now.
+        """
 
     def list(self) -> Iterator[DnsRecord]:
         """Yield the servers' A records in our zone: those whose first label has the form of a server's name."""
 
     def browser_host(self, record: DnsRecord) -> str:
-        """The host that browsers connect to: the DNS name; the IPv4 address if the platform has no DNS."""
+        """Return the host that browsers connect to: the DNS name; the IPv4 address if the platform has no DNS."""
 
 
 class Timers(Protocol):
@@ -290,7 +293,7 @@ class Platform(Protocol):
     @property
     def bus(self) -> Bus: ...
     def now(self) -> datetime:
-        """The present time, aware, in UTC."""
+        """Return the present time, aware, in UTC."""
 
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         """Call all these functions, possibly at the same time; return their results in order. They must not raise."""

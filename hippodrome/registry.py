@@ -45,7 +45,10 @@ class NotRegistered(Exception):
 
 
 def register(platform: Platform, registration: object) -> Project:
-    """Check a registration (`hippodrome.config`) and write it to the master list. Raises `NotRegistered`."""
+    """Check a registration (`hippodrome.config`) and write it to the master list; return the project as registered.
+
+    Raises `NotRegistered`.
+    """
     return _enter(platform, _parse(registration))
 
 
@@ -201,13 +204,13 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
         registration, remarks = hippo_registration.registration_of(event, earlier)
         remarks += hippo_registration.lower_runtime(registration, settings.max_runtime)
         places = {"bucket": settings.bucket, "region": settings.region, "rootDomain": settings.root_domain}
-        problems = list(hippo_registration.elsewhere(event, places))
+        problems = list(hippo_registration.differing_places(event, places))
         project, duplicates = uploaded_pages.located(platform.documents, _parse(registration))
         if problems or duplicates:
             raise NotRegistered([*problems, *duplicates])
         _enter(platform, project)
     except NotRegistered as error:
-        return {"statusCode": 400, "body": "\n".join([*error.problems, *hippo_registration.renamed(event)])}
+        return {"statusCode": 400, "body": "\n".join([*error.problems, *hippo_registration.differing_folder(event)])}
     logger.info("what works differently from HIPPO Gym", extra={"project": project.id, "remarks": remarks})
     return {"statusCode": 200, "body": "\n".join(remarks)}
 
@@ -215,9 +218,12 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
 def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """Handle one call of the function; return `{"registered": id, "live": …}` or `{"problems": […]}`.
 
-    For `{"links": {"projectId": …, "userIds": […]}}`, return `{"signatures": […]}` of signed links instead, so that
-    researchers need not know the secret. For `{"takeOver": true}`, move the secrets that an earlier version wrote into
-    the master list out of it, and return `{"takenOver": n}`. For a payload of HIPPO's script, see `_handle_hippo`.
+    * `{"project": …}` registers the project.
+    * `{"links": {"projectId": …, "userIds": […]}}` gets `{"signatures": […]}` of signed links instead, so that
+      researchers need not know the secret.
+    * `{"takeOver": true}` moves the secrets that an earlier version wrote into the master list to `_secret.json`, and
+      gets `{"takenOver": n}`.
+    * A payload of HIPPO's script is handled by `_handle_hippo`.
     """
     if hippo_registration.is_payload(event):
         return _handle_hippo(platform, event)

@@ -33,7 +33,7 @@ class Answer:
 
 
 def to_json(answer: Answer) -> bytes:
-    """Return the document. `answered` must be in UTC."""
+    """Return the bytes of the document, JSON. `answered` must be in UTC."""
     document = asdict(answer) | {"answered": time_text(answer.answered)}
     return json.dumps(document).encode()
 

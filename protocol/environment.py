@@ -13,11 +13,11 @@ PROJECT_ID = "PROJECT_ID"
 SERVER = "SERVER"
 """The server's name, under which the recordings lie. For a warm server, its handover has this name."""
 TOKEN = "TOKEN"  # noqa: S105 - a variable's name
-"""A secret. A client that sends it may play."""
+"""A secret. A client that sends it may play on this server."""
 GAME_STEPS = "GAME_STEPS"
 """Keys of the game steps, separated by commas: `3` or `2,4`."""
 STORE = "STORE"
-"""The store of documents: a folder, or the address that signs requests (trial/recordings/presigned.py)."""
+"""Where the server stores documents: a folder, or the address that signs requests (trial/recordings/presigned.py)."""
 
 # The participant. A warm server reads its participant and group in its handover.
 
@@ -25,7 +25,7 @@ USER_ID = "USER_ID"
 GROUP = "GROUP"
 """The participant's group, a whole number; empty in a study without groups. The researcher's agent may read it."""
 WARM_SERVER = "SPARE"
-"""`on` if this is a warm server."""
+"""`on` for a warm server, which has no participant when it starts."""
 SESSION = "SESSION"
 """The session's id, if several participants play on this server. The server has no USER_ID and no GROUP then: it reads
 its members and the group in the session's document."""
@@ -44,9 +44,9 @@ DEADLINE = "DEADLINE"
 PLAIN_ORIGINS = "PLAIN_ORIGINS"
 """The origins of the project's front end, separated by spaces. Their pages need no token (plainClients)."""
 SSL_FULLCHAIN = "SSL_FULLCHAIN"
-"""The key of the certificate in STORE."""
+"""The key of the document in STORE that holds the certificate's chain."""
 SSL_PRIVKEY = "SSL_PRIVKEY"
-"""The key of the certificate's private key in STORE."""
+"""The key of the document in STORE that holds the certificate's private key."""
 TLS = "TLS"
 """`on` (the default) or `off`. With `on`, SSL_FULLCHAIN and SSL_PRIVKEY are required."""
 HOST = "HOST"
@@ -57,31 +57,31 @@ AGENT_DIR = "AGENT_DIR"
 SPOOL = "SPOOL"
 """The folder where recordings are written before they are stored."""
 STOP_SECONDS = "STOP_SECONDS"
-"""From SIGTERM to SIGKILL; 30 by default, and at least 15."""
+"""Seconds from SIGTERM to SIGKILL; 30 by default, and at least 15."""
 
 # For tests and slow agents
 
 IDLE_SECONDS = "IDLE_SECONDS"
-"""Without a participant, after which the server ends; 600 by default."""
+"""Seconds for which the server waits while no participant is connected, before it ends; 600 by default."""
 GRACE_SECONDS = "GRACE_SECONDS"
-"""For which at least the server waits for a participant who was connected before; 60 by default."""
+"""The least seconds for which the server waits for a participant who was connected before; 60 by default."""
 START_SECONDS = "START_SECONDS"
-"""For the start of the agent; 300 by default."""
+"""Seconds in which the agent must start; 300 by default."""
 STEP_SECONDS = "STEP_SECONDS"
-"""For one step of the agent; 30 by default."""
+"""Seconds in which the agent must take a step; 30 by default."""
 HELLO_SECONDS = "HELLO_SECONDS"
-"""From a client's connection to its first message; 10 by default."""
+"""Seconds in which a client that has connected must send its first message; 10 by default."""
 RECORDINGS_FIRST_SECONDS = "RECORDINGS_FIRST_SECONDS"
-"""For which an answer waits until the recordings before it are stored; 120 by default."""
+"""The most seconds for which an answer waits until the recordings before it are stored; 120 by default."""
 LINGER_SECONDS = "LINGER_SECONDS"
-"""From the stored answer to the process's end; 2 by default."""
+"""Seconds from when the answer is stored until the process ends; 2 by default."""
 WARM_SERVER_SECONDS = "SPARE_SECONDS"
-"""Between two times that a warm server looks for its handover; 20 by default."""
+"""Seconds between two looks of a warm server for its handover; 20 by default."""
 
 SECRETS = (TOKEN, CREDENTIAL)
 PARTICIPANT = (USER_ID, GROUP)
 
 
 def group_text(group: int | None) -> str:
-    """Return the value of GROUP."""
+    """Return the value that the variable GROUP has for this group."""
     return "" if group is None else str(group)

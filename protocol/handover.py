@@ -36,13 +36,13 @@ class Handover:
     server: str
 
     def to_json(self) -> bytes:
-        """Return the document."""
+        """Return the bytes of the document, JSON."""
         document = {"userId": self.user_id, "group": self.group, "server": self.server}
         return json.dumps(document, indent=1).encode()
 
 
 def parse(body: bytes) -> Handover:
-    """Read the document. Raises BadHandover and no other exception."""
+    """Read the bytes of a handover document. Raises BadHandover and no other exception."""
     try:
         found = json.loads(body)
     except (ValueError, RecursionError) as error:

@@ -18,7 +18,10 @@ _NAME = values.text("what participants read", LONGEST_NAME)
 
 
 def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[SectionProblem]]:
-    """Check `keys`: `{key: action}`, or such a map for each player."""
+    """Check `keys`: a map `{key: action}`, or such a map for each player.
+
+    Returns the valid entries, and the problems.
+    """
     if not value or not all(isinstance(each, dict) for each in value.values()):
         return _one_players_keys(value, path)
     read = {str(player): _one_players_keys(each, (*path, player)) for player, each in value.items()}
@@ -46,12 +49,18 @@ def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str]
 
 
 def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
-    """Check `labels`, the texts of buttons: `{action: text}`."""
+    """Check `labels`, the texts of buttons: `{action: text}`.
+
+    Returns the valid entries, and the problems.
+    """
     return _texts(value, path, _action, _LABEL)
 
 
 def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
-    """Check `playerNames`, the players' names for participants: `{player: text}`."""
+    """Check `playerNames`, the players' names for participants: `{player: text}`.
+
+    Returns the valid entries, and the problems.
+    """
     return _texts(value, path, str, _NAME)
 
 

@@ -42,8 +42,10 @@ _CODE = re.compile(r"(?:Key([A-Z])|(?:Digit|Numpad)([0-9]))")  # KeyboardEvent.c
 
 
 def key_name(text: str) -> str:
-    """Return the key's `KeyboardEvent.key`, a letter always small, and " " for `Space`. Raises ValueError with what to
-    write."""
+    """Return the name of the key as in `KeyboardEvent.key`: a letter always small, and " " for `Space`.
+
+    Raises ValueError with what to write.
+    """
     if text in (_SPACE, "Space"):
         return _SPACE
     if len(text) == 1 and text.isprintable():
@@ -71,7 +73,10 @@ def _meant(text: str) -> str | None:
 
 
 def parts(combined: str) -> tuple[str, ...]:
-    """Return the keys that are joined by `+`, as written. A `+` alone, or a second one at the end, is the key `+`."""
+    """Return the keys that are joined by `+`, as written.
+
+    A `+` that stands alone, or a second one at the end, is the key `+` itself.
+    """
     if combined == "+":
         return ("+",)
     if combined.endswith("++"):
@@ -83,7 +88,7 @@ def combination(text: str) -> str:
     """Return the keys in a text, each as by `key_name`, joined by `+`. Raises ValueError with what to write."""
     keys = [key_name(part) for part in parts(text if text == _SPACE else text.strip() or _SPACE)]
     if len(set(keys)) < len(keys):
-        raise ValueError("names the same key twice")
+        raise ValueError("names the same key twice; write it once")
     if len(keys) > MAX_TOGETHER:
         raise ValueError(f"joins {len(keys)} keys; {MAX_TOGETHER} at most, since few keyboards report more at once")
     return "+".join(keys)

@@ -19,76 +19,78 @@ SERVER_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
 
 
 def participant_folder(project_id: str, user_id: str) -> str:
-    """The folder of all documents of one participant."""
+    """Return the folder of all documents of one participant."""
     return f"{project_id}/users/{user_id}/"
 
 
 def answer_key(project_id: str, user_id: str, step: str) -> str:
-    """The key of the answer to one step."""
+    """Return the key of the answer to one step."""
     return f"{participant_folder(project_id, user_id)}answers/{step}.json"
 
 
 def recordings_folder(project_id: str, user_id: str) -> str:
-    """The folder of a participant's recordings: each server has a folder of its own name in it."""
+    """Return the folder of a participant's recordings: each server has a folder of its own name in it."""
     return f"{participant_folder(project_id, user_id)}trials/"
 
 
 def membership_key(project_id: str, user_id: str) -> str:
-    """The key of the document that says in which session a participant plays (`project.players`)."""
+    """Return the key of the document that says in which session a participant plays (`project.players`)."""
     return f"{participant_folder(project_id, user_id)}session.json"
 
 
 def sessions_folder(project_id: str) -> str:
-    """The folder of a project's sessions."""
+    """Return the folder of a project's sessions."""
     return f"{project_id}/sessions/"
 
 
 def session_folder(project_id: str, session_id: str) -> str:
-    """The folder of the documents of one session."""
+    """Return the folder of the documents of one session."""
     return f"{sessions_folder(project_id)}{session_id}/"
 
 
 def session_key(project_id: str, session_id: str) -> str:
-    """The key of a session's document (`protocol/session.py`)."""
+    """Return the key of a session's document (`protocol/session.py`)."""
     return f"{session_folder(project_id, session_id)}session.json"
 
 
 def session_recordings_folder(project_id: str, session_id: str) -> str:
-    """The folder of a session's recordings: each server has a folder of its own name in it."""
+    """Return the folder of a session's recordings: each server has a folder of its own name in it."""
     return f"{session_folder(project_id, session_id)}trials/"
 
 
 def questions_folder(project_id: str) -> str:
-    """The folder of a project's questions to its function `match`. S3 keeps their older versions for a day."""
+    """Return the folder of a project's questions to its function `match`. S3 keeps their older versions for a day."""
     return f"{QUESTIONS}{project_id}/"
 
 
 def waiting_key(project_id: str) -> str:
-    """The key of the document with the participants who wait: the question to the function `match`."""
+    """Return the key of the document with the participants who wait: the question to the function `match`."""
     return f"{questions_folder(project_id)}waiting.json"
 
 
 def groups_folder(project_id: str) -> str:
-    """The folder of the answers of the function `match`."""
+    """Return the folder of the answers of the function `match`."""
     return f"{project_id}/lobby/groups/"
 
 
 def groups_key(project_id: str, question: str) -> str:
-    """The key of the answer to the question with this id: the groups that the function `match` has chosen."""
+    """Return the key of the answer to the question with this id: the groups that the function `match` has chosen."""
     return f"{groups_folder(project_id)}{question}.json"
 
 
 def handovers_folder(project_id: str) -> str:
-    """The folder of the handovers of a project's warm servers."""
+    """Return the folder of the handovers of a project's warm servers."""
     return f"{project_id}/spares/"
 
 
 def handover_key(project_id: str, server_name: str) -> str:
-    """The key of the handover of the warm server with this name."""
+    """Return the key of the handover of the warm server with this name."""
     return f"{handovers_folder(project_id)}{server_name}.json"
 
 
 def with_number(key: str, number: int) -> str:
-    """The key of the recording with this number among those that would have the same key: `…-0001.jsonl.gz` for 1,
-    `…-0001-2.jsonl.gz` for 2."""
+    """Return the key with a number before its suffix, for a recording whose own key is taken.
+
+    `…-0001.jsonl.gz` becomes `…-0001-2.jsonl.gz` for 2; for 1 it stays.
+    """
     return key if number == 1 else f"{key.removesuffix('.jsonl.gz')}-{number}.jsonl.gz"

@@ -13,9 +13,9 @@ from protocol.values import show
 
 HUMAN = "human"
 GYM_PLAYER = "gym://"
-"""The prefix of the name of a program that is connected to the trial server's /gym."""
+"""The prefix of a player that a program plays, which is connected to the trial server's /gym: `gym://partner`."""
 AGENT_PLAYER = "agent:"
-"""The prefix of the name of a class of agent.py."""
+"""The prefix of a player that a class of agent.py plays: `agent:Partner`."""
 SAMPLE = "sample:"
 """The prefix of a policy's file whose actions are drawn by the softmax of its output. Without it, the policy takes the
 action with the highest output."""
@@ -34,7 +34,7 @@ _PROGRAM = re.compile(r"[A-Za-z0-9_.-]+")
 
 
 def by_group(value: Mapping[Any, Any]) -> bool:
-    """Whether `players` has a map for each group: all keys are whole numbers, and all values are maps."""
+    """Return whether `players` has a map for each group: all keys are whole numbers, and all values are maps."""
     return (
         bool(value)
         and all(_GROUP.fullmatch(str(key)) for key in value)
@@ -43,8 +43,10 @@ def by_group(value: Mapping[Any, Any]) -> bool:
 
 
 def players(value: object) -> dict[str, Any]:
-    """Check `players` and return what plays each player, or such a map for each group. Raises ValueError with what to
-    write instead."""
+    """Check `players` and return what plays each player, or such a map for each group.
+
+    Raises ValueError with what to write instead.
+    """
     if not isinstance(value, dict):
         raise ValueError(f'must be a map: indented lines such as "player_0: human" below it, not {show(value)}')
     if not by_group(value):
@@ -65,8 +67,10 @@ def _players(value: dict[Any, Any], where: str) -> dict[str, str]:
 
 
 def policy(value: object) -> str:
-    """Check `substitute` and return the policy that plays in an empty place. Raises ValueError with what to write
-    instead."""
+    """Check `substitute` and return the policy that plays in an empty place.
+
+    Raises ValueError with what to write instead.
+    """
     plays = _plays(value, "")
     if plays == HUMAN or plays.startswith(GYM_PLAYER):
         raise ValueError(f"must be a policy: random, idle, agent:Class or a file, not {show(plays)}")
@@ -108,8 +112,10 @@ def _checked(check: values.Check, value: object, where: str) -> Any:
 
 
 def idle_action(value: object) -> str | dict[str, str]:
-    """Check `idleAction` and return the name of the action that is taken without a key, or one for each player. Raises
-    ValueError with what to write instead."""
+    """Check `idleAction` and return the name of the action that is taken without a key, or one for each player.
+
+    Raises ValueError with what to write instead.
+    """
     if isinstance(value, dict):
         if len(value) > MAX_PLAYERS:
             raise ValueError(f"must have at most {MAX_PLAYERS} players, not {len(value)}")

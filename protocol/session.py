@@ -23,7 +23,7 @@ from protocol.keys import NAME, participant_folder, session_folder
 
 SCHEMA = 1
 MAX_PLAYERS = 16
-"""Participants of one session."""
+"""The most participants of one session."""
 SESSION_ID = re.compile(r"s\.[0-9a-f]{20}")
 """The id of a session. No participant's id has a dot (`protocol.keys.NAME`)."""
 
@@ -46,7 +46,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class SessionDocument:
-    """A session's document. `players` is the number of seats; `formed` is the time (`time_text`)."""
+    """A session's document. `players` is the number of seats; `formed` is when the session was formed (`time_text`)."""
 
     id: str
     players: int
@@ -64,7 +64,7 @@ class SessionDocument:
         return [member.user_id for member in self.members if member.user_id]
 
     def to_json(self) -> bytes:
-        """Return the document."""
+        """Return the bytes of the document, JSON."""
         members = [{"userId": each.user_id, "group": each.group, "seat": each.seat} for each in self.members]
         document = {"schema": SCHEMA, "id": self.id, "players": self.players, "group": self.group}
         return json.dumps({**document, "formed": self.formed, "members": members}, indent=1).encode()
@@ -91,7 +91,7 @@ def member_token(token: str, user_id: str) -> str:
 
 
 def parse(body: bytes) -> SessionDocument:
-    """Read the document. Raises BadSession and no other exception."""
+    """Read the bytes of a session's document. Raises BadSession and no other exception."""
     try:
         found = json.loads(body)
     except (ValueError, RecursionError) as error:

@@ -280,7 +280,10 @@ class TrialSection:
         return dict(self.key_maps()).get((player,) if self.keys_differ else (), {})
 
     def labels_of(self, player: str) -> Mapping[str, str]:
-        """Return the texts of a player's buttons by action, without actions that only other players have keys for."""
+        """Return the texts of a player's buttons, by action.
+
+        Actions that only other players have keys for are left out.
+        """
         own = set(self.keys_of(player).values())
         others = {action for _, keys in self.key_maps() for action in keys.values()} - own
         return {action: text for action, text in self.labels.items() if action not in others}
@@ -291,27 +294,32 @@ class TrialSection:
         return any(isinstance(each, dict) for each in self.keys.values())
 
     def key_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
-        """Yield the map in `keys` for all players, or the map for each player, after its path below `keys`."""
+        """Yield `keys`, or the map in it for each player, after its path below `keys`."""
         if self.keys_differ:
             yield from (((player,), each) for player, each in self.keys.items())
         else:
             yield (), self.keys
 
     def player_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
-        """Yield the map in `players` for all groups, or the map for each group, after its path below `players`."""
+        """Yield `players`, or the map in it for each group, after its path below `players`."""
         if player_checks.by_group(self.players):
             yield from (((group,), each) for group, each in self.players.items())
         else:
             yield (), self.players
 
     def humans(self) -> Iterator[tuple[Keys, list[str]]]:
-        """Yield the players that participants play, for all groups or for each group, after the path of the map."""
+        """Yield the players that participants play, after the path of their map below `players`.
+
+        There is one map for all groups, or a map for each group.
+        """
         for path, players in self.player_maps():
             yield path, [name for name, plays in players.items() if plays == player_checks.HUMAN]
 
     def players_of(self, group: int | None) -> dict[str, str]:
-        """Return what plays each player in this group; {} if the section does not say. For None it is the first
-        group."""
+        """Return what plays each player in this group; {} if the section does not say.
+
+        If there is a map for each group, None stands for the first group.
+        """
         if player_checks.by_group(self.players):
             return dict(self.players.get(str(self.groups()[0] if group is None else group), {}))
         return dict(self.players)

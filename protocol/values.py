@@ -92,7 +92,7 @@ def as_text(value: object, expected: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise ValueError(f"must be {expected}, not {show(value)}")
     if _CONTROL.search(value.strip()):
-        raise ValueError(f"must be {expected}; without tabs, line ends and invisible characters")
+        raise ValueError(f"must be {expected}; take out its tabs, line ends and invisible characters")
     return value.strip()
 
 
@@ -128,7 +128,10 @@ def step_file(text: str) -> str:
 
 
 def number_in(value: object) -> int | float | None:
-    """Return the finite number in a YAML or JSON number, or in a text such as "30"; None for any other value."""
+    """Return the number in a YAML or JSON number, or in a text such as "30".
+
+    The result is None for any other value, infinity and NaN included.
+    """
     if isinstance(value, Plain):
         value = value.value
     if isinstance(value, str) and _WHOLE.fullmatch(value.strip()):
@@ -218,7 +221,10 @@ def section(example: str) -> Check:
 
 
 def options(value: object) -> dict[str, object]:
-    """Return a map as JSON. Raises ValueError if it holds anything else, is nested too deep, or is too long."""
+    """Return a map of options as JSON values.
+
+    Raises ValueError if it holds anything else, is nested too deep, or is too long.
+    """
     if not isinstance(value, dict):
         raise ValueError(f'must be a map: indented lines such as "difficulty: 3" below it, not {show(value)}')
     found = _json_map(value, _OPTIONS_DEPTH)

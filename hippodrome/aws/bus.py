@@ -24,7 +24,10 @@ class SnsBus:
         self._sns().publish(TopicArn=self._need(TOPICS[topic]), Message=json.dumps(dict(message)))
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        """One SendMessage. Raises ValueError for a delay outside SQS's limits, 0 to `MAX_DELAY` seconds."""
+        """Send the message to the queue of `task_changed`, which gets it after `seconds`. AWS calls: one SendMessage.
+
+        Raises ValueError for a delay outside SQS's limits, 0 to `MAX_DELAY` seconds.
+        """
         if not 0 <= seconds <= MAX_DELAY:
             raise ValueError(f"a message can be delayed by 0 to {MAX_DELAY} seconds, not {seconds}")
         self._sqs().send_message(

@@ -35,7 +35,7 @@ TTL = 60  # seconds. A record written with another TTL could not be deleted any 
 BATCH = 400  # records in a batch
 
 _Changes = list[dict[str, Any]]
-_Refused = list[str]  # names
+_Refused = list[str]  # the names of records that Route 53 refuses
 
 _REFUSALS = ("InvalidChangeBatch", "InvalidInput")
 _NAMED = re.compile(r"name='([^']*)'")
@@ -54,10 +54,11 @@ class Route53Dns:
         self._host = host
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
-        """One ChangeResourceRecordSets per 400 records. A record that is both added and removed is added.
+        """Make these changes of the zone, and return an id for `in_sync`; "" if nothing had to change.
 
-        If a record to remove does not exist, or has another value, the batch is sent again without it. A refused
-        addition is left out as well, and `RefusedDnsRecords` names it. Returns "" if nothing was left to change.
+        A record that is both added and removed is added. If a record to remove does not exist, or has another value,
+        the batch is sent again without it. A refused addition is left out as well; all other changes are made, and then
+        this raises `RefusedDnsRecords`, which names it. AWS calls: one ChangeResourceRecordSets for each 400 records.
         """
         added = {record.name: record for record in add}
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
@@ -71,7 +72,10 @@ class Route53Dns:
         return change
 
     def in_sync(self, change: str) -> bool:
-        """One GetChange for each id in `change`; none for "", when nothing had to change."""
+        """Return whether all name servers have this change; True for "". Raises `ServiceBusy`.
+
+        AWS calls: one GetChange for each of the ids in `change`.
+        """
         try:
             return all(
                 self._client().get_change(Id=part)["ChangeInfo"]["Status"] == "INSYNC"
@@ -84,10 +88,10 @@ class Route53Dns:
             raise
 
     def list(self) -> Iterator[DnsRecord]:
-        """Yield the A records that `change` may have created: of its form, and below the domain of servers' names.
+        """Yield the A records of servers: those that have the form of records which `change` creates.
 
-        Includes records directly below `ROOT_DOMAIN`, where earlier versions created them. One request for each 300
-        records of the zone.
+        Records directly below `ROOT_DOMAIN` are included: earlier versions created them there. AWS calls: one for each
+        300 records of the zone.
         """
         domain = self._need("ROOT_DOMAIN").strip(".").lower()
         parents = {domain, f"{self._host}.{domain}"}

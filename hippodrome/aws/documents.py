@@ -47,7 +47,7 @@ CONTENT_TYPES = {
 
 
 def content_type(key: str) -> str:
-    """The Content-Type of a document, from the suffix of its key; `application/octet-stream` for other suffixes."""
+    """Return the Content-Type of a document by its key's suffix; `application/octet-stream` for other suffixes."""
     return CONTENT_TYPES.get(key.rpartition("/")[2].rpartition(".")[2].lower(), "application/octet-stream")
 
 
@@ -63,7 +63,9 @@ class S3Documents:
         self.bucket = bucket
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        """One GetObject. Return the document; None if it is missing; `known` itself if it has not changed (304)."""
+        """Return the document; None if it is missing; `known` itself if it has not changed (304). AWS calls: one
+        GetObject.
+        """
         condition = {"IfNoneMatch": known.etag} if known else {}
         try:
             found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
@@ -85,7 +87,10 @@ class S3Documents:
         self._put(key, body, {})
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """One ListObjectsV2 for each 1,000 keys, sent when the caller has taken the keys before."""
+        """Yield an entry for each key with this prefix, in the order of the keys.
+
+        AWS calls: one ListObjectsV2 for each 1,000 keys, sent when the caller has taken the keys before.
+        """
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self.bucket, Prefix=prefix)
         for page in pages:
             for line in page.get("Contents", ()):

@@ -6,15 +6,15 @@ from botocore.exceptions import ClientError
 
 
 def code(error: ClientError) -> str:
-    """AWS's error code, such as `NoSuchKey`."""
+    """Return AWS's error code, such as `NoSuchKey`."""
     return str(error.response.get("Error", {}).get("Code", ""))
 
 
 def message(error: ClientError) -> str:
-    """AWS's error message."""
+    """Return AWS's error message."""
     return str(error.response.get("Error", {}).get("Message", ""))
 
 
 def status(error: ClientError) -> int:
-    """The HTTP status; 0 if there was none."""
+    """Return the HTTP status of AWS's response; 0 if there was none."""
     return int(error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0))

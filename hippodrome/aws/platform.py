@@ -61,34 +61,43 @@ class AwsPlatform:
 
     @cached_property
     def documents(self) -> S3Documents:
-        """The documents on S3. Needs `BUCKET`."""
+        """The documents on S3. The variable `BUCKET` must be set."""
         from hippodrome.aws.documents import S3Documents
 
         return S3Documents(lambda: self._client("s3"), self._needs("documents")("BUCKET"))
 
     @cached_property
     def signer(self) -> S3Signer:
-        """The signer of `sign_requests`. It is no port: on one machine nothing is signed. Needs `BUCKET`."""
+        """The signer of `sign_requests`. The variable `BUCKET` must be set.
+
+        It is no port: on one machine nothing is signed.
+        """
         from hippodrome.aws.signer import S3Signer
 
         def credentials() -> Any:
             found = self._session.get_credentials()
             if found is None:
-                raise RuntimeError("there are no credentials to sign with")
+                raise RuntimeError("there are no AWS credentials to sign requests with; the function needs a role")
             return found.get_frozen_credentials()
 
         return S3Signer(lambda: self._client("s3"), credentials, self._needs("signer")("BUCKET"))
 
     @cached_property
     def tasks(self) -> EcsTasks:
-        """The servers on ECS. Needs `CLUSTER` to list tasks; `SUBNET`, `SECURITY_GROUP` and `SIGN_URL` to run them."""
+        """The servers on ECS.
+
+        The variable `CLUSTER` must be set to list tasks; `SUBNET`, `SECURITY_GROUP` and `SIGN_URL` to run them.
+        """
         from hippodrome.aws.tasks import EcsTasks
 
         return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))
 
     @cached_property
     def dns(self) -> Route53Dns:
-        """The DNS records. Needs `HOSTED_ZONE_ID`; to list them, `ROOT_DOMAIN` too. `browser_host` needs none."""
+        """The DNS records on Route 53.
+
+        The variable `HOSTED_ZONE_ID` must be set to change or list records; to list them, `ROOT_DOMAIN`, too.
+        """
         from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
@@ -96,14 +105,21 @@ class AwsPlatform:
 
     @cached_property
     def timers(self) -> SchedulerTimers:
-        """The timers. Needs `SCHEDULE_GROUP`; to set one, `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN`, too."""
+        """The timers on EventBridge Scheduler.
+
+        The variable `SCHEDULE_GROUP` must be set; `SCHEDULE_ROLE_ARN` and `STOP_SERVER_TOPIC_ARN` too to set a timer.
+        """
         from hippodrome.aws.timers import SchedulerTimers
 
         return SchedulerTimers(lambda: self._client("scheduler"), self._needs("timers"), self.now)
 
     @cached_property
     def bus(self) -> SnsBus:
-        """The messages. Needs the ARN of the topic to publish to; `TASK_QUEUE_URL` for `send_delayed`."""
+        """The messages on SNS and SQS.
+
+        To publish to a topic, the variable with its ARN must be set (`bus.TOPICS`); for `send_delayed`,
+        `TASK_QUEUE_URL`.
+        """
         from hippodrome.aws.bus import SnsBus
 
         return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))

@@ -67,7 +67,10 @@ class EcsTasks:
         self._need = need
 
     def run(self, request: TaskRequest) -> str:
-        """One RunTask. Adds `STORE`, `HOST` and `PORT` to the request's environment."""
+        """Start the task with one RunTask, and return its ARN.
+
+        The server's environment also gets `STORE`, `HOST` and `PORT`. Raises `NoCapacity` or `Refused`.
+        """
         overrides = self._overrides(request)
         try:
             answer = self._ecs().run_task(
@@ -109,9 +112,11 @@ class EcsTasks:
                 raise
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        """One DescribeNetworkInterfaces. If some interfaces do not exist, another call without their ids.
+        """Return the public addresses of these network interfaces, by their ids.
 
-        A filter would accept missing ids, but with a filter EC2 pages through all interfaces of the account.
+        Interfaces that do not exist or have no address are left out. AWS calls: one DescribeNetworkInterfaces; if some
+        interfaces do not exist, another one without their ids. (A filter would accept missing ids, but with a filter
+        EC2 pages through all interfaces of the account.)
         """
         wanted = sorted(set(interfaces))
         while wanted:
@@ -131,7 +136,10 @@ class EcsTasks:
         return {}
 
     def find(self, name: str, cluster: str) -> str | None:
-        """One ListTasks. Like all listings of ECS, it may miss a task that was run a moment ago."""
+        """Return the ARN of the living task of this name; None if there is none. AWS calls: one ListTasks.
+
+        Like all listings of ECS, it may miss a task that was run a moment ago.
+        """
         try:
             found = self._ecs().list_tasks(cluster=cluster, startedBy=name)["taskArns"]
         except ClientError as error:
@@ -149,7 +157,10 @@ class EcsTasks:
         self._ecs().create_cluster(clusterName=name, capacityProviders=PROVIDERS, settings=NO_CONTAINER_INSIGHTS)
 
     def delete_cluster(self, name: str) -> None:
-        """One DeleteCluster. Raises ClusterContainsTasksException or UpdateInProgressException while a task ends."""
+        """Delete a participant's own cluster. AWS calls: one DeleteCluster.
+
+        Raises ClusterContainsTasksException or UpdateInProgressException as long as a task is ending in it.
+        """
         try:
             self._ecs().delete_cluster(cluster=name)
         except ClientError as error:
@@ -157,7 +168,9 @@ class EcsTasks:
                 raise
 
     def clusters(self) -> Iterator[str]:
-        """Yield the clusters of the account whose names are names of servers."""
+        """Yield the names of participants' own clusters: those clusters of the account whose names are names of
+        servers.
+        """
         for page in self._ecs().get_paginator("list_clusters").paginate():
             for arn in page["clusterArns"]:
                 name = str(arn).rpartition("/")[2]
@@ -189,16 +202,21 @@ class EcsTasks:
         return overrides
 
     def draining(self, *clusters: str) -> Iterator[RunningTask]:
-        """Yield the servers' tasks in these clusters that were told to stop and have not ended: they may store data."""
+        """Yield the servers' tasks in these clusters that were told to stop and have not ended. They may still store
+        data.
+        """
         for cluster in clusters:
             yield from self._list(cluster, "STOPPED")
 
     def count(self) -> int:
-        """How many tasks live in our clusters. ListTasks alone: DescribeTasks would also return the tasks' secrets."""
+        """Return how many tasks live in the installation's cluster and in participants' own clusters.
+
+        It calls ListTasks alone: DescribeTasks would also return the tasks' secrets.
+        """
         return sum(len(self.arns(cluster)) for cluster in [self._need("CLUSTER"), *self.clusters()])
 
     def arns(self, cluster: str) -> Sequence[str]:
-        """The ARNs of all living tasks in a cluster, servers or not; none if the cluster does not exist."""
+        """Return the ARNs of all living tasks in a cluster, servers or not; none if the cluster does not exist."""
         return [arn for page in self._pages(cluster, "RUNNING") for arn in page]
 
     def _list(self, cluster: str, desired: str = "RUNNING") -> Iterator[RunningTask]:
@@ -220,7 +238,11 @@ class EcsTasks:
 
 
 def client_token(request: TaskRequest) -> str:
-    """The clientToken, 64 hex digits, the same for one server and kind: a repeated RunTask returns the first task."""
+    """Return the `clientToken` of a RunTask call: 64 hex digits.
+
+    It is the same whenever this server is requested on the same kind of capacity, so a repeated RunTask returns the
+    first task.
+    """
     kind = "FARGATE_SPOT" if request.spot else "FARGATE"
     return hashlib.sha256(f"{request.name}\0{kind}\0{request.nonce}".encode()).hexdigest()
 

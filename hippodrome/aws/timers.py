@@ -31,7 +31,10 @@ class SchedulerTimers:
         self._now = now
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """One CreateSchedule; an UpdateSchedule too if the name exists. Raises ValueError if `at` has no time zone."""
+        """Set the timer, or replace the one of the same name. Raises ValueError if `at` has no time zone.
+
+        AWS calls: one CreateSchedule; if the name exists, an UpdateSchedule too.
+        """
         if at.tzinfo is None:
             raise ValueError("a timer's time needs a time zone")
         schedule = self._schedule(name, max(at, self._now() + MIN_DELAY), message)
@@ -59,7 +62,7 @@ class SchedulerTimers:
                 raise
 
     def list(self) -> Iterator[str]:
-        """One ListSchedules for each 100 timers."""
+        """Yield the names of all timers that have not fired. AWS calls: one ListSchedules for each 100 timers."""
         pages = self._client().get_paginator("list_schedules").paginate(GroupName=self._need("SCHEDULE_GROUP"))
         for page in pages:
             for schedule in page["Schedules"]:

@@ -68,13 +68,13 @@ class OrderRequest:
 
 
 def new_account_key() -> dict[str, Any]:
-    """A new account key (P-256), as a JWK."""
+    """Return a new account key (P-256), as a JWK."""
     jwk: dict[str, Any] = JWKEC(key=ec.generate_private_key(ec.SECP256R1())).to_json()
     return jwk
 
 
 def txt_name(domain: str) -> str:
-    """The name of the TXT record that proves `domain` and `*.domain`."""
+    """Return the name of the TXT record that proves `domain` and `*.domain`."""
     return f"{acme_challenges.DNS01.LABEL}.{domain.removeprefix('*.')}"
 
 
@@ -118,7 +118,10 @@ def order(
 
 
 def read_stored(privkey: bytes) -> StoredCertificate | None:
-    """The certificate in `privkey.pem`; None if we did not order it. See `read_or_expired` for a damaged one."""
+    """Return the certificate in `privkey.pem`; None if Hippodrome did not order it.
+
+    If it cannot be read, return what `read_or_expired` returns.
+    """
     origin, _, rest = privkey.partition(b"\n")
     directory = origin.decode(errors="replace").strip()
     if not directory.startswith(_ORIGIN):
@@ -127,7 +130,10 @@ def read_stored(privkey: bytes) -> StoredCertificate | None:
 
 
 def read_or_expired(chain: bytes, directory: str = "") -> StoredCertificate:
-    """The first certificate of the chain; if it cannot be read, one without names that expired long ago."""
+    """Return the names and dates of the first certificate of the chain.
+
+    If it cannot be read, return a certificate without names that expired long ago, so that a new one is ordered.
+    """
     try:
         return read_chain(chain, directory)
     except OrderFailed:
@@ -135,12 +141,12 @@ def read_or_expired(chain: bytes, directory: str = "") -> StoredCertificate:
 
 
 def chain_of(privkey: bytes) -> bytes:
-    """The chain of certificates (PEM) in `privkey.pem`."""
+    """Return the chain of certificates (PEM) in `privkey.pem`."""
     return privkey[privkey.index(b"-----BEGIN CERTIFICATE") :]
 
 
 def read_chain(pem: bytes, directory: str = "") -> StoredCertificate:
-    """Read the first certificate in this PEM. Raises OrderFailed (WRONG) if there is none."""
+    """Return the names and dates of the first certificate in this PEM. Raises OrderFailed (WRONG) if there is none."""
     try:
         first = x509.load_pem_x509_certificate(pem)
         names = first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -324,7 +330,7 @@ def _text(error: messages.Error) -> str:
 
 
 def _parse_retry_after(header: str) -> datetime | None:
-    """The time that a Retry-After header means (seconds, or a date); None if it is neither."""
+    """The time in a Retry-After header (seconds, or a date), at most `MAX_WAIT` from now; None if it is neither."""
     now = datetime.now(UTC)
     if header.strip().isdecimal():
         return now + min(timedelta(seconds=int(header.strip()[:9])), MAX_WAIT)

@@ -76,7 +76,7 @@ class RenewalOutcome:
 class Renewal:
     """Renews the certificate at one location.
 
-    Calls `tell` at each stage of an order, and `note` with a text and each error that does not end the run.
+    Each stage of an order is passed to `tell`. An error that does not end the run is passed to `note`, with a text.
     """
 
     def __init__(
@@ -102,9 +102,10 @@ class Renewal:
         return self._state()[0], self._stored()[0]
 
     def last_directory(self) -> str:
-        """The ACME directory of the present or last certificate; "" if none was ever ordered.
+        """Return the ACME directory that issued the present certificate, or else the last one.
 
-        If this location never had a certificate, the directory of the one at `FORMER`.
+        The result is "" if no certificate was ever ordered, or if the administrator put the present one there. For a
+        location that never had a certificate, it is the directory of the certificate at `FORMER`.
         """
         state, stored = self.read()
         found = stored.directory if stored else state.directory
@@ -113,7 +114,7 @@ class Renewal:
         return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).last_directory()
 
     def last_roots(self, directory: str) -> str:
-        """The root certificates (PEM) last trusted at this directory's HTTPS address; "" for the public ones."""
+        """Return the root certificates (PEM) last trusted at this directory's HTTPS address; "" for the public ones."""
         state = self.read()[0]
         if not state.directory and self._location != FORMER:
             state = Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).read()[0]
@@ -125,7 +126,10 @@ class Renewal:
         return self._decide(state, stored, wanted)
 
     def obtain(self, wanted: RenewalRequest) -> RenewalOutcome:
-        """Order the certificate if it is due. If this raises OrderFailed or a port's error, the present one stays."""
+        """Order the certificate if it is due, and store it.
+
+        Raises OrderFailed, or an error of the documents or of DNS; then the present certificate stays.
+        """
         token = secrets.token_hex(8)
         decision, before, stored = self._decide_and_claim(wanted, token)
         if decision.verdict is not Verdict.ORDER:
@@ -220,11 +224,11 @@ class Renewal:
     # ---- the order
 
     def _order(self, wanted: RenewalRequest, token: str) -> Issued:
-        from hippodrome.certificates import order  # noqa: PLC0415 - its import is slow, see there
+        from hippodrome.certificates import order  # noqa: PLC0415 - its import is slow
 
         def publish(values: list[str], seconds: float) -> None:
             if not self._change(lambda state: rules.with_challenges(state, values) if state.claim == token else None):
-                raise OrderFailed(FailureReason.OVERTAKEN, "another run has taken over")
+                raise OrderFailed(FailureReason.OVERTAKEN, "another run is ordering this certificate now")
             self._published = values
             self._challenges.put(order.txt_name(wanted.domain), values, seconds)
 
@@ -240,7 +244,7 @@ class Renewal:
 
     def _account(self, directory: str) -> dict[str, Any]:
         """The key of our account at this directory. A new key is stored before it is used."""
-        from hippodrome.certificates.order import new_account_key  # noqa: PLC0415 - see there
+        from hippodrome.certificates.order import new_account_key  # noqa: PLC0415 - its import is slow
 
         for _ in range(MAX_TRIES):
             known = self._documents.get(ACCOUNT)
@@ -259,7 +263,7 @@ class Renewal:
         """Remove published values from DNS. If that fails, the next run does it."""
         if not values:
             return
-        from hippodrome.certificates.order import txt_name  # noqa: PLC0415 - see there
+        from hippodrome.certificates.order import txt_name  # noqa: PLC0415 - its import is slow
 
         try:
             self._challenges.remove(txt_name(domain), values)
@@ -273,7 +277,7 @@ class Renewal:
         found = self._documents.get(self._location.privkey)
         if found is None:
             return None, None
-        from hippodrome.certificates.order import read_or_expired, read_stored  # noqa: PLC0415 - see there
+        from hippodrome.certificates.order import read_or_expired, read_stored  # noqa: PLC0415 - its import is slow
 
         stored = read_stored(found.body)
         if stored is None:  # put there by the administrator
@@ -294,7 +298,7 @@ class Renewal:
 
     def _copy_chain(self) -> None:
         """Copy the chain of `privkey.pem` to `fullchain.pem`."""
-        from hippodrome.certificates.order import chain_of  # noqa: PLC0415 - see there
+        from hippodrome.certificates.order import chain_of  # noqa: PLC0415 - its import is slow
 
         for _ in range(MAX_TRIES):
             known = self._documents.get(self._location.fullchain)  # before the key, so that a newer chain conflicts
@@ -320,7 +324,11 @@ class Renewal:
 
 
 def renew(renewal: Renewal, domain: str, seconds: float) -> RenewalOutcome | None:
-    """Renew the certificate from its present ACME directory, for the daily timer. None if none was ever ordered."""
+    """Renew the certificate from its present ACME directory, for the daily timer.
+
+    `seconds` is the time for the whole order. Returns None if no certificate was ever ordered, or if the administrator
+    put the present one there.
+    """
     directory = renewal.last_directory()
     if not directory:
         return None

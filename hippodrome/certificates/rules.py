@@ -62,12 +62,11 @@ class Location(NamedTuple):
 
 
 FORMER = Location("SSL/fullchain.pem", "SSL/privkey.pem", "SSL/certificate.json")
-"""Where earlier versions kept the certificate of `*.<root domain>`. If a project's `ssl` section names these keys, it
-means the installation's certificate."""
+"""Where earlier versions kept the certificate of `*.<root domain>`."""
 
 
 def location(domain: str, root_domain: str) -> Location:
-    """Where the certificate of the names directly below `domain` is stored."""
+    """Return the keys of the documents of the certificate for names directly below `domain`."""
     if domain == root_domain:
         return FORMER
     return Location(*(f"SSL/{domain}/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")))
@@ -95,7 +94,7 @@ class FailureReason(StrEnum):
     UNREACHABLE = "unreachable"  # the CA did not answer, or is busy
     TIMEOUT = "timeout"  # the order took too long
     WRONG = "wrong"  # the certificate received is not the one ordered
-    OVERTAKEN = "overtaken"  # another run has stored a certificate meanwhile
+    OVERTAKEN = "overtaken"  # another run orders now, or has stored a certificate meanwhile
     BROKEN = "broken"  # anything else
 
 
@@ -149,12 +148,12 @@ class StoredCertificate:
     directory: str = ""  # the ACME directory that issued it; "" if the administrator put it there
 
     def days_left(self, now: datetime) -> int:
-        """Whole days until the certificate expires; negative afterwards."""
+        """Return the whole days until the certificate expires; negative afterwards."""
         return (self.not_after - now) // timedelta(days=1)
 
 
 class Verdict(StrEnum):
-    """Whether to order; if not, why not."""
+    """Whether to order a certificate; if not, why not."""
 
     FRESH = "fresh"
     ORDER = "order"
@@ -173,12 +172,16 @@ class Decision:
 
 
 def names_of(domain: str) -> tuple[str, ...]:
-    """The names on the certificate: the wildcard for servers directly below this domain."""
+    """Return the names that the certificate is for: the wildcard `*.domain`."""
     return (f"*.{domain}",)
 
 
 def renew_at(not_before: datetime, not_after: datetime) -> datetime:
-    """The time to renew: 30 days before it expires, or a third of its lifetime if that is less; half if short-lived."""
+    """Return the time at which to renew a certificate.
+
+    It is 30 days before the certificate expires, or when a third of its lifetime is left if that is later. For a
+    lifetime below 10 days it is when half of it is left.
+    """
     lifetime = not_after - not_before
     left = lifetime / 2 if lifetime < SHORT_LIVED else min(RENEW_BEFORE, lifetime / 3)
     return not_after - left
@@ -195,9 +198,9 @@ def decide(
 ) -> Decision:
     """Decide whether to order a certificate for these names at this directory now.
 
-    With `force` the answer is yes even if the certificate is fresh or not ours, another run holds a claim, or an order
-    failed a moment ago. It is still no until the time that the CA asked for, and beyond the hourly limit of failed
-    validations.
+    With `force` the decision is to order even if the certificate is fresh or not ours, another run holds a claim, or an
+    order failed a moment ago. But even then no order begins before the time that the CA has asked for, or beyond the
+    hourly limit of failed validations.
     """
     by_certificate = _decide_by_certificate(stored, directory, names, now)
     if by_certificate.verdict is not Verdict.ORDER and not force:
@@ -250,33 +253,36 @@ def _wait_after_failures(
 
 
 def claimed(state: CertificateRecord, token: str, now: datetime) -> CertificateRecord:
-    """The state with a claim of the run that has this token and is ordering now."""
+    """Return the record with the claim of the run that has this token and orders now."""
     return msgspec.structs.replace(state, claim=token, claimed=now)
 
 
 def with_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """The state with values that will be published in DNS. If this run is interrupted, a later run removes them."""
+    """Return the record with values that are about to be published in DNS.
+
+    If this run is interrupted, a later run removes them from DNS.
+    """
     return msgspec.structs.replace(state, challenges=tuple(values))
 
 
 def without_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """The state without these values, which are removed from DNS; unchanged if it has other values."""
+    """Return the record without these values, which are removed from DNS; unchanged if it holds other values."""
     return msgspec.structs.replace(state, challenges=()) if state.challenges == tuple(values) else state
 
 
 def unclaimed(state: CertificateRecord) -> CertificateRecord:
-    """The state without a claim, after a run that was interrupted (Ctrl-C): another run may order."""
+    """Return the record without a claim, after a run was interrupted (Ctrl-C), so that another run may order."""
     return msgspec.structs.replace(state, claim="", claimed=None)
 
 
 def failed(state: CertificateRecord, failure: FailedOrder) -> CertificateRecord:
-    """The state after a failed order, without its claim."""
+    """Return the record with this failed order added, and without the claim of its run."""
     kept = (*state.failures, msgspec.structs.replace(failure, text=failure.text[:MAX_TEXT]))[-MAX_FAILURES:]
     return msgspec.structs.replace(unclaimed(state), failures=kept)
 
 
 def succeeded(state: CertificateRecord, stored: StoredCertificate, trusted: str, now: datetime) -> CertificateRecord:
-    """The state after a successful order: this certificate is stored, and the failures before it are forgotten."""
+    """Return the record of this new certificate, without the failed orders before it and without a claim."""
     return msgspec.structs.replace(
         unclaimed(state),
         directory=stored.directory,

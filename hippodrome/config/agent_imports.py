@@ -53,7 +53,7 @@ class Import(NamedTuple):
 
 
 def may_run_on_aws(config: Config) -> bool:
-    """Whether the study may run on AWS: it has `useAWS: true`, or no useAWS, but a `cpu` in awsSetup."""
+    """Return whether the study may run on AWS: it has `useAWS: true`, or no useAWS, but a `cpu` in awsSetup."""
     project = config.project
     return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
 
@@ -61,9 +61,10 @@ def may_run_on_aws(config: Config) -> bool:
 def missing(folder: Path) -> list[Diagnostic]:
     """Return a mistake for each package that a file imports and the image lacks, at its first import in the file.
 
-    It is a remark if the package may come with one in requirements.txt that is not installed here. Imports whose
-    failure the code expects (`try`, `TYPE_CHECKING`) are left out. So are packages that are not installed here: their
-    distribution is not known, and `make check` tries the agent without them.
+    There is a remark instead of a mistake if this is not certain, for example because a package of requirements.txt is
+    not installed on this machine and may bring others. Imports whose failure the code expects (`try`, `TYPE_CHECKING`)
+    are left out. So are packages that are not installed on this machine: their distribution is not known, and `make
+    check` tries the agent without them.
     """
     image = _image(folder)
     found: dict[tuple[str, str], Diagnostic] = {}
@@ -75,11 +76,11 @@ def missing(folder: Path) -> list[Diagnostic]:
     return list(found.values())
 
 
-def of_players(folder: Path, config: Config) -> list[Diagnostic]:
-    """Return a mistake for each package that config.yml needs and the image lacks. It is a remark if the package may
-    come with another one.
+def missing_for_players(folder: Path, config: Config) -> list[Diagnostic]:
+    """Return a mistake for each package that config.yml needs and the image lacks.
 
-    Policies' files need ONNX Runtime. Without an agent.py, a game such as `package.module` needs its package.
+    Policies' files need ONNX Runtime. Without an agent.py, a game such as `package.module` needs its package. There is
+    a remark instead of a mistake if it is not certain that the image lacks the package.
     """
     image, source = _image(folder), read_source(folder)
     found: dict[str, Diagnostic] = {}
@@ -103,14 +104,14 @@ def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str
     game = config.trial.game or ""
     package = game.partition(".")[0]
     if package != game and all(map(str.isidentifier, game.split("."))) and layout.find(folder).agent is None:
-        yield ("trial", "game"), "this game", wanted(package) or package
+        yield ("trial", "game"), "this game", requirement_line(package) or package
 
 
-def loaded(folder: Path, config: Config, names: Iterable[str]) -> list[str]:
-    """Return a sentence for each of these top-level modules that the image lacks and no file of the project imports.
+def missing_of_loaded(folder: Path, config: Config, names: Iterable[str]) -> list[str]:
+    """Return a sentence for each of the modules `names` that the image lacks and that no file of the project imports.
 
-    `names` are the modules that were loaded while the agent played, such as pygame, with which Gymnasium draws
-    CartPole.
+    `names` are the top-level modules that were loaded while the agent played, such as pygame, with which Gymnasium
+    draws CartPole.
     """
     if missing(folder):  # these packages may load the modules, and are reported already
         return []
@@ -135,7 +136,7 @@ def _lacking(name: str, image: _Image) -> tuple[str, bool]:
     names = {canonicalize_name(distribution) for distribution in distributions}
     if names & image.held or canonicalize_name(name) in image.unknown:
         return "", True
-    write = f"write {wanted(name)} into {REQUIREMENTS} beside {AGENT}"
+    write = f"write {requirement_line(name)} into {REQUIREMENTS} beside {AGENT}"
     reason = _unknown(image)
     if reason:
         return f"whether {shown} is in the servers' image is not checked, because {reason}; to be sure, {write}", False
@@ -153,9 +154,11 @@ def _unknown(image: _Image) -> str:
     return f"{names} {'are' if others else 'is'} not installed here"
 
 
-def wanted(name: str) -> str:
-    """Return the line for requirements.txt that installs this top-level module in the version of this machine; "" if
-    it is not installed here."""
+def requirement_line(name: str) -> str:
+    """Return the line for requirements.txt that installs this top-level module in the version of this machine.
+
+    The result is "" if the module is not installed on this machine.
+    """
     distributions = sorted(set(_distributions().get(name, ())))
     return f"{distributions[0]}=={metadata.version(distributions[0])}" if distributions else ""
 

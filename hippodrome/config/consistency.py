@@ -18,7 +18,10 @@ from protocol.environment import PLAIN_ORIGINS
 
 
 def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
-    """Run both checks on the sections of a file. Paths in `invalid` yield no further mistakes."""
+    """Check each value of a file's sections by itself, and then the values against each other.
+
+    Returns the valid values and all mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
+    """
     checked = check_values(sections, invalid)
     checks = (
         _missing,

@@ -43,7 +43,10 @@ class ConfigErrors(Exception):
 
 
 class Mistake(NamedTuple):
-    """A mistake in the value at a path of keys; `message` says what to do. `line` is None if it is the path's own."""
+    """A mistake in the value at a path of keys; `message` says what to do.
+
+    `line` is the line of the mistake in the file; None stands for the line of the value at `path`.
+    """
 
     path: Keys
     message: str

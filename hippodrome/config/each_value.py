@@ -30,7 +30,7 @@ _ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding 
 
 @dataclass(slots=True)
 class Checked:
-    """The state of the checks: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
+    """The result of the checks: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
 
     root: Root
     step_keys: list[str]
@@ -47,7 +47,10 @@ class Checked:
 
 
 def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
-    """Check each value of the file's sections by itself. Paths in `invalid` yield no further mistakes."""
+    """Check each value of a file's sections by itself.
+
+    Returns the valid values and the mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
+    """
     sections = _copy(sections)
     about_trial = sections.pop("trial", None)
     steps = _at(sections, STEPS)
@@ -91,7 +94,10 @@ def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
 
 
 def _copy(data: Any, depth: int = 5) -> Any:
-    """A copy that may be changed. It is as deep as sections and lists can be: a message may be nested deeper."""
+    """A copy of the sections and lists of the first `depth` levels, so that these may be changed.
+
+    No valid config.yml has more levels. A message may: what lies deeper is not copied.
+    """
     if isinstance(data, dict) and depth:
         return {str(key): _copy(value, depth - 1) for key, value in data.items()}
     return [_copy(item, depth - 1) for item in data] if isinstance(data, list) and depth else data

@@ -7,7 +7,10 @@ from collections.abc import Iterable
 
 COMMON = frozenset(("the", "and", "to", "you", "your", "this", "that", "are", "with"))
 LEAST = 0.08
-"""The least share of these words in an English text. In our examples it is a fifth, in other languages nearly 0."""
+"""The least share of words in COMMON that an English text has.
+
+In our examples it is a fifth, in other languages nearly 0.
+"""
 ENOUGH = 50
 """The least number of words for which the share is reliable."""
 
@@ -29,6 +32,9 @@ def share(words: list[str]) -> float:
 
 
 def is_not_english(texts: Iterable[str]) -> bool:
-    """Whether these pages and texts are certainly in another language. False if they have fewer than ENOUGH words."""
+    """Return whether these pages and texts are certainly in another language than English.
+
+    The result is False if they have fewer than ENOUGH words.
+    """
     words = [word for text in texts for word in words_of(text)]
     return len(words) >= ENOUGH and share(words) < LEAST

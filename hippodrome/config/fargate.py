@@ -29,8 +29,10 @@ def fits(cpu: float, memory: float) -> bool:
 
 
 def memory_choices(cpu: float) -> str:
-    """Return the amounts of memory for `cpu` in words: "4 to 16" or "16 to 60 in steps of 4". Raises KeyError for a
-    number of vCPUs that Fargate does not offer."""
+    """Return the amounts of memory for `cpu` in words: "4 to 16" or "16 to 60 in steps of 4".
+
+    Raises KeyError for a number of vCPUs that Fargate does not offer.
+    """
     sizes = SIZES[cpu]
     if not float(sizes[0]).is_integer():
         return ", ".join(f"{size:g}" for size in sizes[:-1]) + f" or {sizes[-1]:g}"
@@ -55,8 +57,10 @@ def cpu(value: object) -> float:
 
 
 def memory(value: object) -> float:
-    """Check an amount of memory, in GB. Raises ValueError with what to write instead. (`fits` compares it with the
-    vCPUs.)"""
+    """Check an amount of memory, in GB. Raises ValueError with what to write instead.
+
+    Whether Fargate offers it with the number of vCPUs is checked by `fits`.
+    """
     found = _size(value, "gi?b")
     if found is not None and 0.5 <= found <= 120:
         return found
@@ -67,6 +71,7 @@ def memory(value: object) -> float:
 def _size(value: object, unit: str) -> float | None:
     """The number in a value that may have this unit; None if there is none."""
     if isinstance(value, str):
-        value = re.sub(rf"(?i){unit}$", "", value.strip()).rstrip()  # no \s*: long blanks would be tried from each one
+        # No `\s*` before the unit: long blanks would take quadratic time.
+        value = re.sub(rf"(?i){unit}$", "", value.strip()).rstrip()
     found = number_in(value)
     return None if found is None else float(found)

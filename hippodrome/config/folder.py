@@ -35,8 +35,10 @@ class ConfigSource:
     adapted: Adapted
 
     def diagnostic(self, path: Keys, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
-        """Return a mistake or remark on the value at this path of Hippodrome's form. By default it has the value's
-        line."""
+        """Return a mistake or remark on the value at this path of Hippodrome's form.
+
+        Without `line`, it names the line of the value.
+        """
         origin = self.adapted.origin(path)
         return self._diagnostic(origin, message, line, remark)
 
@@ -45,7 +47,7 @@ class ConfigSource:
         return in_order(self._diagnostic(path, message, None, True) for path, message in self.adapted.remarks)
 
     def names(self, path: Keys) -> bool:
-        """Return whether the file has a value for this path of Hippodrome's form."""
+        """Return whether the file gives a value for this path of Hippodrome's form."""
         return self.adapted.origin(path) in self.parsed.lines
 
     def _diagnostic(self, origin: Keys, message: str, line: int | None, remark: bool) -> Diagnostic:

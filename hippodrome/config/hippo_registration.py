@@ -26,7 +26,7 @@ _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, st
 
 
 def is_payload(event: Mapping[str, Any]) -> bool:
-    """Whether HIPPO's script has sent this event: its `steps` are a map, or it has keys that only HIPPO uses."""
+    """Return whether HIPPO's script has sent this event: its `steps` are a map, or it has keys that only HIPPO uses."""
     if any(key in event for key in ("project", "links", "takeOver")):
         return False
     return isinstance(event.get("steps"), dict) or any(key in event for key in _ONLY_HIPPO)
@@ -38,15 +38,19 @@ def project_id(event: Mapping[str, Any]) -> str | None:
     return found if ids.is_project_id(found) else None
 
 
-def renamed(event: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if the script uploads pages to a folder whose name differs from the project's id here."""
+def differing_folder(event: Mapping[str, Any]) -> list[str]:
+    """Return a sentence in a list if the script uploads pages to a folder that is not named after the project.
+
+    The project's id here may differ from the one in the payload (`project_id`). The list is empty if they are the same,
+    or if the payload's id cannot be used.
+    """
     given, here = event.get("id"), project_id(event)
     if here is None or given == here:
         return []
     return [f"project.id: the script uploads the pages to a folder {show(str(given))}; write {here} for both"]
 
 
-def elsewhere(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
+def differing_places(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
     """Yield a sentence for each bucket, region and domain in the payload that differs from the one in `here`.
 
     The script has uploaded the pages to its bucket, and makes the repository and the task definition in its region. A

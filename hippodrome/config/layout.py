@@ -103,15 +103,19 @@ def find(folder: Path) -> Layout:
 
 
 def agent_folder(folder: Path) -> Path:
-    """Return the folder of agent.py and of the modules beside it, whatever else is wrong with the project. The folder
-    need not exist."""
+    """Return the folder of agent.py and of the modules beside it, whatever else is wrong with the project.
+
+    The folder need not exist.
+    """
     agent = _agent(folder)
     return folder if agent is None else agent.parent
 
 
 def pages_folder(folder: Path) -> Path | None:
-    """Return the folder of the pages, whatever else is wrong with the project; None if there is none. Raises OSError
-    if the folders cannot be read."""
+    """Return the folder of the pages, whatever else is wrong with the project; None if there is none.
+
+    Raises OSError if the folders cannot be read.
+    """
     found = (place / name for place in _places(folder) for name in PAGES)
     return next((path for path in found if path.is_dir()), None)
 

@@ -117,8 +117,10 @@ def origin(value: object) -> str:
 
 
 def page_origin(value: object) -> str:
-    """Check the origin of a front end's pages, and return it as browsers write it. It is an https origin, or an http
-    origin of this machine (localhost, a name below it, 127.0.0.1)."""
+    """Check the origin of a front end's pages, and return it as browsers write it.
+
+    It is an https origin, or an http origin of this machine (localhost, a name below it, 127.0.0.1).
+    """
     found = as_text(value, "an address such as https://play.example.org").lower()
     if _HERE.fullmatch(found):
         return found.removesuffix(":80")

@@ -103,8 +103,10 @@ def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:
                 message = "unknown key" if detail["type"] == "extra_forbidden" else message_of(detail, path)
                 mistakes.append(Mistake((*path, *detail["loc"]), message))
             continue
-        if not step.key or not step.page or (step.variants and not type_of(step.page).has_files):
-            mistakes.append(Mistake(path, "must have key and page, and variants only if it is no game step"))
+        if not step.key or not step.page:
+            mistakes.append(Mistake(path, "must have key and page"))
+        elif step.variants and not type_of(step.page).has_files:
+            mistakes.append(Mistake(path, "is a game step, so it cannot have variants; leave them out"))
         steps.append(step)
     keys = [step.key for step in steps]
     if not mistakes and keys != ordered(set(keys)):

@@ -72,7 +72,7 @@ def without_a_key(config: Config) -> Remark | None:
 
 
 def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
-    """Yield a remark on each arrow of `ui` that is in the name of none of these actions, so that it does nothing."""
+    """Yield a remark on each arrow of `ui` that does nothing, because it is in the name of none of these actions."""
     names = [name.strip().lower() for name in actions]
     if not names or not config.game_steps or config.trial.keys:
         return
@@ -99,8 +99,10 @@ def arrows_of_unnamed_actions(config: Config, count: int) -> Iterator[Remark]:
 
 
 def combined_after_single(config: Config) -> Iterator[Remark]:
-    """With `input: single`, yield a remark on each combination of which one key is an action by itself: that action is
-    taken before the other keys are down."""
+    """With `input: single`, yield a remark on each combination of keys that participants cannot press.
+
+    One key of such a combination is an action by itself, which is taken before the other keys are down.
+    """
     if config.trial.input != "single":
         return
     for path, keys in config.trial.key_maps():

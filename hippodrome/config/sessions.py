@@ -47,8 +47,10 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
 
 
 def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
-    """Yield mistakes in keys that need groups if the study has none. `groups` is their number: the versions of a
-    page."""
+    """Yield mistakes in keys that need groups if the study has none.
+
+    `groups` is their number: the versions of a page.
+    """
     project = checked.root.project
     if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return

@@ -28,8 +28,10 @@ class StepFolder:
     names: tuple[str, ...]
 
     def find(self, page: str) -> tuple[int, tuple[Path, ...]]:
-        """Return the page's number of variants and its files. It is 0 if all participants get one page. Raises
-        StepFileError."""
+        """Return how many variants the page has, and its files. 0 variants: all participants get one page.
+
+        Raises StepFileError if a file is missing, cannot be read, or does not fit the others.
+        """
         groups = sorted(self._groups(page))
         single = f"{page}.html"
         if single in self.names and 0 in groups:
@@ -84,8 +86,10 @@ class StepFolder:
 
 
 def open_folder(project: Path) -> StepFolder:
-    """Return the project's folder of pages: `steps`, or that of HIPPO Gym's layout. Raises StepFileError if there is
-    none, or it cannot be read."""
+    """Return the project's folder of pages: `steps`, or that of HIPPO Gym's layout.
+
+    Raises StepFileError if there is none, or it cannot be read.
+    """
     try:
         path = layout.pages_folder(project)
         if path is not None:

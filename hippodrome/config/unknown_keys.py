@@ -22,7 +22,10 @@ _AROUND_TEXTS = ((), TEXTS[:-1])
 
 
 def explain(path: Keys) -> tuple[str, list[Keys]]:
-    """Return the message about an unknown key, and a list with the path that was probably meant, if there is one."""
+    """Return the message about an unknown key, and the path of the key that was probably meant.
+
+    The path is in a list, which is empty if no known key is similar enough.
+    """
     section, key = path[:-1], str(path[-1])
     own = "a key of your agent's own goes under trial.options" if section == ("trial",) else ""
     home = _home(key, section)

@@ -68,8 +68,10 @@ class ParsedFile:
 
 
 def parse_yaml(data: bytes) -> ParsedFile:
-    """Return the file's content; its `mistakes` are those in single values. Raises UnreadableConfig if the file cannot
-    be read at all."""
+    """Return the file's content; its `mistakes` are those in single values.
+
+    Raises UnreadableConfig if the file cannot be read at all.
+    """
     text = _decode(data)
     root = _compose(text)
     if root is None:

@@ -28,28 +28,30 @@ MIN_BILLED_SECONDS = 60  # the least that Fargate bills
 
 
 def participant_slots_folder(project_id: str) -> str:
-    """The folder of the participants' slots."""
+    """Return the folder of the participants' slots."""
     return f"{project_id}/places/"
 
 
 def participant_slots_key(project_id: str, shard: int) -> str:
-    """The key of this shard, one of the documents of participants' slots."""
+    """Return the key of one shard of the participants' slots; `shard` counts from 0."""
     return f"{participant_slots_folder(project_id)}{shard}.json"
 
 
 SERVER_SLOTS = "_places/"
+"""The folder of the slots of all projects' servers."""
 
 
 def server_slots_key(project_id: str) -> str:
-    """The key of the slots of a project's servers."""
+    """Return the key of the slots of a project's servers."""
     return f"{SERVER_SLOTS}{project_id}.json"
 
 
 class ParticipantSlots(Record, frozen=True):
     """`{projectId}/places/{shard}.json`: the labels of participants who hold a slot, and the room for them.
 
-    `room` is how many may hold a slot in this shard. The rooms of all shards add up to the limit; a registration with
-    another limit divides it anew. A shard that was never written has its `shard_share` as room.
+    A label is a hash of a participant's id (`ids.server_label`). `room` is how many participants may hold a slot in
+    this shard. The rooms of all shards add up to the limit; a registration with another limit divides it anew. A shard
+    that was never written has its `shard_share` as room.
     """
 
     labels: tuple[str, ...] = ()
@@ -80,12 +82,12 @@ class ParticipantSlots(Record, frozen=True):
 
 
 def shard_share(limit: int, shard: int) -> int:
-    """How many of `limit` slots one shard gets."""
+    """Return how many of `limit` slots one shard gets."""
     return limit // SHARDS + (shard < limit % SHARDS)
 
 
 def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
-    """Whether the rooms of all shards add up to the limit, or to the number of participants if that is greater.
+    """Return whether the rooms of all shards add up to the limit, or to the number of participants if that is greater.
 
     If a shard has more participants than room, it counts with its participants.
     """
@@ -94,12 +96,12 @@ def is_divided(limit: int, parts: Sequence[ParticipantSlots]) -> bool:
 
 
 def counts(parts: Sequence[ParticipantSlots]) -> list[int]:
-    """How many participants hold a slot in each shard."""
+    """Return how many participants hold a slot in each shard."""
     return [len(part.labels) for part in parts]
 
 
 def first_shard(label: str, limit: int) -> int:
-    """The first shard in which a participant looks for a slot: one that has a share of the limit.
+    """Return the first shard in which a participant looks for a slot: one that has a share of the limit.
 
     A participant may hold two slots: if `next_step` crashed between taking the slot and writing `participant.json`, and
     the limit changed before they came back. Then too few others are admitted, never too many.
@@ -146,9 +148,9 @@ class ServerSlots(Record, frozen=True):
         return ServerSlots({**others, server.label: wanted}, used)
 
     def free_slots(self, project: Project, seconds: int) -> int | None:
-        """How many more servers, each reserving `seconds`, would get a slot; None if the project has no such limit.
+        """Return how many more servers that reserve `seconds` each would get a slot.
 
-        Below 0 if more servers hold a slot than the limits allow.
+        The number is below 0 if more servers hold a slot than the limits allow. None: the project has no such limit.
         """
         rooms = []
         if project.max_servers is not None:
@@ -195,12 +197,12 @@ class ServerSlots(Record, frozen=True):
 
 
 def seconds_reserved(server: Server) -> int:
-    """The most seconds that a server can use: up to its deadline."""
+    """Return the seconds that a slot reserves for this server: as many as it can run until its deadline."""
     return math.ceil((server.deadline - server.requested).total_seconds())
 
 
 def seconds_used(server: Server, reason: Reason, end: datetime) -> int:
-    """The seconds that a server used until `end`. They begin with its request: AWS bills nearly all of them."""
+    """Return the seconds that a server used until `end`. They begin with its request: AWS bills nearly all of them."""
     if reason in NEVER_RAN:
         return 0
     return max(MIN_BILLED_SECONDS, math.ceil((end - server.requested).total_seconds()))

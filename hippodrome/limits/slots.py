@@ -39,9 +39,10 @@ class Slots:
     # Participants
 
     def admit(self, project: Project, user_id: str) -> bool:
-        """Give a newcomer a slot; return False if none is free. Mostly two calls; none without `maxParticipants`.
+        """Give a newcomer a slot; return False if none is free. In a project without `maxParticipants`, return True.
 
-        A participant who holds a slot keeps it, even if `participant.json` was not written because of a crash.
+        A participant who holds a slot keeps it, even if `participant.json` was not written because of a crash. AWS
+        calls: usually two; none without `maxParticipants`.
         """
         limit = project.max_participants
         if limit is None or self._is_known_full(project, limit):
@@ -64,8 +65,8 @@ class Slots:
     def set_limit(self, project: Project, user_ids: Iterable[str]) -> None:
         """Divide a new or changed `maxParticipants` among the shards; `user_ids` are the participants so far.
 
-        One read for each shard. If something has to change, more calls for each shard, and the study is full for
-        newcomers until the last of them.
+        AWS calls: one read of each shard. If something has to change, each shard is written twice, and until that is
+        over the study is full for newcomers.
         """
         limit = project.max_participants
         if limit is None:
@@ -87,15 +88,19 @@ class Slots:
             self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.with_room_for, more=more))
 
     def documents_naming(self, project_id: str, user_id: str) -> list[str]:
-        """The keys of the documents that hold this participant's label. One listing, and a read of each shard.
+        """Return the keys of the documents that hold this participant's slot.
 
-        Documents that cannot be read are not among them; `unreadable` returns their keys.
+        Documents that cannot be read are not among them; `unreadable` returns their keys. AWS calls: one listing, and a
+        read of each document.
         """
         label, readable = ids.server_label(project_id, user_id), self._participant_slots(project_id)
         return [key for key, people in readable.items() if people and label in people.labels]
 
     def unreadable(self, project_id: str) -> list[str]:
-        """The keys of the documents of participants' slots that cannot be read. One listing, and a read of each."""
+        """Return the keys of the documents of participants' slots that cannot be read.
+
+        AWS calls: one listing, and a read of each document.
+        """
         return [key for key, people in self._participant_slots(project_id).items() if people is None]
 
     def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:
@@ -120,9 +125,10 @@ class Slots:
     # Servers
 
     def acquire(self, project: Project, record: Server) -> bool:
-        """Take a slot for a server whose record is written; False if none is free. Two calls, none without limits.
+        """Take a slot for a server whose record is written; return False if none is free.
 
-        If none is free, a slot that was kept from an earlier attempt is released, too.
+        If none is free, a slot that was kept from an earlier attempt is released, too. AWS calls: two; none if the
+        project does not limit servers.
         """
         if not record.counted:
             return True
@@ -133,7 +139,10 @@ class Slots:
         return record.label in self._shared.change(limits.server_slots_key(project.id), ServerSlots, take).after.slots
 
     def release(self, project_id: str, releases: Iterable[Release]) -> None:
-        """Release the slots of servers that have ended, before their records are closed. Two calls for all of them."""
+        """Release the slots of servers that have ended, before their records are closed.
+
+        AWS calls: two for all of them.
+        """
         now = self._platform.now()
         released = list(releases)
 
@@ -145,9 +154,10 @@ class Slots:
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, leave)
 
     def server_slots(self, projects: Iterable[Project]) -> dict[str, ServerSlots]:
-        """By project, the slots of its servers. One read for each of these projects that limits servers.
+        """Return the slots of servers, by project. A project whose slots cannot be read is left out.
 
-        Without a listing, no other document in that folder is read.
+        AWS calls: one read for each of these projects that limits servers. There is no listing, so no other document in
+        that folder is read.
         """
         found = {}
         for project in projects:
@@ -161,16 +171,19 @@ class Slots:
         return found
 
     def release_forgotten(self, project_id: str, forgotten: Mapping[str, Server | None]) -> None:
-        """Release slots that ended servers still hold. Two calls for all of them.
+        """Release slots that servers still hold although they have ended. AWS calls: two for all of them.
 
-        `forgotten` has, by the server's name, its closed record; None if it has none any more.
+        `forgotten` maps a server's name to its closed record; None if the server has no record any more.
         """
         ended = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, lambda slots: slots.without_all(ended))
 
 
 def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:
-    """A server's label, attempt and used seconds (None: not known from its record); None if it is no server's name."""
+    """Return label, attempt and used seconds of the server of this name; None if it is no server's name.
+
+    The seconds are None if the record is missing, of another attempt, or not closed.
+    """
     label, attempt = ids.parse_server_name(name) or ("", 0)
     if not label:
         return None

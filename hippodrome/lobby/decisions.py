@@ -32,7 +32,11 @@ class OpenSession(Record, frozen=True):
     players: int = 0
 
     def is_usable(self, players: int, now: datetime, open_for: timedelta) -> bool:
-        """Whether a session of `players` may get its server now. It is kept open for `open_for` after its request."""
+        """Return whether the session, which is for `players`, may still get members.
+
+        It may until `open_for` after its server was requested. A session of an earlier version, which does not name its
+        number of players, fits any number.
+        """
         return now - self.asked < open_for and self.players in (0, players)
 
 
@@ -40,8 +44,8 @@ class Proposal(Record, frozen=True):
     """A session that may be formed. `labels` are the labels of its members, in the order in which they came.
 
     `id` identifies the proposal: its members confirm it by this id. `ahead`: the open session whose server it gets, if
-    there is one; if this proposal falls apart, another one may get it. `players`: the project's number when it was
-    proposed; 0 in documents of earlier versions.
+    there is one; if this proposal falls apart, another proposal may get that server. `players`: the project's number
+    when the session was proposed; 0 in documents of earlier versions.
     """
 
     id: str
@@ -116,7 +120,7 @@ class Decisions(Record, frozen=True):
     renewed: datetime | None = None
 
     def labels(self) -> frozenset[str]:
-        """The labels of all participants in the document."""
+        """Return the labels of all participants in the document."""
         return frozenset(
             [
                 *(label for each in self.proposed for label in each.labels),
@@ -126,56 +130,59 @@ class Decisions(Record, frozen=True):
         )
 
     def labels_formed(self) -> frozenset[str]:
-        """The labels of the members of all formed sessions in the document."""
+        """Return the labels of the members of all formed sessions in the document."""
         return frozenset(member.label for each in self.formed for member in each.members)
 
     def proposal_of(self, label: str) -> Proposal | None:
-        """The proposal with this participant; None if there is none."""
+        """Return the proposal with this participant; None if there is none."""
         return next((each for each in self.proposed if label in each.labels), None)
 
     def formed_of(self, label: str) -> Formed | None:
-        """The formed session with this participant; None if there is none."""
+        """Return the formed session with this participant; None if there is none."""
         return next((each for each in self.formed if any(member.label == label for member in each.members)), None)
 
     def unmatched_of(self, label: str) -> Unmatched | None:
-        """The decision that this participant is unmatched; None if they are not."""
+        """Return the entry which says that this participant is unmatched; None if there is none."""
         return next((each for each in self.unmatched if each.label == label), None)
 
     def is_decided(self, label: str) -> bool:
-        """Whether the participant is unmatched, or a member of a session that has its server for good."""
+        """Return whether the participant is unmatched, or a member of a session that has its server for good."""
         return self.decided_for(label) != Decisions()
 
     def decided_for(self, label: str) -> Decisions:
-        """The part of the document that is decided for good about this participant; empty if nothing is."""
+        """Return the part of the document that is decided for good about this participant; empty if nothing is."""
         formed, unmatched = self.formed_of(label), self.unmatched_of(label)
         has_server = formed is not None and formed.waits_for is None
         return Decisions(formed=(formed,) if formed and has_server else (), unmatched=(unmatched,) if unmatched else ())
 
     def without_server(self) -> list[Formed]:
-        """The formed sessions that wait for a server, in the order in which they were formed."""
+        """Return the formed sessions that wait for a server, in the order in which they were formed."""
         return sorted((each for each in self.formed if each.waits_for), key=lambda each: each.at)
 
     def for_good(self) -> Decisions:
-        """The part of the document that is decided for good: sessions with their server, and unmatched participants."""
+        """Return the part of the document that is decided for good.
+
+        These are the sessions that have their server, and the unmatched participants.
+        """
         has_server = tuple(each for each in self.formed if each.waits_for is None)
         return Decisions(formed=has_server, unmatched=self.unmatched)
 
     def session_ids(self) -> frozenset[str]:
-        """The ids of all sessions in the document that may have a server."""
+        """Return the ids of all sessions in the document that may have a server."""
         proposed = (each.session_id for each in self.proposed if each.ahead)
         return frozenset([*(each.id for each in self.open), *proposed, *(each.id for each in self.formed)])
 
 
 def key(project_id: str) -> str:
-    """The key of a project's document of decisions."""
+    """Return the key of a project's document of decisions."""
     return f"{LOBBIES}{project_id}.json"
 
 
 def next_version(before: Decisions, after: Decisions) -> Decisions:
-    """`after`, with the next version number if it differs from `before`."""
+    """Return `after`; if it differs from `before`, with the next version number."""
     return before if after == before else msgspec.structs.replace(after, version=before.version + 1)
 
 
 def by_age(sessions: Iterable[OpenSession]) -> tuple[OpenSession, ...]:
-    """These open sessions in the order in which their servers were requested. The first is used first."""
+    """Return these open sessions in the order in which their servers were requested. The first is used first."""
     return tuple(sorted(sessions, key=lambda each: (each.asked, each.id)))

@@ -38,7 +38,7 @@ _NAME = re.compile(r"(s[a-z2-7]{20})\.(?:(way)|(yes|left)\.(.+)|([0-9]{13})\.(-|
 
 
 class WaitingDocument(Record, frozen=True, omit_defaults=False):
-    """The content of the entry of a participant who waits."""
+    """The content of the entry which says that a participant waits."""
 
     user_id: str
     group: int | None = None
@@ -46,7 +46,11 @@ class WaitingDocument(Record, frozen=True, omit_defaults=False):
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A participant who waits. `joined`: when they came, in ms as in the key; `seen`: their last request."""
+    """A participant who waits in the lobby.
+
+    `joined`: when they came, in ms since 1970, as in the key. `seen`: the time of their last request. `trait`: see
+    `traits.py`.
+    """
 
     label: str
     joined: int
@@ -59,13 +63,15 @@ class Waiting:
         return self.joined, self.label
 
     def is_present(self, now: datetime) -> bool:
-        """Whether the participant's last request is younger than `PRESENT`."""
+        """Return whether the participant's last request is younger than `PRESENT`."""
         return now - self.seen < PRESENT
 
 
 @dataclass(frozen=True, slots=True)
 class Departure:
-    """A participant has closed the page, `at` this time. `joined`: when they had come, in ms."""
+    """The entry which says that a participant has closed the page. `joined`: when they had come (ms); `at`: when they
+    left.
+    """
 
     joined: int
     at: datetime
@@ -73,7 +79,10 @@ class Departure:
 
 @dataclass(frozen=True)
 class Entries:
-    """A listing of the folder. A participant who has left and not come back is in `left`, not in `waiting`."""
+    """The entries in the lobby's folder, as one listing has them.
+
+    A participant who has left and not come back is in `left`, not in `waiting`.
+    """
 
     waiting: Mapping[str, Waiting] = field(default_factory=dict)  # by label
     confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # labels, by the proposal's id
@@ -84,18 +93,21 @@ class Entries:
     outdated: tuple[str, ...] = ()  # the keys of old entries, which may be deleted
 
     def with_waiting(self, one: Waiting) -> Entries:
-        """The listing with this participant, who waits now."""
+        """Return the listing with this participant added, who waits now."""
         left = {label: each for label, each in self.left.items() if label != one.label}
         return replace(self, waiting={**self.waiting, one.label: one}, left=left)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
-        """The listing with this confirmation, which has just been written."""
+        """Return the listing with this confirmation added, which has just been written."""
         labels = self.confirmed.get(proposal_id, frozenset()) | {label}
         return replace(self, confirmed={**self.confirmed, proposal_id: labels})
 
 
 def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta) -> Entries:
-    """Read a listing of `folder(project_id)`. Entries of participants under way count up to the age `way`."""
+    """Read a listing of `folder(project_id)`.
+
+    An entry which says that a participant is under way counts only until it is older than `way`.
+    """
     prefix = folder(project_id)
     waiting: dict[str, Waiting] = {}
     confirmed: dict[str, set[str]] = {}
@@ -145,52 +157,55 @@ def _earlier(one: Waiting, other: Waiting) -> Waiting:
 
 
 def folder(project_id: str) -> str:
-    """The folder of a project's lobby."""
+    """Return the folder of a project's lobby."""
     return f"{FOLDER}{project_id}/"
 
 
 def prefix_of(project_id: str, label: str) -> str:
-    """The prefix of the keys of all entries of a participant."""
+    """Return the prefix with which the keys of all entries of a participant begin."""
     return f"{folder(project_id)}{label}."
 
 
 def waiting_key(project_id: str, one: Waiting) -> str:
-    """The key of the entry of a participant who waits."""
+    """Return the key of the entry which says that this participant waits."""
     return f"{prefix_of(project_id, one.label)}{one.joined:013}.{one.trait}"
 
 
 def confirmation_key(project_id: str, label: str, proposal_id: str) -> str:
-    """The key of a participant's confirmation of a proposal."""
+    """Return the key of the entry which says that a participant has confirmed this proposal."""
     return f"{prefix_of(project_id, label)}yes.{proposal_id}"
 
 
 def departure_key(project_id: str, label: str, joined: int) -> str:
-    """The key of the entry which says that a participant has closed the page."""
+    """Return the key of the entry which says that a participant, who came at `joined`, has closed the page."""
     return f"{prefix_of(project_id, label)}left.{joined:013}"
 
 
 def way_key(project_id: str, label: str) -> str:
-    """The key of the entry which says that a participant is under way."""
+    """Return the key of the entry which says that a participant is under way."""
     return f"{prefix_of(project_id, label)}way"
 
 
 def done_key(project_id: str, decided: str) -> str:
-    """The key of the mark that a decision is carried out: `decided` is a session's id, or an unmatched one's label."""
+    """Return the key of the mark which says that a decision is carried out.
+
+    `decided` is the id of the formed session, or the label of the unmatched participant.
+    """
     return f"{folder(project_id)}{decided}.done"
 
 
 def milliseconds(now: datetime) -> int:
-    """A time as it stands in keys: milliseconds since 1970."""
+    """Return a time as keys have it: milliseconds since 1970."""
     return int(now.timestamp() * 1000)
 
 
 def seconds_since(joined: int, now: datetime) -> float:
-    """Seconds since `joined`, in ms; 0 if another machine's clock makes it negative."""
+    """Return the seconds since `joined` (ms since 1970); 0 if another machine's clock makes them negative."""
     return max(0, milliseconds(now) - joined) / 1000
 
 
 def read_body(body: bytes) -> WaitingDocument | None:
-    """Read the content of the entry of a participant who waits; None if it cannot be read."""
+    """Read the content of the entry which says that a participant waits; None if it cannot be read."""
     try:
         found = from_json(body, WaitingDocument)
     except (msgspec.DecodeError, RecursionError):
@@ -199,5 +214,5 @@ def read_body(body: bytes) -> WaitingDocument | None:
 
 
 def body(document: WaitingDocument) -> bytes:
-    """The content of the entry of a participant who waits, as bytes."""
+    """Return the bytes of the entry which says that a participant waits."""
     return to_json(document)

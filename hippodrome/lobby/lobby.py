@@ -69,8 +69,8 @@ class LobbyState:
 class NoServerYet:
     """The participant's session is formed, and no server is ready for it yet.
 
-    `session` is its id, and `record` the record of the server that was started ahead under this id. If another server
-    that was started ahead is ready sooner, the session gets that one, and its id.
+    `session` is its id. `record` is the record of the server that was started ahead under this id. If another server
+    that was started ahead is ready sooner, the session gets that server, and the id under which it was started.
     """
 
     session: str
@@ -90,7 +90,7 @@ class _Asker:
 
 
 class Lobby:
-    """The lobbies of all projects. One per running function."""
+    """The lobbies of all projects. Each running function has one."""
 
     def __init__(self, platform: Platform, repository: Repository) -> None:
         self._platform = platform
@@ -106,11 +106,12 @@ class Lobby:
     def visit(
         self, project: Project, user_id: str, group: int | None, answers: Answers
     ) -> LobbyState | NoServerYet | Membership:
-        """Handle a request of a participant at the game step. Return their membership, or the state while they wait.
+        """Handle a request of a participant at the game step.
 
-        The membership also says if the participant is unmatched; then the answer of each game step is stored. `answers`
-        reads the participant's answers so far. It is called only if `matching` needs them. The project must have its
-        secret. `docs/architecture.md` counts the calls.
+        Returns their membership; until it is decided, the state of the lobby or of their session. The membership may
+        say that the participant is unmatched; then the answer of each game step is stored. `answers` reads the
+        participant's answers so far, and is called only if `matching` needs them. `project` must have its secret
+        (`SecretCache.with_secret`). `docs/architecture.md` counts the AWS calls.
         """
         label = ids.server_label(project.id, user_id)
         membership = self._repository.membership(project.id, user_id)
@@ -124,10 +125,10 @@ class Lobby:
         return membership
 
     def leave(self, project: Project, user_id: str) -> None:
-        """Note that the participant has closed the page: they are not proposed until their next request.
+        """Note that the participant has closed the page: until their next request, no session with them is proposed.
 
         A participant who is back within `entries.PRESENT` (a reload, another tab) keeps the time at which they came.
-        One listing and some writes.
+        AWS calls: one listing and some writes.
         """
         label = ids.server_label(project.id, user_id)
         found = self._store.entries(project, label)
@@ -138,16 +139,19 @@ class Lobby:
             self._store.delete(key for key in found.keys[label] if ".left." not in key)
 
     def forget(self, project: Project, user_id: str) -> None:
-        """Delete the entries of a participant who no longer needs a game. May be repeated. One listing."""
+        """Delete the entries of a participant who no longer needs a game. May be repeated.
+
+        AWS calls: one listing, and deletes.
+        """
         label = ids.server_label(project.id, user_id)
         self._store.delete(self._store.entries(project, label).keys.get(label, ()))
 
     def under_way(self, project: Project, user_id: str) -> None:
         """Note that the participant is under way to the game, and start a server ahead if one is needed for them.
 
-        One server is started ahead for every `players` participants who are under way or wait. The call may be repeated
-        or late: for a participant who has a membership, or has answered all game steps, it does nothing. If the start
-        message was lost after the document was written, a repetition sends it again.
+        One server is started ahead for every `players` participants who are under way or wait. The call may be
+        repeated, or come late: for a participant who has a membership, or has answered all game steps, it does nothing.
+        If the server's start message was lost after the document was written, a repetition sends it again.
         """
         if self._repository.membership(project.id, user_id) is not None:
             return
@@ -185,10 +189,10 @@ class Lobby:
     def repair(self, project: Project) -> Collection[str]:
         """Finish interrupted runs, and bring the servers that are started ahead to their number; for the sweep.
 
-        Return the ids of all sessions that the lobby lists afterwards. The server of a session that is not among them
-        is left over if the session has no document: the caller must have listed servers before this call, and looks for
-        the document after it. A document of decisions that cannot be read is made anew, empty. Raises `RetryLater` and
-        the documents port's errors.
+        Returns the ids of all sessions that the lobby lists afterwards. If a session is not among them and has no
+        document, its server is left over. To find such servers, the caller must list the servers before this call, and
+        look for the documents after it. If the document of decisions cannot be read, it is made anew, empty. Raises
+        `RetryLater` and the errors of the documents.
         """
         return self._repair.run(project)
 

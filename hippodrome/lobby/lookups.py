@@ -25,7 +25,7 @@ FORMED_AT_ONCE = 10
 LOOKED_AT = 5
 """How many open sessions' servers a request reads, if its session is the first that waits for a server."""
 LOOKED_AT_IN_NEED = 50
-"""The same, if the server that its session waits for has ended."""
+"""How many open sessions' servers such a request reads, if the server that its session waits for has ended."""
 
 
 class Lookups:
@@ -36,7 +36,7 @@ class Lookups:
         self._repository = repository
 
     def open_for(self, project: Project) -> timedelta:
-        """For how long after its request a server that was started ahead can be given to a session."""
+        """Return for how long after its request a server that was started ahead may be given to a session."""
         return sessions.open_for(project, self._platform.settings)
 
     def run(
@@ -49,15 +49,16 @@ class Lookups:
         servers: StartedAhead,
         chosen: Sequence[Sequence[str]] = (),
     ) -> LobbyRun:
-        """Return a run that may form the sessions of these confirmed proposals. Two reads for each member."""
+        """Return a run that may form the sessions of these confirmed proposals. AWS calls: two reads per member."""
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), self.open_for(project)
         return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
 
     def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
-        """The confirmed proposals that this participant's request forms: their own, and some that have waited for long.
+        """Return the confirmed proposals that this participant's request forms.
 
-        In a crowd more participants come than the document takes writes, so one write decides on several sessions.
+        These are their own, and some that have waited for long: in a crowd more participants come than the document
+        takes writes, so one write decides on several sessions.
         """
         now = self._platform.now()
         confirmed = rules.confirmed(known, entries)
@@ -71,8 +72,8 @@ class Lookups:
         """Read the records of the servers that this participant's request may give to sessions.
 
         The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
-        started ahead. Then it has that server; if no other session waits before theirs, also some servers of open
-        sessions; if the session's own server has ended, more of these.
+        started ahead. Then it has that server. If no other session waits before theirs, it also has some servers of
+        open sessions; and more of these, if the session's own server has ended.
         """
         formed = known.formed_of(label)
         own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)

@@ -40,11 +40,11 @@ class Matcher:
         document: Decisions,
         entries: Entries,
     ) -> Sequence[Sequence[str]]:
-        """Return the sessions that `match` has chosen, by their members' labels; ask it again if a question is due.
+        """Return the sessions that `match` has chosen, each as its members' labels; ask it again if a question is due.
 
-        This is for the request of the participant with this label. If they are new, they are added to the question, as
-        `candidate` returns them. No sessions are returned if other requests change the question all the time. Two
-        reads; two calls more if something is written.
+        `label` is that of the participant whose request this is. If they are new, what `candidate` returns is added to
+        the question. If other requests change the question all the time, the result is empty. AWS calls: two reads; two
+        more if something is written.
         """
         now, key = self._platform.now(), waiting_key(project.id)
         question = self._read(key, project)
@@ -83,7 +83,10 @@ class Matcher:
         return chosen
 
     def forget(self, project: Project) -> None:
-        """Delete old questions and answers. Two listings. The next request of a participant who waits asks again."""
+        """Delete old questions and answers. AWS calls: two listings, and deletes.
+
+        If a participant still waits, their next request asks again.
+        """
         now = self._platform.now()
         for folder in (questions_folder(project.id), groups_folder(project.id)):
             for entry in self._documents.list(folder):

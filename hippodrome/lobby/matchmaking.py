@@ -15,18 +15,18 @@ from hippodrome.lobby.entries import Waiting, milliseconds
 from hippodrome.model.project import Project
 
 PROPOSED_AT_ONCE = 50
-"""One run proposes at most so many sessions, so that a crowd makes no function slow. The next run proposes more."""
+"""The most sessions that one run proposes, so that a crowd makes no function slow. The next run proposes more."""
 
 
 def patience_is_over(joined: int, project: Project, now: datetime) -> bool:
-    """Whether a participant who came at `joined` (ms) has waited for `patience` seconds."""
+    """Return whether a participant who came at `joined` (ms) has waited for `patience` seconds."""
     return milliseconds(now) - joined >= round(project.patience * 1000)
 
 
 def choose(
     free: Sequence[Waiting], project: Project, now: datetime, chosen: Sequence[Sequence[str]]
 ) -> list[Sequence[Waiting]]:
-    """The sessions to propose, at most `PROPOSED_AT_ONCE`.
+    """Return the sessions to propose, at most `PROPOSED_AT_ONCE`.
 
     `free` are the participants who are in no session, in the order of arrival; `chosen`, the sessions that the function
     `match` has chosen, by their members' labels.
@@ -113,7 +113,10 @@ def _short_sessions(
 
 
 def around(one: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
-    """This participant and others who may play with them, in the order of arrival; at most `players`, perhaps fewer."""
+    """Return this participant and others who may play with them, in the order of arrival.
+
+    There are at most `players`, and fewer if not enough fit.
+    """
     members, most = [one], None if traits.together(project) else traits.most_of_one(project)
     for other in free:
         if len(members) == project.players:

@@ -22,7 +22,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import Record, from_json, to_json
 
 WAITED_STEPS = 5
-"""Seconds. Waiting times are rounded down to a multiple of this, and a question is asked again as often."""
+"""The seconds to a multiple of which waiting times are rounded down. A question is asked again as often."""
 ANSWERED_WITHIN = timedelta(seconds=10)
 """A question without an answer is asked anew after this: a server looks every two seconds, and `match` has five."""
 MOST_WAITING = 200
@@ -52,7 +52,7 @@ class Question(Record, frozen=True):
     came: tuple[Candidate, ...] = ()
 
     def candidates(self) -> dict[str, Candidate]:
-        """All participants in the document, by label."""
+        """Return all participants in the document, in the question or in `came`, by label."""
         return {each.id: each for each in (*self.waiting, *self.came)}
 
 
@@ -69,20 +69,23 @@ class MatchAnswer:
 
 
 def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
-    """The candidate for a participant who comes, without answers that are too large."""
+    """Return what `match` gets of a participant who comes. Answers that are too large are left out."""
     found = Candidate(label, group=group, answers=answers)
     return found if len(to_json(found)) <= MOST_ANSWERS else Candidate(label, group=group)
 
 
 def with_candidate(question: Question, one: Candidate) -> Question:
-    """The document with this participant, for the next question; unchanged if `MOST_CAME` stand in it already."""
+    """Return the document with this participant added to `came`, for the next question.
+
+    It is unchanged if the participant is in the document, or if `came` has `MOST_CAME` participants already.
+    """
     if one.id in question.candidates() or is_full(question):
         return question
     return msgspec.structs.replace(question, came=(*question.came, one))
 
 
 def is_full(question: Question) -> bool:
-    """Whether the document has no room for another participant before the next question."""
+    """Return whether no other participant can be added to the document before the next question."""
     return len(question.came) >= MOST_CAME
 
 
@@ -116,7 +119,7 @@ def next_question(
     matched: Collection[str],
     now: datetime,
 ) -> Question:
-    """The question to ask now: `question` unchanged, or a new one about the participants who are `free`.
+    """Return the question to ask now: `question` unchanged, or a new one about the participants who are `free`.
 
     `waiting`: the labels of all participants who wait; others are dropped from the document. `matched`: the labels in
     the answer to `question`. The new question leaves them out; a later one has them again if they are still free.

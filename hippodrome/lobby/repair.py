@@ -88,5 +88,8 @@ class Repair:
         formed = tuple(each for each in after.for_good().formed if each not in known.formed)
         self._store.carry_out(project, Decisions(formed=formed), entries)
         if ended:
-            logger.info("servers that were ahead", extra={"project": project.id, "stopped": len(ended)})
+            logger.info(
+                "servers that were started ahead and are not needed were stopped",
+                extra={"project": project.id, "stopped": len(ended)},
+            )
         return after.session_ids()

@@ -52,14 +52,14 @@ def decide(
 
 
 def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
-    """The participants who are present and in no session, in the order of arrival."""
+    """Return the participants who are present and in no session, in the order of arrival."""
     busy = document.labels()
     found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
     return sorted(found, key=lambda one: one.order)
 
 
 def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
-    """The proposals that all members have confirmed and no member has left."""
+    """Return the proposals that all members have confirmed and no member has left."""
     return [
         each
         for each in document.proposed
@@ -69,7 +69,7 @@ def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
 
 
 def number_here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
-    """How many participants, this one included, could play together now; at most `players`."""
+    """Return how many participants could play together now, this one included; at most `players`."""
     proposal = document.proposal_of(label)
     if proposal is not None:
         return len(proposal.labels)
@@ -104,7 +104,7 @@ def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
 
 
 def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
-    """The document without these proposals. The open sessions that they had are open again."""
+    """Return the document without these proposals. The open sessions that they had are open again."""
     if not any(each.id in ids for each in document.proposed):
         return document
     opened = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
@@ -185,7 +185,10 @@ def give_up(document: Decisions, one: Unmatched) -> Decisions:
 
 
 def without_done(document: Decisions, done: Collection[str]) -> Decisions:
-    """The document without the decisions that are carried out: sessions' ids and unmatched participants' labels."""
+    """Return the document without the decisions that are carried out.
+
+    `done` holds the ids of sessions, and the labels of unmatched participants.
+    """
     if not any(each.id in done for each in document.formed) and not any(
         each.label in done for each in document.unmatched
     ):
@@ -198,7 +201,10 @@ def without_done(document: Decisions, done: Collection[str]) -> Decisions:
 
 
 def without(document: Decisions, label: str) -> Decisions:
-    """The document without this participant, whose data are erased. Their seat in a formed session is empty then."""
+    """Return the document without this participant, whose data are erased.
+
+    Their seat in a formed session is empty then.
+    """
 
     def unnamed(ahead: OpenSession | None) -> OpenSession | None:
         return msgspec.structs.replace(ahead, by="") if ahead and ahead.by == label else ahead

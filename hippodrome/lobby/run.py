@@ -37,7 +37,7 @@ class StartedAhead:
         return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
 
     def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:
-        """The document with these servers given to the sessions that wait for one."""
+        """Return the document after these servers have been given to the sessions that wait for one."""
         return servers_ahead.with_ready_servers(
             document, self.ready, self.over, now, coming=self.coming, open_for=open_for
         )
@@ -50,7 +50,7 @@ class LobbyRun:
     project: Project
     known: Decisions
     entries: Entries
-    members: Mapping[str, Sequence[Matched]]  # of the sessions that it can form, by the proposal's id
+    members: Mapping[str, Sequence[Matched]]  # of the sessions that this run can form, by the proposal's id
     broken: Collection[str]  # the proposals of sessions that cannot be formed
     now: datetime
     open_for: timedelta
@@ -58,7 +58,7 @@ class LobbyRun:
     chosen: Sequence[Sequence[str]] = ()  # the sessions that the function `match` has chosen, by their members' labels
 
     def decided(self, document: Decisions) -> Decisions:
-        """The document with all decisions that this run can make."""
+        """Return the document with all decisions that this run can make."""
         document = rules.without_done(document, self.entries.done)
         document = rules.without_proposals(document, self.broken)
         for proposal_id, found in self.members.items():

@@ -17,10 +17,10 @@ SERVER_WITHIN = timedelta(minutes=5)
 
 
 def sessions_wanted(document: Decisions, entries: Entries, project: Project, also: Collection[str] = ()) -> int:
-    """How many open sessions there should be: one for every `players` participants who are under way or wait.
+    """Return how many open sessions there should be: one for every `players` participants who are under way or wait.
 
-    `also` are the labels of further participants who are under way. At most `maxServers`, since no more can run; 0 in a
-    project that is closed.
+    `also` are the labels of further participants who are under way. The result is at most `maxServers`, since no more
+    servers can run; it is 0 in a project that is closed.
     """
     if not project.live:
         return 0
@@ -39,7 +39,7 @@ def open_sessions(
     players: int,
     open_for: timedelta,
 ) -> Decisions:
-    """The document with new open sessions for `players`, so that at least `wanted` can be used."""
+    """Return the document with new open sessions for `players`, as many as are needed to have `wanted` usable ones."""
     usable = sum(each.is_usable(players, now, open_for) for each in document.open)
     added = [OpenSession(new_id(), now, by, players) for _ in range(wanted - usable)]
     return msgspec.structs.replace(document, open=by_age([*document.open, *added])) if added else document
@@ -71,7 +71,7 @@ def with_ready_servers(
     opened = list(document.open)
     usable = {each.id for each in opened if each.is_usable(each.players, now, open_for)}
     left = len({*usable, *(each.id for each in servers)} & set(ready))  # of those that are ready
-    given: dict[tuple[str, ...], str] = {}  # to the session of these labels
+    given: dict[tuple[str, ...], str] = {}  # by the labels of a session, the id of its server
     for at, session in enumerate(sessions):
         players = servers[at].players
         fits = [n for n, each in enumerate(opened) if each.id in usable and each.players == players]
@@ -111,14 +111,15 @@ def surplus(
     players: int,
     open_for: timedelta,
 ) -> frozenset[str]:
-    """The ids of open sessions to remove: those that can no longer be used, those in `over`, and those beyond `wanted`.
+    """Return the ids of the open sessions to remove.
 
-    The sessions whose servers were requested last are beyond `wanted`: these servers take longest to be ready.
+    These are the sessions that can no longer be used, those in `over`, and those beyond `wanted`: the ones whose
+    servers were requested last, since they take longest to be ready.
     """
     usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
     return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])
 
 
 def without_open(document: Decisions, ids: Collection[str]) -> Decisions:
-    """The document without these open sessions."""
+    """Return the document without these open sessions."""
     return msgspec.structs.replace(document, open=tuple(each for each in document.open if each.id not in ids))

@@ -27,11 +27,11 @@ from protocol.session import BadSession, SessionDocument
 from protocol.times import time_text
 
 FORMED_LATELY = timedelta(hours=1)
-"""Sessions that were formed longer ago have been written completely, or finished by a sweep."""
+"""Sessions formed within this time may not be written completely. Older ones are, at the latest by a sweep."""
 
 
 class LobbyStore:
-    """The documents of all lobbies."""
+    """Reads and writes the documents of all lobbies."""
 
     def __init__(self, platform: Platform, repository: Repository) -> None:
         self._platform = platform
@@ -50,7 +50,7 @@ class LobbyStore:
             return self.change(project, lambda document: document)
 
     def change(self, project: Project, change: Callable[[Decisions], Decisions]) -> Decisions:
-        """Change the document of decisions, and count its version; return the new document. Raises `RetryLater`."""
+        """Change the document of decisions, give it the next version number, and return it. Raises `RetryLater`."""
 
         def counted(document: Decisions) -> Decisions:
             return decisions.next_version(document, change(document))
@@ -61,10 +61,10 @@ class LobbyStore:
     # Entries
 
     def entries(self, project: Project, label: str | None = None) -> Entries:
-        """The entries of all participants in the lobby, or only of the one with this label. One listing.
+        """Return the entries in the lobby: those of all participants, or of the one with this label.
 
         A participant counts as under way as long as the server that was started ahead for them can be used. So a
-        participant who never comes costs no second server.
+        participant who never comes costs no second server. AWS calls: one listing.
         """
         prefix = lobby_entries.prefix_of(project.id, label) if label else lobby_entries.folder(project.id)
         way = min(timedelta(minutes=project.max_runtime), sessions.open_for(project, self._platform.settings))
@@ -80,10 +80,11 @@ class LobbyStore:
     def carry_out(self, project: Project, decided: Decisions, entries: Entries) -> Mapping[str, Membership]:
         """Write the sessions' documents and all memberships, delete the entries, and mark the decisions as done.
 
-        Return the memberships by label. A session's memberships are written after everything else that it needs, and
-        its mark is written last: until then, any run does all of this again. The marked decisions leave the document
-        with its next other change, so that a crowd does not wait for one more write. The answers of unmatched
-        participants are written at their next request (`Lobby.visit`): the sweep's role may write no answers.
+        Returns the memberships by label. A session's memberships are written after everything else that the session
+        needs, and its mark is written last: until the mark is there, any run does all of this again. The marked
+        decisions leave the document with its next other change, so that a crowd does not wait for one more write. The
+        answers of unmatched participants are written at their next request (`Lobby.visit`): the sweep's role may write
+        no answers.
         """
         made: dict[str, Membership] = {}
         for formed in decided.formed:
@@ -100,7 +101,8 @@ class LobbyStore:
         """Write the missing memberships of sessions that were formed lately, and send start messages that may be lost.
 
         This is for a lobby whose document was lost while they were written: a session's own document names all its
-        members. One listing of all sessions' documents and recordings, and a read for each session formed lately.
+        members. AWS calls: one listing of all sessions' documents and recordings, and a read for each session formed
+        lately.
         """
         since = self._platform.now() - FORMED_LATELY
         for entry in self._documents.list(sessions_folder(project.id)):

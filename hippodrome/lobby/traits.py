@@ -17,23 +17,27 @@ _LENGTH = 10  # hex digits
 
 
 def trait(project: Project, group: int | None, answers: Mapping[str, Any]) -> str:
-    """The participant's trait: a hash of their answer or group. All participants without an answer have the same."""
+    """Return the participant's trait: a hash of the answer or of the group by which `matching` matches.
+
+    Participants without an answer have the same trait as each other.
+    """
     if (field := field_of(project.matching)) is not None:
         return _hash(project, answers.get(field))
     return _hash(project, group) if project.matching in ("group", "mixed") else NO_TRAIT
 
 
 def together(project: Project) -> bool:
-    """Whether the members of a session must have the same trait; if not, they must have different ones."""
+    """Return whether the members of a session must have the same trait; if not, they must have different ones."""
     if isinstance(project.matching, dict):
         return "same" in project.matching
     return project.matching != "mixed"
 
 
 def most_of_one(project: Project) -> int:
-    """How many members of a session may have the same trait if members must have different ones.
+    """Return how many members of a session may have the same trait if members must have different ones.
 
-    One; more only with `mixed`, if there are fewer groups than players.
+    This is one. But with `matching: mixed` and fewer groups than players, several members must share a group: then it
+    is the number of players divided by the number of groups, rounded up.
     """
     mixed = project.matching == "mixed" and project.groups
     return math.ceil(project.players / project.groups) if mixed else 1

@@ -16,19 +16,22 @@ from hippodrome.model.step_order import FINAL, default_start, default_stop, posi
 from hippodrome.model.step_types import type_of
 
 SALT = "hippo"
-"""The salt of such a project, for its secret. A registration keeps it, so tickets and codes stay valid."""
+"""The salt of a project whose entry HIPPO wrote: the project's secret is derived from it.
+
+A registration keeps the salt, so tickets and codes stay valid.
+"""
 
 USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes: HIPPO's default, and the most that we take
 _PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 
 
 def is_hippos(entry: Mapping[str, Any]) -> bool:
-    """Whether HIPPO wrote this entry: its steps are a map. In our entries they are a list."""
+    """Return whether HIPPO wrote this entry: its steps are a map. In our entries they are a list."""
     return isinstance(entry.get("steps"), dict)
 
 
 def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry as the fields of a `Project`. Raises ValueError if participants could not take part in it."""
+    """Return the entry as the fields of a `Project`. Raises ValueError if participants could not take part in it."""
     pages = _pages(entry["steps"])
     keys = visited(list(pages), pages)
     if type_of(pages[keys[-1]]).on_server:
@@ -53,7 +56,8 @@ def _pages(steps: Mapping[str, Any]) -> dict[str, str]:
     """The pages in order, by their keys. Steps without a page are left out, and the keys of later steps count less."""
     numbers = _numbers(steps)
     if numbers != list(range(1, len(numbers) + 1)):
-        raise ValueError("a number between its steps is missing")
+        missing = next(number for number, given in enumerate(numbers, 1) if number != given)
+        raise ValueError(f"it has no step {missing}, but later ones; number the steps without a gap")
     with_page = [number for number in numbers if not _is_blank(steps[str(number)])]
     pages = {str(now): _page(steps[str(number)]) for now, number in enumerate(with_page, 1)}
     if not _is_blank(steps.get(FINAL)):

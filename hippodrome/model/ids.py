@@ -14,7 +14,8 @@ PROJECT_ID = re.compile(r"(?!_)[A-Za-z0-9_-]{1,64}")
 """A valid project id. It stands in S3 keys, in the family of a task definition, in an image's tag and in links.
 
 ECS takes letters, digits, `-` and `_` in a family (API_RegisterTaskDefinition); ECR takes these and `.` in a tag. No
-DNS name holds a project's id. Our own folders in the bucket begin with `_`, so no id does.
+DNS name holds a project's id. Our own folders in the bucket begin with `_`, so no id does; a registration also refuses
+`SSL`, the folder of the certificates.
 """
 USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
@@ -24,33 +25,35 @@ _DELAYED = "-delay"
 
 
 def is_project_id(text: object) -> bool:
-    """Whether `text` is 1 to 64 letters, digits, dashes and underscores, and does not begin with an underscore."""
+    """Return whether `text` can be a project's id: 1 to 64 letters, digits, dashes and underscores, with no underscore
+    at the beginning.
+    """
     return isinstance(text, str) and PROJECT_ID.fullmatch(text) is not None
 
 
 def is_user_id(text: object) -> bool:
-    """Whether `text` is 1 to 64 letters, digits, dashes and underscores."""
+    """Return whether `text` can be a participant's id: 1 to 64 letters, digits, dashes and underscores."""
     return isinstance(text, str) and USER_ID.fullmatch(text) is not None
 
 
 def warm_id(project_id: str, asked: datetime, number: int) -> str:
-    """The user id in the record of this warm server. It is no valid participant's id, so no link can name it."""
+    """Return the user id in the record of this warm server. It is no valid participant's id, so no link can name it."""
     return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_warm_id(text: object) -> bool:
-    """Whether this user id is a warm server's."""
+    """Return whether this user id is a warm server's."""
     return isinstance(text, str) and _WARM_ID.fullmatch(text) is not None
 
 
 def new_session_id() -> str:
-    """A new random id of a session or a proposal. It is no valid participant's id, so no link names it."""
+    """Return a new random id of a session or a proposal. It is no valid participant's id, so no link names it."""
     return f"s.{secrets.token_hex(10)}"
 
 
 @functools.lru_cache(maxsize=1024)  # a request asks several times, and base32 is encoded in Python
 def server_label(project_id: str, user_id: str) -> str:
-    """The label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
+    """Return the label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
 
     It has 21 characters of `[a-z2-7]`, the first a letter. Its 100 bits tell a million participants apart.
     """
@@ -59,33 +62,33 @@ def server_label(project_id: str, user_id: str) -> str:
 
 
 def server_name(label: str, attempt: int) -> str:
-    """The name of one attempt of a server: its DNS label, its task's `startedBy`, and its timer's name."""
+    """Return the name of one attempt of a server: its DNS label, its task's `startedBy`, and its timer's name."""
     return f"{label}-{attempt}"
 
 
 def parse_server_name(name: str) -> tuple[str, int] | None:
-    """The label and the attempt in a server's name; None if this is no server's name."""
+    """Return the label and the attempt in a server's name; None if this is no server's name."""
     found = _SERVER_NAME.fullmatch(name)
     return (found[1], int(found[2])) if found else None
 
 
 def delayed_timer(name: str) -> str:
-    """The name of a server's second timer, with which the stop relay stops it after a delay."""
+    """Return the name of a server's second timer: it stops the server after the `delay` of a stop request."""
     return name + _DELAYED
 
 
 def timer_server(timer: str) -> str:
-    """The name of the server that this timer stops. A server may have two timers."""
+    """Return the name of the server that this timer stops. A server may have two timers."""
     return timer.removesuffix(_DELAYED)
 
 
 def host_server(domain_name: str) -> str:
-    """The first label of a server's DNS name, which by default is the server's name."""
+    """Return the first label of a server's DNS name, which by default is the server's name."""
     return domain_name.partition(".")[0]
 
 
 def is_host_label(text: str) -> bool:
-    """Whether a server's DNS name may begin with this label: it is valid, and no server's default name.
+    """Return whether a server's DNS name may begin with this label: it is valid, and no server's default name.
 
     A label has at most 63 bytes (RFC 1035, 2.3.4); for a longer one Route 53 refuses a whole batch of changes
     (DomainLabelTooLong). Route 53 takes any printable character and stores letters in lower case (Route 53 Developer
@@ -96,29 +99,35 @@ def is_host_label(text: str) -> bool:
 
 
 def group(project_id: str, user_id: str, variants: int) -> int:
-    """The participant's group, 0 to `variants` - 1. It never changes, and all groups are equally likely.
+    """Return the participant's group, 0 to `variants` - 1. It never changes, and all groups are equally likely.
 
-    A participant has the same group at all steps with the same number of variants. The groups for different numbers are
-    independent.
+    `variants` is the number of a page's versions. A participant has the same group at all steps with this number. The
+    groups for different numbers are independent.
     """
     digest = hashlib.sha256(f"group\0{variants}\0{project_id}\0{user_id}".encode()).digest()
     return int.from_bytes(digest[:16], "big") % variants
 
 
 def ticket(secret: str, user_id: str, step: str) -> str:
-    """Proof, in a page's form, that this participant was shown this step. 32 hex digits of an HMAC."""
+    """Return the ticket in a page's form, which proves that this participant was shown this step.
+
+    It is 32 hex digits of an HMAC with the project's `secret`.
+    """
     return hmac.new(secret.encode(), f"ticket\0{user_id}\0{step}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def link_signature(secret: str, project_id: str, user_id: str) -> str:
-    """Proof, in a link, that this participant is invited. 32 hex digits of an HMAC with the project's secret."""
+    """Return the signature in a participant's link, which proves that the participant is invited.
+
+    It is 32 hex digits of an HMAC with the project's `secret`.
+    """
     return hmac.new(secret.encode(), f"link\0{project_id}\0{user_id}".encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
-    """The code that a participant gives to the recruiter: 10 characters of an HMAC with the project's secret.
+    """Return the code that a participant gives to the recruiter: 10 characters of an HMAC with the project's `secret`.
 
-    Each `outcome`, such as `unmatched`, has another code.
+    Each `outcome`, such as `unmatched`, gives another code.
     """
     about = f"completion\0{user_id}" + (f"\0{outcome}" if outcome else "")
     digest = hmac.new(secret.encode(), about.encode(), hashlib.sha256).digest()
@@ -126,5 +135,5 @@ def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
 
 
 def secrets_equal(given: str, expected: str) -> bool:
-    """Compare a given secret, which may hold any characters, with the expected one in constant time."""
+    """Return whether a given secret, which may hold any characters, is the expected one. Takes constant time."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())

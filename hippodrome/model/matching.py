@@ -16,5 +16,8 @@ the members."""
 
 
 def field_of(matching: str | Mapping[str, str]) -> str | None:
-    """The field of an earlier page by whose answers participants are matched; None if they are matched otherwise."""
+    """Return the field of an earlier page by whose answers participants are matched.
+
+    The result is None if they are not matched by answers.
+    """
     return None if isinstance(matching, str) else next(iter(matching.values()), None)

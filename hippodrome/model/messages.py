@@ -31,7 +31,7 @@ _WORDS_WITHOUT_CODE = (  # patterns of stoppedReason that decide only if there i
 
 
 class StartServer(Record, frozen=True):
-    """Start topic: start this participant's server. `attempt` counts from 1.
+    """A message of the start topic: start this participant's server. `attempt` counts from 1.
 
     `user_id` may also be a warm server's id, or a session's. In a project with several players a participant's message
     starts no server of their own: it says that they are under way to the game. `players` is the number of players of a
@@ -45,7 +45,10 @@ class StartServer(Record, frozen=True):
 
 
 class StopServer(Record, frozen=True):
-    """Stop topic: stop this attempt of the server; without `attempt`, as in HIPPO's messages, the present one."""
+    """A message of the stop topic: stop this attempt of the server.
+
+    Without `attempt`, as in HIPPO's messages, it means the present attempt.
+    """
 
     project_id: str
     user_id: str
@@ -54,13 +57,16 @@ class StopServer(Record, frozen=True):
 
 
 class StopUser(Record, frozen=True):
-    """Stop topic: stop the participant's servers in all projects. HIPPO's relay and timers name no project."""
+    """A message of the stop topic: stop the participant's servers in all projects.
+
+    HIPPO's relay and timers send it, since they name no project.
+    """
 
     user_id: str
 
 
 class KeepWarm(Record, frozen=True):
-    """Start topic: bring the project's pool of warm servers to its size."""
+    """A message of the start topic: bring the project's pool of warm servers to its size."""
 
     keep_warm: str  # the project's id
 
@@ -73,9 +79,9 @@ class ServerAttempt(Record, frozen=True):
 
 
 class DnsChanged(Record, frozen=True):
-    """From `task_changed` to itself: check whether this DNS change is INSYNC, so that these servers are ready.
+    """A message from `task_changed` to itself: look whether this DNS change is INSYNC. Then these servers are ready.
 
-    `looked` counts the checks before this one. `unmade`: the zone was busy, so the change must still be made.
+    `looked` counts the checks before this one. With `unmade`, the zone was busy, and the change must still be made.
     """
 
     change: str
@@ -85,7 +91,7 @@ class DnsChanged(Record, frozen=True):
 
 
 class TaskSeen(Record, frozen=True):
-    """To `task_changed`, from itself or the sweep: this task runs and has no DNS record yet.
+    """A message to `task_changed`, from itself or the sweep: this task runs and has no DNS record yet.
 
     `looked` counts how often its address was looked up before.
     """
@@ -113,7 +119,7 @@ class TaskChanged(NamedTuple):
 
 
 def body_of(record: Any) -> Any:
-    """The JSON message in a record of SQS or SNS; None if it is not JSON.
+    """Return the JSON message in a record of SQS or SNS; None if it is not JSON.
 
     SNS puts a message into an envelope. In an SQS record the envelope is JSON text; in an event that SNS sends to a
     function it is an object: https://docs.aws.amazon.com/lambda/latest/dg/with-sns.html
@@ -215,7 +221,7 @@ def _stop_code(detail: Mapping[str, Any]) -> str | None:
 
 
 def to_message(record: Record) -> Message:
-    """The message as plain JSON data for the bus."""
+    """Return the message as plain JSON data for the bus."""
     return dict(msgspec.to_builtins(record))
 
 

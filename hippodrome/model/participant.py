@@ -58,28 +58,30 @@ class Progress:
         return cls(has_arrived, answered)
 
     def due_step(self, project: Project) -> Step:
-        """The step that is due: the first without an answer, or the final one."""
+        """Return the step that is due: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 
     def recently_answered(self, project: Project, now: datetime) -> list[str]:
-        """Keys of the pages answered within the last `REPEAT_WINDOW`, latest first, at most `MAX_COMPARED`."""
+        """Return the keys of the pages answered within the last `REPEAT_WINDOW`: the latest first, at most
+        `MAX_COMPARED`.
+        """
         keys = [step.key for step in project.steps if not step.type.on_server and step.key in self.answered]
         recent = [key for key in keys if now - self.answered[key] < REPEAT_WINDOW]
         return sorted(recent, key=self.answered.__getitem__, reverse=True)[:MAX_COMPARED]
 
     def reached_at(self, project: Project, step: Step) -> datetime | None:
-        """When the participant reached `step`, that is, answered the step before it; None at the first step."""
+        """Return when the participant reached `step`, that is, answered the step before it; None for the first step."""
         at = project.index(step.key)
         return self.answered.get(project.steps[at - 1].key) if at else None
 
 
 def participant_key(project_id: str, user_id: str) -> str:
-    """The key of a participant's record."""
+    """Return the key of a participant's record."""
     return f"{participant_folder(project_id, user_id)}participant.json"
 
 
 def new_participant(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
-    """The record of a participant who opens the link for the first time."""
+    """Return the record of a participant who opens the link for the first time."""
     return Participant(
         project_id=project.id,
         user_id=user_id,
@@ -91,7 +93,7 @@ def new_participant(project: Project, user_id: str, link: Mapping[str, str], now
 
 
 def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
-    """The record of the answers to `step`."""
+    """Return the record of the answers to `step`."""
     return Answer(
         step=step.key,
         page=project.file(user_id, step),
@@ -102,41 +104,47 @@ def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str,
 
 
 def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two forms hold the same answers; the order of their fields does not count."""
+    """Return whether two forms hold the same answers, in whatever order their fields are."""
     return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
 def following_step(project: Project, step: Step) -> Step | None:
-    """The next step; None after the last."""
+    """Return the next step; None after the last."""
     at = project.index(step.key)
     return project.steps[at + 1] if at is not None and at + 1 < len(project.steps) else None
 
 
 def starts_server(project: Project, step: Step) -> bool:
-    """Whether the participant's server is started when this step is reached."""
+    """Return whether the participant's server is started when this step is reached."""
     return step.key == project.events.start_server_step
 
 
 def stops_server(project: Project, step: Step) -> bool:
-    """Whether the participant's server is stopped when this step is reached."""
+    """Return whether the participant's server is stopped when this step is reached."""
     return step.key == project.events.stop_server_step
 
 
 def may_have_server(project: Project, step: Step) -> bool:
-    """Whether the participant may have a server at this step: at the start step or later, and before the stop step."""
+    """Return whether the participant may have a server at this step.
+
+    They may from the step at which servers start on, and before the step at which they stop.
+    """
     start = project.events.start_server_step
     at, first = project.index(step.key), project.index(start) if start else None
     return at is not None and first is not None and first <= at and not is_past_server(project, step)
 
 
 def is_past_server(project: Project, step: Step) -> bool:
-    """Whether the participant needs no server any more at this step: it is the stop step or a later one."""
+    """Return whether the participant needs no server any more at this step: it is the stop step or a later one."""
     stop = project.events.stop_server_step
     at, last = project.index(step.key), project.index(stop) if stop else None
     return at is not None and last is not None and at >= last
 
 
 def reached_without_post(project: Project, step: Step) -> bool:
-    """Whether this step follows a game: the trial stored the answer, so no POST has published this step's messages."""
+    """Return whether this step follows a game step.
+
+    The trial stores the answer to a game step, so no POST has published the messages of the step after it.
+    """
     at = project.index(step.key)
     return bool(at) and project.steps[(at or 0) - 1].type.on_server

@@ -59,7 +59,10 @@ class AwsSetup(Record, frozen=True):
 
 
 class Ssl(Record, frozen=True):
-    """The bucket and the keys of the servers' certificate."""
+    """HIPPO's section `ssl`: the bucket and the keys of a certificate.
+
+    It is stored and has no effect: servers get the installation's certificate.
+    """
 
     ssl_bucket: str | None = None
     fullchain: str | None = None
@@ -102,7 +105,7 @@ class Project(Record, frozen=True):
     front_end: list[str] = msgspec.field(default_factory=list)  # the origins of that front end
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
     max_participants: int | None = None
-    max_servers: int | None = None  # at once
+    max_servers: int | None = None  # how many servers may run at once
     max_server_hours: int | None = None  # of all servers together, ever
     warm_servers: int = 0  # how many servers to keep started ahead of participants
     signed_links: bool = False
@@ -152,7 +155,10 @@ class Project(Record, frozen=True):
         return self.players > 1
 
     def following(self, before: Project | None) -> Project:
-        """This registration, with those for other numbers of players from `before`, the present registration."""
+        """Return this registration, with the last registrations for other numbers of players.
+
+        These are taken from `before`, the present registration, which this one replaces.
+        """
         kept = {each.players: each for each in (before.other_numbers if before else ())}
         if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
@@ -160,10 +166,10 @@ class Project(Record, frozen=True):
         return msgspec.structs.replace(self, other_numbers=others)
 
     def for_session(self, players: int) -> Project | None:
-        """The project as it was registered last for this number of players, for servers of sessions with that number.
+        """Return the project as it was registered last for sessions of this number of players.
 
-        0 stands for the number that is registered now. None if the number was never registered. The result for another
-        number has no warm servers: they run only the present registration.
+        0 stands for the number that is registered now. The result is None if the number was never registered. The
+        result for another number has no warm servers: they run only the present registration.
         """
         if players in (0, self.players):
             return self
@@ -188,35 +194,42 @@ class Project(Record, frozen=True):
         return self.max_servers is not None or self.max_server_hours is not None
 
     def page_key(self, file: str) -> str:
-        """The key of a step page; `file` is the page's name without `.html`."""
+        """Return the key of a step page; `file` is the page's name without `.html`."""
         return step_key(self.id, file, self.page_folder)
 
     def index(self, key: str) -> int | None:
-        """The position of this step, from 0; None if the project has no such step."""
+        """Return the position of this step, from 0; None if the project has no such step."""
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 
     def step(self, key: str | None) -> Step | None:
-        """The step with this key; None if the project has no such step."""
+        """Return the step with this key; None if the project has no such step."""
         return next((step for step in self.steps if step.key == key), None)
 
     def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
-        """The step with this key, if the ticket proves that this participant was shown that step; else None."""
+        """Return the step with this key, if the ticket proves that this participant was shown that step; else None."""
         step = self.step(key)
         proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key))
         return step if proven else None
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:
-        """The participant's group at this step if it has variants, else in the study; None if there are no groups."""
+        """Return the participant's group at this step, if the step has variants; otherwise their group in the study.
+
+        The result is None if there are no groups.
+        """
         variants = (step.variants if step else 0) or self.groups
         return ids.group(self.id, user_id, variants) if variants else None
 
     def file(self, user_id: str, step: Step) -> str:
-        """The name of the step file that this participant sees, such as `consent-1`; `page` if it has no variants."""
+        """Return the name of the step file that this participant sees, such as `consent-1`; `page` if it has no
+        variants.
+        """
         return f"{step.page}-{ids.group(self.id, user_id, step.variants)}" if step.variants else step.page
 
 
 def number_of_groups(variants: Iterable[int]) -> int:
-    """The number of groups of participants, given the number of variants of each page; 0 if no page has variants."""
+    """Return the number of groups of participants, given the number of variants of each page; 0 if no page has
+    variants.
+    """
     return max(variants, default=0)
 
 
@@ -240,14 +253,15 @@ class MasterList(Record, frozen=True):
     hippos: Mapping[str, bytes] = msgspec.field(default_factory=dict)
 
     def find(self, project_id: str) -> Project | None:
+        """Return the project with this id; None if the list has no entry of it that can be read."""
         return next((project for project in self.projects if project.id == project_id), None)
 
     def is_unreadable(self, project_id: str) -> bool:
-        """Whether this project has an entry that cannot be read, and none that can."""
+        """Return whether this project has an entry that cannot be read, and none that can."""
         return self.find(project_id) is None and any(entry.id == project_id for entry in self.unreadable)
 
     def salt(self, project_id: str) -> str | None:
-        """The project's salt, also from an entry that cannot be read; None if the project has no entry."""
+        """Return the project's salt, also from an entry that cannot be read; None if the project has no entry."""
         found = self.find(project_id)
         if found:
             return found.salt
@@ -255,19 +269,22 @@ class MasterList(Record, frozen=True):
         return next((_string(entry, "salt") for entry in entries), None)
 
     def secrets(self) -> dict[str, str]:
-        """The secrets that an earlier version wrote into entries, readable or not, by project id."""
+        """Return the secrets that an earlier version wrote into entries, by project id.
+
+        Entries that cannot be read are included.
+        """
         unread = {entry.id: _string(_as_object(entry.raw), "secret") for entry in self.unreadable if entry.id}
         known = unread | {project.id: project.secret for project in self.projects}
         return {project_id: secret for project_id, secret in known.items() if secret}
 
     def without_secrets(self) -> MasterList:
-        """The list as it is stored: researchers may read it, so it holds no secret."""
+        """Return the list as it is stored. It holds no secret, since researchers may read it."""
         projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
         unread = tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable)
         return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.hippos.items()})
 
     def with_project(self, project: Project) -> MasterList:
-        """The list with this project, which replaces any entry with its id, readable or not."""
+        """Return the list with this project, which replaces any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
         unread = tuple(entry for entry in self.unreadable if entry.id != project.id)
@@ -320,7 +337,7 @@ def _unreadable(raw: bytes, error: Exception) -> UnreadableEntry:
 
 
 def write_list(listed: MasterList) -> bytes:
-    """The master list as JSON. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
+    """Return the master list as JSON. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
     projects = [
         msgspec.Raw(listed.hippos.get(project.id) or msgspec.json.encode(project)) for project in listed.projects
     ]
@@ -353,5 +370,5 @@ MASTER_LIST = "project_master_list.json"
 
 
 def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:
-    """The key of a step page; `file` is its name without `.html`, `folder` the project's `page_folder`."""
+    """Return the key of a step page; `file` is its name without `.html`, `folder` the project's `page_folder`."""
     return f"{project_id}/{folder}/{file}.html" if folder else f"{project_id}/{file}.html"

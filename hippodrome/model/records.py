@@ -25,17 +25,25 @@ _making = threading.Lock()  # held while msgspec inspects a type of record, and 
 
 
 def to_json(record: Record) -> bytes:
-    """The record as JSON, indented so that a researcher can read it."""
+    """Return the record as JSON, indented so that a researcher can read it."""
     return msgspec.json.format(_encoder.encode(record), indent=1)
 
 
 def from_json(body: bytes, kind: type[T]) -> T:
-    """The record in a document. Raises `msgspec.DecodeError` (a ValueError) if it is not one, or RecursionError."""
+    """Return the record in a document.
+
+    Raises `msgspec.DecodeError` (a ValueError) if the document holds no such record, or RecursionError if it is nested
+    too deep.
+    """
     return _decoder(kind).decode(body)
 
 
 def from_data(data: Any, kind: type[T]) -> T:
-    """The record in plain JSON data. Raises `msgspec.ValidationError` (a ValueError), or RecursionError."""
+    """Return the record in plain JSON data.
+
+    Raises `msgspec.ValidationError` (a ValueError) if the data are no such record, or RecursionError if they are nested
+    too deep.
+    """
     _decoder(kind)
     return msgspec.convert(data, kind)
 

@@ -33,6 +33,8 @@ R = TypeVar("R")
 
 
 class ServerState(StrEnum):
+    """The state of a server, as its record has it."""
+
     QUEUED = "queued"  # never stored: there is no record yet
     STARTING = "starting"
     NAMING = "naming"
@@ -140,18 +142,22 @@ class Server(Record, frozen=True):
         return self.state is ServerState.CLOSED
 
     def lacks(self, step_key: str) -> bool:
-        """Whether it can never play this game step, because the steps were registered anew since it was started.
+        """Return whether the steps were registered anew since this server was started, so that it cannot play this one.
 
-        False for records of earlier versions, which do not say it, and for a session's server, on which others play.
+        The result is False for records of earlier versions, which do not name their steps, and for a session's server,
+        on which others play.
         """
         return bool(self.game_steps) and not self.is_sessions and step_key not in self.game_steps
 
     def is_open(self, attempt: int) -> bool:
-        """Whether the record is at this attempt and not closed."""
+        """Return whether the record is at this attempt and not closed."""
         return self.attempt == attempt and not self.is_closed
 
     def owns(self, name: str) -> bool:
-        """Whether this open record owns the resources of this name, which is a warm server's if one was assigned."""
+        """Return whether this record is open and owns the resources of this name.
+
+        If a warm server was assigned, the record owns the resources of the warm server's name.
+        """
         return self.name == name and not self.is_closed
 
     @property
@@ -186,8 +192,8 @@ class TaskStopped(NamedTuple):
 def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Server]) -> R | None:
     """Return the record that owns the resources of this name, following handovers; None if there is none.
 
-    `read` returns the stored record under a label, and `server` the `Server` in it. One read; two for an assigned warm
-    server. The record may be at another attempt now: compare its `name`.
+    `read` returns the stored record under a label, and `server` the `Server` in it. The record may be at another
+    attempt now: compare its `name`. `read` is called once; twice for an assigned warm server.
     """
     parsed = ids.parse_server_name(name)
     found = read(parsed[0]) if parsed else None
@@ -199,20 +205,20 @@ def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Serv
 
 
 def key(label: str) -> str:
-    """The key of the record under this label. The names of the server's resources begin with the label, too."""
+    """Return the key of the record under this label. The names of the server's resources begin with the label, too."""
     return f"{RECORDS}{label}.json"
 
 
 def new_attempt(
     project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
 ) -> Server:
-    """The record of a new attempt. It is written before anything is started.
+    """Return the record of a new attempt, to be written before anything is started.
 
-    Its DNS name is a hash below the servers' domain. With `subdomain: userId` the participant's id takes the place of
-    the hash, if the installation allows it and the id is a valid DNS label. Ids come with the link, so the author of a
-    link chooses that label, but no other part of the name. The deadline of a warm server bounds its waiting; once it is
-    assigned, it gets the same time to play as other servers. A session's server gets the time in which it may wait for
-    its members in addition (`sessions.lifetime`).
+    The server's DNS name is a hash below the servers' domain. With `subdomain: userId` the participant's id takes the
+    place of the hash, if the installation allows it and the id is a valid DNS label. Ids come with the link, so the
+    author of a link chooses that label, but no other part of the name. The deadline of a warm server bounds its
+    waiting; once it is assigned, it gets the same time to play as other servers. A session's server gets, in addition,
+    the time in which it may wait for its members (`sessions.lifetime`).
     """
     label = ids.server_label(project.id, user_id)
     name = ids.server_name(label, attempt)
@@ -243,7 +249,7 @@ def new_attempt(
 
 
 def past_attempt(server: Server) -> PastAttempt:
-    """The part of this attempt that the next attempt's record keeps."""
+    """Return what the record of the next attempt keeps of this attempt."""
     return PastAttempt(
         attempt=server.attempt,
         requested=server.requested,
@@ -261,19 +267,22 @@ def past_attempt(server: Server) -> PastAttempt:
 
 
 def next_attempt(closed: Server) -> int | None:
-    """The attempt that automatically replaces a closed server; None if there is none, as for a warm server."""
+    """Return the attempt that replaces a closed server without a request; None if none does, as for a warm server."""
     if closed.is_warm_server or not closed.is_closed or closed.attempt >= AUTOMATIC_ATTEMPTS:
         return None
     return closed.attempt + 1 if closed.reason in REPLACED else None
 
 
 def plays_on(record: Server) -> bool:
-    """Whether the server runs, or its next attempt starts without a request."""
+    """Return whether the server is open, or its next attempt is started without a request of the participant."""
     return not record.is_closed or next_attempt(record) is not None
 
 
 def requestable_attempt(record: Server) -> int | None:
-    """The attempt that the participant may request; None if there is none. An attempt without a slot is repeated."""
+    """Return the attempt that the participant may request now; None if they may request none.
+
+    If the last attempt found no free slot, it is the same attempt again.
+    """
     if not record.is_closed or next_attempt(record) is not None:
         return None
     if record.reason is Reason.FULL:
@@ -282,22 +291,25 @@ def requestable_attempt(record: Server) -> int | None:
 
 
 def replacing(before: Server, wanted: Server) -> Server:
-    """The next attempt's record `wanted`, with the closed attempt `before` added to `earlier`."""
+    """Return the record `wanted` of the next attempt, with the closed attempt `before` added to its `earlier`."""
     return msgspec.structs.replace(wanted, earlier=(*before.earlier, past_attempt(before)))
 
 
 def found_no_slot(server: Server, attempt: int) -> bool:
-    """Whether this attempt was closed because no slot was free. Nothing was started, so it may be repeated."""
+    """Return whether this attempt was closed because no slot was free. It started nothing, so it may be repeated."""
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
 def repeating(before: Server, wanted: Server) -> Server:
-    """The record `wanted` of an attempt that found no slot and is repeated, with the attempts before it."""
+    """Return the record `wanted` with the earlier attempts of `before`, an attempt without a slot that it repeats."""
     return msgspec.structs.replace(wanted, earlier=before.earlier)
 
 
 def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:
-    """The closed record of a server that was stopped before it was started. A late start message finds it closed."""
+    """Return the closed record of a server that was stopped before it was started.
+
+    The start message, which comes later, finds it closed and starts nothing.
+    """
     return Server(
         project_id=project_id,
         user_id=user_id,
@@ -313,7 +325,7 @@ def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datet
 
 
 def on_demand(server: Server) -> Server:
-    """The record of a server that runs on demand, because Spot has no capacity.
+    """Return the record of a server that is to run on demand, because Spot has no capacity.
 
     It is written before RunTask is called again, so that a repetition does not run a task of both kinds.
     """
@@ -321,7 +333,7 @@ def on_demand(server: Server) -> Server:
 
 
 def naming(server: Server, task: str, address: Address, now: datetime) -> Server:
-    """The record of a server whose task runs and has an address.
+    """Return the record of a server whose task runs and has an address.
 
     It is written before the DNS record is created, so that each DNS record has an owner.
     """
@@ -332,17 +344,17 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
 
 def with_default_name(server: Server) -> Server:
-    """The record with the default DNS name. The zone refuses the present name."""
+    """Return the record with the default DNS name, because the zone refuses the present name."""
     return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
 
 
 def ready(server: Server, now: datetime) -> Server:
-    """The record of a server whose DNS record is INSYNC, so that the participant may connect."""
+    """Return the record of a server whose DNS record is INSYNC, so that the participant may connect."""
     return msgspec.structs.replace(server, state=ServerState.READY, ready=now)
 
 
 def reserving(server: Server, warm_server: Server) -> Server:
-    """The record with this warm server reserved.
+    """Return the record with this warm server reserved.
 
     It is written before the warm server's own record, so that a repetition reserves no other one.
     """
@@ -359,10 +371,10 @@ def reserving(server: Server, warm_server: Server) -> Server:
 
 
 def without_warm_server(server: Server, own: Server) -> Server:
-    """The record without the reserved warm server, which has ended or is another participant's.
+    """Return the record without the reserved warm server, which has ended or is another participant's.
 
-    It gets the names of `own`, a new server's record. The nonce stays: a task may have been started with secrets that
-    are derived from it.
+    The record gets the names of `own`, a new server's record. The nonce stays: a task may have been started with
+    secrets that are derived from it.
     """
     return msgspec.structs.replace(
         server,
@@ -377,31 +389,35 @@ def without_warm_server(server: Server, own: Server) -> Server:
 
 
 def handed_over(warm_server: Server, label: str, now: datetime) -> Server:
-    """The closed record of a warm server whose resources the participant's record under `label` owns now."""
+    """Return the closed record of a warm server whose resources the participant's record under `label` owns now."""
     return msgspec.structs.replace(
         warm_server, state=ServerState.CLOSED, closed=now, reason=Reason.ASSIGNED, assigned_to=label
     )
 
 
 def draining(warm_server: Server) -> Server:
-    """The record of a warm server that can no longer be assigned. It is written before a resource is removed."""
+    """Return the record of a warm server that can no longer be assigned. It is written before a resource is removed."""
     return msgspec.structs.replace(warm_server, state=ServerState.DRAINING)
 
 
 def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
-    """The record of a server that has got the warm server's resources, so that the participant may connect."""
+    """Return the record of a server that has got the warm server's resources, so that the participant may connect."""
     return msgspec.structs.replace(
         server, state=ServerState.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
     )
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:
-    """The closed record. `servers/termination.py` says which resources are removed before, and which after."""
+    """Return the closed record.
+
+    `servers/termination.py` says which of the server's resources are removed before this record is written, and which
+    after.
+    """
     return msgspec.structs.replace(server, state=ServerState.CLOSED, closed=now, reason=reason, cause=cause)
 
 
 def reason_for(stopped: TaskStopped) -> Reason:
-    """The reason to record for a task that our functions did not stop."""
+    """Return the reason to record for a task that ended although our functions did not stop it."""
     if stopped.code == "UserInitiated":
         return Reason.STOPPED
     if stopped.code == "EssentialContainerExited" and stopped.exit_code == 0:

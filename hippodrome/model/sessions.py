@@ -16,7 +16,7 @@ SHORTEST_OPEN = timedelta(minutes=10)
 
 
 def open_for(project: Project, settings: Settings) -> timedelta:
-    """For how long after its request a server that was started ahead may be given to a session.
+    """Return for how long after its request a server that was started ahead may be given to a session.
 
     The installation's maxRuntime bounds the sum of waiting and play. If the project's maxRuntime leaves less than
     `SHORTEST_OPEN` for waiting, the waiting takes time from the play.
@@ -26,7 +26,7 @@ def open_for(project: Project, settings: Settings) -> timedelta:
 
 
 def lifetime(project: Project, settings: Settings) -> timedelta:
-    """How long the server of a participant or a session may live.
+    """Return how long the server of a participant or a session may live.
 
     It is `lifetime_asked_for`, but never longer than the installation's maxRuntime.
     """
@@ -34,6 +34,9 @@ def lifetime(project: Project, settings: Settings) -> timedelta:
 
 
 def lifetime_asked_for(project: Project, settings: Settings) -> timedelta:
-    """The project's maxRuntime, for the play; and with sessions, the time in which the server waits for members."""
+    """Return how long the study needs its servers to live: the project's maxRuntime.
+
+    In a study with sessions, the time in which a server waits for its members comes in addition.
+    """
     waits = open_for(project, settings) if project.has_sessions else timedelta()
     return timedelta(minutes=project.max_runtime) + waits

@@ -8,18 +8,21 @@ FINAL = "finalStep"
 
 
 def ordered(keys: Iterable[str]) -> list[str]:
-    """The keys of steps in the order of their numbers, finalStep last."""
+    """Return the keys of steps in the order of their numbers, finalStep last."""
     return sorted(keys, key=lambda key: (key == FINAL, 0 if key == FINAL else int(key)))
 
 
 def visited(keys: list[str], pages: Mapping[str, str]) -> list[str]:
-    """The keys of the steps that participants visit: without finalStep, if it has the same page as the step before."""
+    """Return the keys of the steps that participants visit.
+
+    If finalStep has the same page as the step before, it is left out.
+    """
     same = len(keys) > 1 and keys[-1] == FINAL and pages.get(FINAL) == pages.get(keys[-2])
     return keys[:-1] if same and FINAL in pages else keys
 
 
 def position(key: str | None, keys: list[str]) -> int | None:
-    """The index of the step that an event names; None if there is none.
+    """Return the index of the step that an event names; None if no step is meant.
 
     The last step may also be named finalStep, or, as in HIPPO, by the number after the last.
     """
@@ -30,13 +33,14 @@ def position(key: str | None, keys: list[str]) -> int | None:
 
 
 def default_start(games: Sequence[int]) -> int:
-    """The index of the step at which a server starts by default: the second step, which only an answer leads to.
+    """Return the index of the step at which a server starts by default.
 
-    If the first step is a game, it is that one. `games` are the indexes of the game steps.
+    It is the second step, which only an answer leads to; but the first one if that is a game. `games` are the indexes
+    of the game steps.
     """
     return min(1, games[0])
 
 
 def default_stop(games: Sequence[int]) -> int:
-    """The index of the step at which a server stops by default: the one after the last game."""
+    """Return the index of the step at which a server stops by default: the one after the last game."""
     return games[-1] + 1

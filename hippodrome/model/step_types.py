@@ -28,5 +28,5 @@ NAMES = " or ".join(RESERVED)
 
 
 def type_of(page: str) -> StepType:
-    """The type of a step with this page."""
+    """Return the type of a step with this page."""
     return RESERVED.get(page, PAGE)

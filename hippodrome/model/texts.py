@@ -351,19 +351,22 @@ ENGLISH: Mapping[str, str] = {name: text for group in GROUPS.values() for name, 
 
 
 def is_language(text: str) -> bool:
-    """Whether pages and scripts can use this text as the tag of a language, such as `de` or `pt-BR`."""
+    """Return whether pages and scripts can use this text as the tag of a language, such as `de` or `pt-BR`."""
     return _LANGUAGE.fullmatch(text) is not None
 
 
 def is_right_to_left(language: str) -> bool:
-    """Whether the language with this tag is written from right to left; a script in the tag (`ku-Arab`) decides."""
+    """Return whether the language with this tag is written from right to left.
+
+    If the tag names a script (`ku-Arab`), the script decides.
+    """
     name, script, *_ = [*language.lower().split("-"), ""]
     by_script = len(script) == 4 and script.isalpha()
     return bool(_SCRIPTS.fullmatch(script) if by_script else _RIGHT_TO_LEFT.fullmatch(name))
 
 
 def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
-    """The names of the texts that participants may read in a study with or without a game and sessions."""
+    """Return the names of the texts that participants may read in a study with or without a game and sessions."""
     groups = [_PAGES, _LINKS]
     groups += [_WAITING, _ENDED, _GAME, SAID_ALONE] if has_game else []
     groups += [_LOBBY, _TOGETHER, SAID_TOGETHER] if has_sessions else []
@@ -371,7 +374,7 @@ def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
 
 
 def places(text: str) -> tuple[str, ...]:
-    """The names of the places in a text, such as `seconds`: each once, in the order of their first occurrence."""
+    """Return the names of the placeholders in a text, such as `seconds`: each once, in the order of the text."""
     return tuple(dict.fromkeys(PLACE.findall(text)))
 
 
@@ -382,7 +385,8 @@ class Texts:
 
     def __init__(self, own: Mapping[str, str]) -> None:
         self._own = {name: text for name, text in own.items() if text and name in ENGLISH}
-        self._hash = hash(frozenset(self._own.items()))  # each template and script of a page asks for it
+        # Computed once, since each template and script of a page asks for it.
+        self._hash = hash(frozenset(self._own.items()))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Texts) and self._own == other._own
@@ -399,15 +403,17 @@ class Texts:
         return self[LANGUAGE]
 
     def all(self) -> dict[str, str]:
-        """All texts by their names."""
+        """Return all texts by their names."""
         return {**ENGLISH, **self._own}
 
     def say(self, name: str, /, **values: Any) -> str:
-        """The text with these values in its places. A place without a value stays as it is."""
+        """Return the text with these values in its placeholders. A placeholder without a value stays as it is."""
         return PLACE.sub(lambda place: str(values.get(place[1], place[0])), self[name])
 
     def of_server(self) -> dict[str, str]:
-        """The study's own words for the sentences of servers, by the English sentence; only those that differ from it."""
+        """Return the study's own words for sentences of servers, by the English sentence. Sentences without own words
+        are left out.
+        """
         return {ENGLISH[name]: self[name] for name in SAID if self[name] != ENGLISH[name]}
 
 

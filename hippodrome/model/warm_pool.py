@@ -15,23 +15,26 @@ from hippodrome.ports import Settings
 
 POOLS = "_spares/"
 LONGEST_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
-COUNTED_WAIT = timedelta(hours=1)  # the same in a project with maxServerHours, of which a warm server reserves its wait
+COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, of which a warm server reserves its waiting time
 MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for less, none is started
 
 
 def pool_key(project_id: str) -> str:
-    """The key of a project's pool."""
+    """Return the key of a project's pool."""
     return f"{POOLS}{project_id}.json"
 
 
 def longest_wait(project: Project, settings: Settings) -> timedelta:
-    """How long a warm server waits at most. The installation's maxRuntime bounds the sum of waiting and play."""
+    """Return how long a warm server waits at most. The installation's maxRuntime bounds the sum of waiting and play."""
     longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
     return min(longest, timedelta(minutes=settings.max_runtime) - sessions.lifetime(project, settings))
 
 
 def deadline(project: Project, settings: Settings, label: str, now: datetime) -> datetime:
-    """The deadline of a warm server that starts now: 75 to 100 % of `longest_wait`, so that not all end at once."""
+    """Return the deadline of a warm server that starts now.
+
+    It is 75 to 100 % of `longest_wait` away, different for each label, so that not all warm servers end at once.
+    """
     share = hashlib.sha256(label.encode()).digest()[0] / 256
     return now + timedelta(seconds=round(longest_wait(project, settings).total_seconds() * (1 - share / 4)))
 
@@ -51,7 +54,7 @@ class Pool(Record, frozen=True):
     made: int = 0
 
     def first(self, version: str) -> str | None:
-        """The id of the oldest warm server that is ready and of this version; None if there is none."""
+        """Return the id of the oldest warm server that is ready and of this version; None if there is none."""
         ready = [
             (warm_server.requested, warm_id)
             for warm_id, warm_server in self.warm_servers.items()
@@ -60,35 +63,35 @@ class Pool(Record, frozen=True):
         return min(ready)[1] if ready else None
 
     def without_first(self, version: str) -> Pool:
-        """The pool without the warm server that `first` returns."""
+        """Return the pool without the warm server that `first` returns."""
         first = self.first(version)
         return self.without([first]) if first else self
 
     def without(self, warm_ids: Collection[str]) -> Pool:
-        """The pool without these warm servers."""
+        """Return the pool without these warm servers."""
         return self._with(
             {warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_id not in warm_ids}
         )
 
     def with_ready(self, warm_ids: Collection[str]) -> Pool:
-        """The pool with these warm servers marked ready; ids that are not in the pool are ignored."""
+        """Return the pool with these warm servers marked ready; ids that are not in the pool are ignored."""
         known = self.warm_servers.keys() & warm_ids
         ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
         return self._with({**self.warm_servers, **ready})
 
     def with_returned(self, warm_id: str, warm_server: WarmServer) -> Pool:
-        """The pool with a warm server that was taken out and is not needed."""
+        """Return the pool with a warm server that was taken out and is not needed."""
         return self._with({**self.warm_servers, warm_id: warm_server})
 
     def of_registration(self, project: Project | None) -> Mapping[str, WarmServer]:
-        """The warm servers that were requested for this registration."""
+        """Return the warm servers that were requested for this registration."""
         version = project.version if project else None
         return {
             warm_id: warm_server for warm_id, warm_server in self.warm_servers.items() if warm_server.version == version
         }
 
     def resized(self, project: Project | None, number: int, now: datetime) -> Pool:
-        """The pool with `number` warm servers of this registration, and no others.
+        """Return the pool with `number` warm servers of this registration, and no others.
 
         If there are too many, those that are not ready are removed first, then the oldest.
         """
@@ -100,7 +103,7 @@ class Pool(Record, frozen=True):
         return self._with(kept).with_new(project, number - len(kept), now)
 
     def with_new(self, project: Project, count: int, now: datetime) -> Pool:
-        """The pool with `count` new warm servers, which are to be started."""
+        """Return the pool with `count` new warm servers, which are to be started."""
         made = self.made + max(0, count)
         new = {ids.warm_id(project.id, now, n): WarmServer(project.version, now) for n in range(self.made, made)}
         return Pool({**self.warm_servers, **new}, made)
@@ -110,9 +113,10 @@ class Pool(Record, frozen=True):
 
 
 def target_size(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:
-    """How many warm servers a project should have, if it has `waiting` now, and slots for `room` more (None: no limit).
+    """Return how many warm servers a project should have.
 
-    0 if the project is closed, or if warm servers could only wait for less than `MIN_LONGEST_WAIT`.
+    `waiting` is how many it has now; `room` is for how many more there are slots (None: no limit). The result is 0 if
+    the project is closed, or if warm servers could only wait for less than `MIN_LONGEST_WAIT`.
     """
     if project is None or not project.live or longest_wait(project, settings) < MIN_LONGEST_WAIT:
         return 0

@@ -28,7 +28,7 @@ class Answers:
         self._platform = platform
 
     def store(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any]) -> None:
-        """Store the answers to a step, which moves the participant on. If the step has an answer, that one stays.
+        """Store the answers to a step, which moves the participant on. An answer that the step has already stays.
 
         The messages of the following step are published first, so a crash in between repeats them but never loses them.
         """
@@ -51,10 +51,11 @@ class Answers:
         return answers or {}
 
     def repeats(self, project: Project, user_id: str, progress: Progress, answers: Mapping[str, Any]) -> bool:
-        """Whether these answers, of a form that names no step, equal those of a step answered within the last minute.
+        """Return whether these answers equal those of a step that was answered within the last minute.
 
-        Simultaneous requests get the same result: `progress` has every answer before the due step, and answers never
-        change. One read for each answer of that minute, at most `participant.MAX_COMPARED`.
+        They are those of a form that names no step. Simultaneous requests get the same result: `progress` has every
+        answer before the due step, and answers never change. AWS calls: one read for each answer of that minute, at
+        most `participant.MAX_COMPARED`.
         """
         recent = progress.recently_answered(project, self._platform.now())
         earlier = (self.read(project.id, user_id, key) for key in recent)

@@ -27,19 +27,19 @@ class BadForm(Exception):
         self.status, self.text = status, text
 
     def reason(self, texts: Texts) -> str:
-        """The reason as a participant of a study with these texts reads it; here, in English."""
+        """Return the reason as a participant reads it in a study with these texts. Here it is always in English."""
         return self.text
 
 
 class BadPageForm(BadForm):
-    """A refusal that a form of our own pages may get. `name` is that of the text with the reason (`model/texts.py`)."""
+    """The refusal of a form that a page of ours may send. `name`: the text that gives the reason (`model/texts.py`)."""
 
     def __init__(self, status: int, name: str) -> None:
         super().__init__(status, ENGLISH[name])
         self._name = name
 
     def reason(self, texts: Texts) -> str:
-        """The reason in the study's own words."""
+        """Return the reason in the study's own words."""
         return texts[self._name]
 
 

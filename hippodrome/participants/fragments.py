@@ -66,7 +66,10 @@ class Fragment:
     lang: str = ""
 
     def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
-        """Return the page with these values and the nonce of its response. Raises FragmentError."""
+        """Return the page with these values, and with the nonce of the response in its scripts.
+
+        Raises FragmentError.
+        """
         text = sandbox.render(self.text, values) if sandbox.uses_jinja(self.text) else self.text
         mark = _MARK if nonce else f' nonce="{_MARK}"'
         return text.replace(mark, nonce)

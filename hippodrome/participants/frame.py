@@ -38,7 +38,7 @@ class Html(str):
 
 
 def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
-    """A page with a title and a text, such as an error."""
+    """Return a page with a title and a text, such as an error."""
     nonce = secrets.token_urlsafe(16)
     page = fill(
         "frame.html",
@@ -58,9 +58,10 @@ def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> P
 
 
 def form_message(title: str, text: str, *, step: str = "", ticket: str = "", also: str = "") -> str:
-    """A title and a text as HTML, for a program that shows pages in a form of its own, as HIPPO's front end does.
+    """Return a title and a text as HTML, for a program with a form of its own, such as HIPPO's front end.
 
-    The hidden fields in front name `step`. If `step` is empty, the form answers no step, and gets the due step's page.
+    The hidden fields in front name `step`, and `also` are further ones. A form without a `step` answers no step: the
+    response to it is the page of the due step.
     """
     fields = fill("named", step=step, ticket=ticket)
     return fields + also + fill("message", title=title, text=text)
@@ -82,9 +83,11 @@ def frame(
     sheet: str = "",
     data: Html = Html(),  # noqa: B008
 ) -> Html:
-    """A whole page. `data` are attributes of its body. With `heading`, the study's name is the page's first heading.
+    """Return the whole HTML of a step's page.
 
-    `sheet` names a further style sheet of `web/`, which only some pages need.
+    `main`, `head`, `script` and `data` are its parts: the content, further elements of the head, the scripts, and
+    attributes of the body. `body` is the kind of page, for `style`. With `heading`, the study's name is the page's
+    first heading. `sheet` names a further style sheet of `web/`, which only some pages need.
     """
     texts = Texts(project.texts)
     lang = lang or texts.language
@@ -110,13 +113,13 @@ def frame(
 def script(
     name: str, nonce: str, *, module: bool = False, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH
 ) -> Html:
-    """The script element with a script of `web/`. `also` are modules in the same folder that come before it."""
+    """Return the script element with a script of `web/`. `also` are modules in the same folder that come before it."""
     kind = ' type="module"' if module else ""
     return Html(f'<script{kind} nonce="{nonce}">\n{_code(name, also, texts)}</script>\n')
 
 
 def script_json(data: Any) -> Html:
-    """JSON for a script element. No text in it can end the element."""
+    """Return data as JSON for a script element. No text in it can end the element."""
     return Html(json.dumps(data).replace("<", "\\u003c"))
 
 
@@ -124,7 +127,10 @@ def script_json(data: Any) -> Html:
 
 
 def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str, str]:
-    """The headers of a page. `connect` has further sources, separated by spaces, to which its scripts may connect."""
+    """Return the headers of a page.
+
+    `connect` has further sources, separated by spaces, to which its scripts may connect.
+    """
     hosts = " ".join(allowed_sources(project.allowed_hosts)) if project else ""
     policy = {
         "default-src": "'none'",
@@ -149,7 +155,7 @@ def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str,
 
 
 def allowed_sources(given: list[str]) -> list[str]:
-    """Those of these sources that are valid, so that no value can add a directive to the policy."""
+    """Return those of the sources that are valid. No value can add a directive to the policy."""
     return [source for source in given if _SOURCE.fullmatch(source)]
 
 
@@ -196,7 +202,10 @@ $texts
 
 
 def fill(name: str, texts: Texts = IN_ENGLISH, /, **values: Any) -> Html:
-    """Fill values into a template with the texts of a study; values that are not `Html` are escaped."""
+    """Return the template `name` with a study's texts and these values filled in.
+
+    Values that are not `Html` are escaped.
+    """
     safe = {key: value if isinstance(value, Html) else html.escape(str(value)) for key, value in values.items()}
     return Html(_template(name, texts).substitute(safe))
 
@@ -206,7 +215,10 @@ _SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", 
 
 @cache
 def style(kind: str | None = None) -> str:
-    """The style sheet for pages of this kind ("step", "game" or "message"), from `style.css`; None: for all pages."""
+    """Return `style.css` without what is only for other kinds of pages than this one: "step", "game" or "message".
+
+    For None, return all of it.
+    """
     text = (WEB / "style.css").read_text(encoding="utf-8")
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)

@@ -34,10 +34,13 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 
 RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
+"""The fields of recruiters' links (Prolific, MTurk, SONA) that take the place of `userId`."""
 OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
+"""The fields of a link that are not kept in the participant's record as the recruiter's."""
 LEAVE = "leave"
 """The value of `hippodrome-action` in the form that the lobby's page sends when it is closed."""
 LINK = "…/next?projectId=your-project&userId=…"
+"""The form of a study link, for messages."""
 
 
 class Journey:
@@ -205,7 +208,10 @@ class Journey:
 
 
 def _user_id(request: Request, texts: Texts) -> str | None:
-    """The participant's id in the link: `userId` or a recruiter's field; None if it has none. Raises `PageError`."""
+    """The participant's id in the link: `userId` or a recruiter's field; None if a GET has none.
+
+    Raises `PageError` if the id is not valid, or if a POST has none.
+    """
     given = next((name for name in ("userId", *RECRUITER_IDS) if request.has_query(name)), None)
     if given is None:
         if request.method == "POST":

@@ -41,12 +41,15 @@ class PageError(Exception):
 
     @classmethod
     def of(cls, texts: Texts, status: int, name: str, hippo: HippoAnswer | None = None, **values: object) -> PageError:
-        """The error in a study's own words: the title is its text `name`, the text is `{name}Text` with `values`."""
+        """Return the error with texts in the study's own words.
+
+        The title is the study's text `name`. The sentence is its text `{name}Text`, filled in with `values`.
+        """
         title, text = texts[name], texts.say(f"{name}Text", **values)
         return cls(status, title, text, hippo, texts.language)
 
     def response(self, request: Request) -> Response:
-        """The response to this request: the page, or JSON for a program."""
+        """Return the response to this request: the page, or JSON for a program."""
         if request.wants_json:
             answer = self.hippo or HippoAnswer(self.status)
             status = answer.status if answer.status in ACTED_ON or not request.is_front_end else 200
@@ -56,6 +59,9 @@ class PageError(Exception):
 
 
 def program_message(status: int, title: str, text: str, page: str = "") -> Response:
-    """JSON for a program that shows pages. Its `page` is the given one; if that is empty, title and text as HTML."""
+    """Return a response with JSON for a program that shows pages.
+
+    Its `page` is the one given; if that is empty, it is the title and the text as HTML.
+    """
     shown = page or frame.form_message(title, text)
     return http.as_json(status, {"page": shown, "css": None, "message": f"{title}. {text}"})

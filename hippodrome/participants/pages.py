@@ -30,7 +30,7 @@ LOBBY = "lobby"
 
 @dataclass(frozen=True)
 class StepView:
-    """The content of a step page for one participant."""
+    """What a step page shows to one participant."""
 
     project: Project
     step: Step
@@ -48,7 +48,7 @@ class StepView:
 
 @dataclass(frozen=True)
 class GameView:
-    """The content of the game page for one participant, who first waits and then plays on it."""
+    """What the game page shows to one participant, who first waits and then plays on it."""
 
     project: Project  # as the participant's session runs it (`Project.for_session`)
     step: Step
@@ -68,7 +68,7 @@ class GameView:
 
 
 def step_page(view: StepView) -> Page:
-    """A step page in its frame. Raises FragmentError."""
+    """Return a step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
     prepared = _prepare(view.project, view.source, view.files)
@@ -103,7 +103,7 @@ def step_page(view: StepView) -> Page:
 
 
 def fragment(view: StepView) -> str:
-    """The researcher's part of a page, for programs with a frame and a form of their own. Raises FragmentError.
+    """Return the researcher's part of a page, for a program with a frame and a form of its own. Raises FragmentError.
 
     The hidden fields that name the step come first. The program sends them with the form: HIPPO's front end posts all
     named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
@@ -112,7 +112,7 @@ def fragment(view: StepView) -> str:
 
 
 def game_page(view: GameView) -> Page:
-    """The page of a game step: waiting and playing. Raises FragmentError."""
+    """Return the page of a game step: waiting and playing. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
     state = str(view.state.get("state", "queued"))
@@ -169,17 +169,17 @@ def game_page(view: GameView) -> Page:
 
 
 def is_over(state: Mapping[str, Any]) -> bool:
-    """Whether the server has ended or failed, and no other one will start by itself."""
+    """Return whether the server has ended or failed, and no other one will start by itself."""
     return state.get("state") in ("ended", "failed")
 
 
 def in_lobby(state: Mapping[str, Any]) -> bool:
-    """Whether the participant waits for others to play with and is not matched yet."""
+    """Return whether the participant waits for others to play with and is not matched yet."""
     return state.get("state") == LOBBY
 
 
 def game_message(view: GameView) -> str:
-    """The page of a game step whose server was lost or has ended, for a program that shows it in a form of its own.
+    """Return the page of a game step whose server was lost or has ended, for a program with a form of its own.
 
     The form requests another server if the participant may have one.
     """

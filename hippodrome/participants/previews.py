@@ -14,6 +14,7 @@ from enum import Enum
 from hippodrome.http import Request
 
 NOT_ACCEPTED = "ASSIGNMENT_ID_NOT_AVAILABLE"
+"""The `assignmentId` in MTurk's preview of a task that the worker has not accepted."""
 _PURPOSE = ("sec-purpose", "purpose", "x-purpose", "x-moz")  # headers
 
 # User agents of programs that show a card for a link in a chat, or index pages. Not of Cubot, a maker of phones.
@@ -34,7 +35,7 @@ class PreviewKind(Enum):
 
 
 def preview_kind(request: Request) -> PreviewKind | None:
-    """Return the kind of preview; None for a participant's request."""
+    """Return the kind of preview that the request is; None if it is a participant's."""
     if request.method == "POST":
         return None
     if any(value == NOT_ACCEPTED for _, value in request.query or ()):

@@ -47,7 +47,7 @@ class Refusal(Exception):
 
 
 class Relays:
-    """`send_start_server_message` and `send_stop_server_message`. One per running function."""
+    """Implements `send_start_server_message` and `send_stop_server_message`. Each running function has one."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -56,13 +56,13 @@ class Relays:
         self._repository = Repository(platform.documents)
 
     def start(self, request: Request) -> Response:
-        """Publish the start message of the participant's server, or refuse with a status and a sentence."""
+        """Publish the start message of the participant's server; a refused request gets a status and a sentence."""
         return self._respond(request, self._start)
 
     def stop(self, request: Request) -> Response:
         """Publish the stop message of the participant's server, or set a timer that does so after `delay`.
 
-        The request's field `delay` is in seconds, 0 to `LONGEST_DELAY`. Refuses with a status and a sentence.
+        The request's field `delay` is in seconds, 0 to `LONGEST_DELAY`. A refused request gets a status and a sentence.
         """
         return self._respond(request, self._stop)
 

@@ -25,15 +25,18 @@ class FragmentError(Exception):
 
 
 def uses_jinja(text: str) -> bool:
-    """Whether Jinja has to render this text. `{#` alone does not count: style sheets have `@media print{#menu{…}}`."""
+    """Return whether Jinja has to render this text.
+
+    `{#` alone does not count: style sheets have `@media print{#menu{…}}`.
+    """
     return "{{" in text or "{%" in text or ("{#" in text and "#}" in text)
 
 
 @lru_cache(maxsize=64)
 def records_mentioned(source: str) -> frozenset[str]:
-    """The participant's documents that a step page uses: `participant`, `answers`, or single steps such as `answers.3`.
+    """Return the names of the participant's documents that a step page uses.
 
-    Empty for a page that Jinja cannot parse.
+    They are `participant`, `answers`, or single steps such as `answers.3`; none for a page that Jinja cannot parse.
     """
     if not uses_jinja(source):
         return frozenset()
@@ -72,7 +75,9 @@ def render(text: str, values: Mapping[str, Any]) -> str:
             parts.append(part)
             size += len(part)
             if size > LIMIT:
-                raise FragmentError("the page grows beyond 2 MB")
+                raise FragmentError(
+                    "the page is larger than 2 MB with its values filled in; look for a loop that repeats too much"
+                )
     except FragmentError:
         raise
     except Exception as error:  # a template can fail in any way

@@ -17,7 +17,7 @@ _LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def join(main: Path, also: tuple[str, ...] = ()) -> str:
-    """One script of this module and all modules that it imports: each once, after its own imports.
+    """Return one script with this module and all modules that it imports: each once, after its own imports.
 
     `also` are modules in the same folder that `main` does not import. They and their imports come before it. Raises
     ValueError for an import or export of another form, and if a module imports itself.

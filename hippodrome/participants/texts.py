@@ -17,7 +17,7 @@ NAMED = re.compile(r"\bTEXT\.([A-Za-z]+)")
 
 
 def in_script(code: str, texts: Texts) -> str:
-    """The script with a study's texts in place of their names."""
+    """Return the script with a study's texts in place of their names (`TEXT.start`)."""
     return _filled(code, {**texts.all(), LANGUAGE: _for_numbers(texts.language)})
 
 
@@ -32,7 +32,10 @@ def _for_numbers(language: str) -> str:
 
 
 def in_template(template: str, texts: Texts) -> str:
-    """The HTML template with a study's texts, escaped, in place of their names. `{step}` in a text becomes `$step`."""
+    """Return the HTML template with a study's texts, escaped, in place of their names.
+
+    `{step}` in a text becomes `$step`.
+    """
     known = texts.all()
     return NAMED.sub(lambda found: _in_html(known[found[1]], places(ENGLISH[found[1]])), template)
 

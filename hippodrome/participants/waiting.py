@@ -33,7 +33,11 @@ class ServerStates:
         now: datetime,
         since: datetime | None = None,
     ) -> dict[str, Any]:
-        """The state as JSON data. `since` is when the participant reached the step; it counts if there is no record."""
+        """Return the state of the participant's server as JSON data for the game page (docs/pages.md).
+
+        `since` is when the participant reached the step. As long as there is no record, the state's `seconds` count
+        from then; after that they count from the server's request.
+        """
         state: dict[str, Any] = {
             "state": ServerState.QUEUED,
             "attempt": 1,

@@ -19,9 +19,10 @@ def for_each(
     log_text: str,
     name: Callable[[I], str] | None = None,
 ) -> tuple[list[tuple[I, T]], list[I]]:
-    """Call `act` on each item; return the items whose result is not None, with it, and the items for which it raised.
+    """Call `act` on each item. One failure does not affect the other items.
 
-    Each error is logged as `log_text`, with the server's name that `name` returns for the item.
+    Returns two lists: the items whose result is not None, each with its result; and the items for which `act` raised.
+    Each error is logged with the text `log_text`, and with the server's name that `name` returns for the item.
     """
 
     def one(item: I) -> tuple[I, T | None, bool]:

@@ -193,7 +193,7 @@ _REFUSAL_PATTERNS = (
 
 
 def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
-    """The cause why a failed task ended. `was_ready`: whether its server was ready for its participant."""
+    """Return the cause for which a task failed. `was_ready`: whether its server was ready for its participant."""
     if stopped.code in ("SpotInterruption", "TerminationNotice"):
         return Cause.SPOT
     if matched := _first_match(_TASK_PATTERNS, stopped.words):
@@ -212,14 +212,17 @@ def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
 
 
 def cause_of_refusal(error: NoCapacity | Refused) -> Cause:
-    """The cause why RunTask ran no task."""
+    """Return the cause for which RunTask ran no task."""
     if isinstance(error, NoCapacity):
         return Cause.QUOTA if _first_match(_TASK_PATTERNS, str(error)) is Cause.QUOTA else Cause.CAPACITY
     return _first_match(_REFUSAL_PATTERNS, str(error)) or Cause.REFUSED
 
 
 def parse_cause(written: str) -> Cause | None:
-    """The cause that a record names; None if it names none, or one that only a later version knows."""
+    """Return the cause that a server's record names.
+
+    The result is None if the record names none, or one that only a later version knows.
+    """
     return Cause(written) if written in set(Cause) else None
 
 

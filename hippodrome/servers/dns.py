@@ -26,7 +26,7 @@ from hippodrome.storage.repository import Versioned
 
 PAUSES = (18, *[3] * 34)  # seconds before each check, for two minutes; a change is seldom INSYNC before 18 s
 LONG_PAUSE = 30  # seconds between later checks
-MAX_CHECKS = 51  # ten minutes
+MAX_CHECKS = 51  # of one change: they take ten minutes
 RETRY_PAUSE = 3  # seconds until the next try if the zone was busy, or if an interface had no public address yet
 MAX_ADDRESS_CHECKS = 5  # for one network interface; then the queue delivers the event again
 BEFORE_READY = (ServerState.STARTING, ServerState.NAMING)
@@ -36,7 +36,7 @@ MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
 
 def delete_dns_records(platform: Platform, records: Iterable[DnsRecord | None]) -> None:
-    """Delete these DNS records, with exactly these values, by one change. Makes no call if all are None."""
+    """Delete these DNS records, with exactly these values, by one change. If all are None, nothing is called."""
     found = [record for record in records if record is not None]
     if found:
         platform.dns.change(remove=found)
@@ -280,5 +280,8 @@ class DnsRecords:
 
 
 def pause(looked: int) -> int:
-    """Seconds until the next check, after `looked` checks: `PAUSES`, then `LONG_PAUSE`."""
+    """Return the seconds to wait before the next check of a change: one of `PAUSES`, then `LONG_PAUSE`.
+
+    `looked` is how many checks there were.
+    """
     return PAUSES[looked] if looked < len(PAUSES) else LONG_PAUSE

@@ -37,18 +37,18 @@ class Scope:
     names: frozenset[str] = frozenset()  # the names of the warm servers that were assigned to that participant
 
     def covers(self, owner: Server | None) -> bool:
-        """Whether this server is one of the project's."""
+        """Return whether this server belongs to the project `project_id`. Without `project_id`, every server counts."""
         return self.project_id is None or (owner is not None and owner.project_id == self.project_id)
 
     def erases(self, name: str) -> bool:
-        """Whether a resource of this name is an erased participant's."""
+        """Return whether a resource of this name is an erased participant's."""
         return name in self.names or (ids.parse_server_name(name) or ("", 0))[0] in self.labels
 
 
 def why_left_over(name: str, owner: Server | None, scope: Scope, *, ours: bool = False) -> LeftoverReason | None:
-    """Why a resource of this name is left over; None if it is not, or if it is outside `scope`.
+    """Return why a resource of this name is left over; None if it is not, or if it is outside `scope`.
 
-    `owner`: the record that owns the name. `ours`: whether only this installation can have created the resource.
+    `owner` is the record that owns the name. `ours`: whether only this installation can have created the resource.
     Otherwise a resource without a record may be another installation's.
     """
     parsed = ids.parse_server_name(name)
@@ -68,7 +68,7 @@ def why_left_over(name: str, owner: Server | None, scope: Scope, *, ours: bool =
 
 
 def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> LeftoverReason | None:
-    """Why the slot of the server of this name is left over; None if it is not.
+    """Return why the slot of the server of this name is left over; None if it is not.
 
     A closed server's slot is left over only after `LOST_AFTER`: before that, a task of the server may still appear (and
     be stopped), or the next attempt may take the slot over.
@@ -81,7 +81,7 @@ def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Leftov
 
 
 def leftovers(found: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
-    """The resources that are left over. `owners`: the records that own resources, by the resources' names."""
+    """Return the resources that are left over. `owners` has, by a resource's name, the record that owns it."""
 
     def keep(name: str, *, ours: bool = False) -> bool:
         return why_left_over(name, owners.get(name), scope, ours=ours) is not None

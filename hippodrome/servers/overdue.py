@@ -35,7 +35,10 @@ Rule = Callable[[Server, RunningTask | None, datetime], Remedy | None]
 
 
 def remedy(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
-    """The remedy for this server, whose living task is `task`; None if nothing has to be done."""
+    """Return what the sweep does about this server; None if nothing has to be done.
+
+    `task` is the server's living task; None if there is none.
+    """
     if not record.is_closed and now > record.deadline + OVERDUE_AFTER:
         return Remedy.OVERDUE
     return RULES[record.state](record, task, now)

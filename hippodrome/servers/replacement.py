@@ -29,7 +29,10 @@ class Replacement:
         self._services = services
 
     def request(self, closed: Server) -> None:
-        """Publish the start message of the next attempt, unless all its participants have answered all game steps."""
+        """Publish the start message of the next attempt, if the closed server is replaced.
+
+        Nothing is published if all its participants have answered all game steps.
+        """
         following = next_attempt(closed)
         if following is None or self._has_played(closed):
             return
@@ -37,14 +40,20 @@ class Replacement:
         self._services.platform.bus.publish(Topic.START, to_message(start))
 
     def write_record(self, new: Server) -> Versioned:
-        """Replace the closed record of the previous attempt. Raises `Conflict` if there is no such record."""
+        """Replace the closed record of the previous attempt by this one.
+
+        Raises `Conflict` if there is no such record.
+        """
         before = self._services.repository.server(new.label)
         if before is None or before.server.attempt != new.attempt - 1 or not before.server.is_closed:
             raise Conflict
         return self._services.repository.save(server.replacing(before.server, new), before.etag)
 
     def _has_played(self, closed: Server) -> bool:
-        """Whether all game steps are answered: a server may be lost between its last answer and its stop."""
+        """Whether all participants of this server have answered all game steps, so that it needs no replacement.
+
+        A server may be lost between its last answer and its stop.
+        """
         project = self._services.project_cache.live_project(closed.project_id)
         if project is None or not project.game_steps:
             return False

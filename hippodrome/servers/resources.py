@@ -30,7 +30,7 @@ class Resources:
         return bool(self.tasks or self.dns_records or self.timers or self.clusters)
 
     def counts(self) -> dict[str, int]:
-        """How many resources of each kind were found, by the kind."""
+        """Return how many resources were found, by their kind."""
         return {
             "tasks": len(self.tasks),
             "timers": len(self.timers),
@@ -39,18 +39,18 @@ class Resources:
         }
 
     def kinds(self) -> list[str]:
-        """The kinds of which at least one was found, in the singular."""
+        """Return the kinds of resources of which at least one was found, as words in the singular."""
         return [kind.removesuffix("s") for kind, number in self.counts().items() if number]
 
     def names(self) -> Iterator[str]:
-        """Yield the name of each resource. It may be a server's name."""
+        """Yield the name of each resource. A name need not be that of a server."""
         yield from (task.name for task in self.tasks)
         yield from (ids.host_server(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)
         yield from self.clusters
 
     def only(self, keep: Callable[[str], bool], ours: Callable[[str], bool] | None = None) -> Resources:
-        """The resources whose names `keep` accepts.
+        """Return the resources whose names `keep` accepts.
 
         `ours` decides instead for resources that only this installation can have created: tasks in its cluster, and
         timers. The hosted zone and the account's other clusters may hold those of another installation.

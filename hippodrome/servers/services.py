@@ -27,7 +27,7 @@ class ServerServices:
         self.slots = Slots(platform)
         self.pools = Pools(platform, self.project_cache)
         self.handovers = Handovers(platform, self.repository, self.slots, self.pools)
-        self.written: dict[tuple[str, int], Versioned] = {}  # the records last written as `naming`, by label, attempt
+        self.written: dict[tuple[str, int], Versioned] = {}  # records last written as `naming`, by label and attempt
         self._failures: deque[Cause] = deque()
 
     def failed(self, cause: Cause) -> None:
@@ -35,7 +35,7 @@ class ServerServices:
         self._failures.append(cause)
 
     def failures(self) -> list[Cause]:
-        """The causes of the failed servers that were closed since the last call, one per server."""
+        """Return the causes of the failed servers that were closed since the last call, one per server."""
         found: list[Cause] = []
         while self._failures:
             found.append(self._failures.popleft())

@@ -21,7 +21,10 @@ if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds a
 
 
 def readable_session(repository: Repository, project_id: str, session_id: str) -> SessionDocument | None:
-    """The session's document; None if there is none yet, or if it cannot be read, which is logged. One read."""
+    """Return the session's document. AWS calls: one read.
+
+    The result is None if there is no document yet, or if it cannot be read, which is logged.
+    """
     try:
         return repository.session(project_id, session_id)
     except BadSession as error:
@@ -30,28 +33,29 @@ def readable_session(repository: Repository, project_id: str, session_id: str) -
 
 
 def members_of(repository: Repository, project_id: str, session_id: str) -> list[str]:
-    """The ids of the session's members; none before it is formed, or if its document cannot be read."""
+    """Return the ids of the session's members; none before the session is formed, or if its document cannot be read."""
     session = readable_session(repository, project_id, session_id)
     return session.user_ids if session else []
 
 
 class Sessions:
-    """Reads the documents by which it decides whether servers of sessions are stopped."""
+    """Decides, by reading the members' documents, whether the servers of sessions are stopped."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
         self._repository = services.repository
 
     def has_sessions(self, project_id: str) -> bool:
-        """Whether sessions of this project have several players; False if the project is not registered."""
+        """Return whether several participants share a server in this project; False if it is not registered."""
         project = self._services.project_cache.project(project_id)
         return project is not None and project.has_sessions
 
     def stop_of(self, message: StopServer) -> StopServer | None:
-        """The stop message for the session's server that follows from a participant's own; None if others still play.
+        """Return the stop message for a session's server that follows from a participant's own; None if none follows.
 
-        Deletes the participant's entries in the lobby, so that nobody is matched with them. The participant counts as
-        one who has reached the stop step: the message is published before the answer that leads there is stored.
+        None follows as long as other members play, or if the participant is no member yet. Deletes the participant's
+        entries in the lobby, so that nobody is matched with them. The participant counts as one who has reached the
+        stop step: the message is published before the answer that leads there is stored.
         """
         project = self._services.project_cache.project(message.project_id)
         if project is None:
@@ -64,9 +68,10 @@ class Sessions:
         return StopServer(project.id, session.id, None, message.reason)
 
     def is_over(self, project: Project, session: SessionDocument, leaves: str = "") -> bool:
-        """Whether all members have reached the stop step. `leaves` is a member who has. One listing for each other one.
+        """Return whether all members have reached the stop step. `leaves` is the id of a member who certainly has.
 
-        False in a project without a stop step: there the trial ends by itself.
+        The result is False in a project without a stop step: there the trial ends by itself. AWS calls: one listing for
+        each other member.
         """
         return all(self._has_left(project, user_id) for user_id in session.user_ids if user_id != leaves)
 

@@ -1,11 +1,11 @@
 """`sign_requests`: a server shows its credential and gets presigned requests for its own documents, and no others.
 
 Servers run researchers' code and have no rights on AWS. With presigned requests a server may read the certificate, its
-handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create the
-answers of its game steps and its own recordings. The credential is derived from the installation's secret
+handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create its own
+recordings, and create and read the answers of its game steps. The credential is derived from the installation's secret
 (`secret.py`). It is not the token, which the participant's browser knows.
 
-A session's server may also read the session's document, and create the answers of the members whom that document names.
+A session's server may also read the session's document. Its answers are those of the members whom that document names.
 Its recordings are the session's. With `matching: match`, as long as it has no members, it may read the question to the
 function `match` of agent.py, and create the document of the answer.
 
@@ -132,7 +132,7 @@ class SigningRefusal(Exception):
 
 @dataclass(frozen=True)
 class ServerAccess:
-    """The owner of a server, and its game steps. The documents that it may read and create follow from these fields.
+    """The facts about a server from which the documents follow that it may read and create.
 
     `name` is the server's own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id`
     and `certificate` are set. `user_id` may be a session's id; then `members` are the ids of the session's members,
@@ -171,11 +171,11 @@ class ServerAccess:
         return folder(self.project_id, self.user_id)
 
     def is_open(self, now: datetime) -> bool:
-        """Whether it may still get any request signed, at this time."""
+        """Return whether presigned requests are still made for the server at this time."""
         return self.closed is None or (not self.is_unassigned and now < self.closed + STORE_AFTER_CLOSE)
 
     def allows(self, wanted: DocumentRequest) -> bool:
-        """Whether the server may send this request."""
+        """Return whether the server may send this request."""
         if wanted.method is Method.GET:
             return self.closed is None and self._allows_reading(wanted.key)
         if self.is_unassigned or wanted.size is None or wanted.size < 0:
@@ -185,7 +185,7 @@ class ServerAccess:
         return self.is_recording(wanted.key) and wanted.size <= MAX_RECORDING
 
     def is_recording(self, key: str) -> bool:
-        """Whether the key is that of one of its own recordings."""
+        """Return whether the key is that of one of its own recordings."""
         return (
             not self.is_unassigned
             and key.startswith(self.folder)
@@ -229,7 +229,10 @@ class ServerAccess:
 
 
 def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAccess | None:
-    """The access of the server of this name, from its owner's record; None if the record has no such server."""
+    """Return what the server of this name may read and create, according to its owner's record.
+
+    The result is None if the record has no server of this name.
+    """
     common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
     for run in (server.past_attempt(record), *record.earlier):
         if (run.warm_server_name or ids.server_name(record.label, run.attempt)) == name:
@@ -246,13 +249,13 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
 
 
 def credential_nonce(record: Server, attempt: int) -> str | None:
-    """The nonce that the credential of this attempt is derived from; None if the record has none."""
+    """Return the nonce that the credential of this attempt is derived from; None if the record has none."""
     runs = (server.past_attempt(record), *record.earlier)
     return next((run.nonce for run in runs if run.attempt == attempt and run.nonce), None)
 
 
 class Signing:
-    """Answers the requests of servers. One per running function."""
+    """Answers the requests of servers. Each running function has one."""
 
     def __init__(self, platform: SigningPlatform) -> None:
         self._platform = platform
@@ -262,8 +265,8 @@ class Signing:
     def respond(self, request: Request) -> Response:
         """Respond to one HTTP request with presigned requests, or with a status and a sentence.
 
-        One read of the server's record, two for an assigned warm server; one of the session's document, if it is a
-        session's; one listing, if the server wants to create a recording.
+        AWS calls: one read of the server's record, two for an assigned warm server; one of the session's document, if
+        it is a session's server; one listing, if the server wants to create a recording.
         """
         try:
             asked = _read(request)
@@ -317,7 +320,9 @@ class Signing:
             stored = [entry.size for entry in self._platform.documents.list(access.folder)]
             if len(stored) + len(announced) > MAX_RECORDINGS or sum(stored) + sum(announced) > MAX_RECORDED:
                 logger.error("a server has stored too much", extra={"server": access.name})
-                raise SigningRefusal(403, "This server has stored as much as one may.")
+                raise SigningRefusal(
+                    403, f"A server may store {MAX_RECORDINGS} recordings and {MAX_RECORDED // 1024**3} GB, no more."
+                )
         signer = self._platform.signer
         return [
             signer.presign_get(wanted.key, VALID_SECONDS)

@@ -32,7 +32,7 @@ from protocol.session import is_session_id
 
 
 class Start:
-    """Handles the messages of the start topic."""
+    """Starts the servers that messages of the start topic ask for."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -92,7 +92,7 @@ class Start:
 
     def _cancel_start(self, message: StartServer) -> None:
         """Start nothing: the project is closed, or has no sessions any more. If the server was started, stop it."""
-        logger.warning("start for a project that is not live or has no sessions: dropped")
+        logger.warning("a start message was dropped: its project is closed, or has no sessions any more")
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
@@ -189,7 +189,7 @@ class Start:
         except NoCapacity:
             if not record.spot:
                 raise
-            logger.warning("no Spot capacity: on demand", extra={"server": record.name})
+            logger.warning("there is no Spot capacity: the server runs on demand", extra={"server": record.name})
             if self._repository.update(stored, lambda r: server.on_demand(r) if r.owns(record.name) else None):
                 self._platform.tasks.run(replace(request, spot=False))
 

@@ -305,7 +305,10 @@ class Sweep:
             self._platform.timers.cancel(timer)
 
     def _send_stop(self, record: Server, reason: Reason) -> None:
-        """Send a stop message, which comes again until the stop is complete: a later sweep might miss such a server."""
+        """Send a stop message. The queue delivers it again until the server is stopped completely.
+
+        If the sweep stopped the server itself and was interrupted, a later sweep might miss it.
+        """
         message = StopServer(record.project_id, record.user_id, record.attempt, reason)
         self._platform.bus.publish(Topic.STOP, to_message(message))
 

@@ -46,7 +46,7 @@ class ServerToClose(NamedTuple):
 
 
 class Termination:
-    """Ends servers: many of them with one DNS change."""
+    """Ends servers. All servers of a batch share one DNS change."""
 
     def __init__(self, services: ServerServices) -> None:
         self._services = services
@@ -59,7 +59,7 @@ class Termination:
     def stop(self, batch: Sequence[StopServer]) -> list[StopServer]:
         """Stop servers; return the messages that should be delivered again.
 
-        In this order: tasks, DNS records, slots, clusters, the servers' records, timers.
+        What belongs to a server is ended in this order: task, DNS record, slot, cluster, the server's record, timer.
         """
         wanted = list(dict.fromkeys(batch))  # a message may be in a batch twice
         again, changed = self._stop_once(wanted)
@@ -100,10 +100,12 @@ class Termination:
         return ServerToClose(stored, Reason.DEADLINE if message.reason == Reason.DEADLINE else Reason.STOPPED)
 
     def _record_to_stop(self, message: StopServer) -> Versioned | None:
-        """The record of the server to stop; None if it is closed. If there is no record, create a closed one.
+        """The record of the server to stop; None if none is open.
 
-        A start message that comes later finds the closed record. In a project with sessions, participants have no
-        record, or one from before it had sessions; their message may be for their session's server.
+        If there is no record at all and the reason is `STOPPED`, create a closed record: a start message that comes
+        later finds it, and starts nothing. In a project with sessions, participants have no record, or one from before
+        it had sessions; their message may be for their session's server. Raises `RetryLater` if the server is started
+        at the same time.
         """
         stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
         if stored is not None and stored.server.is_open(message.attempt or stored.server.attempt):
@@ -244,7 +246,9 @@ class Termination:
             closing.stored, lambda r: server.close(r, closing.reason, now, cause) if r.owns(record.name) else None
         )
         if closed is None and record.is_warm_server:
-            raise RetryLater("it may have been assigned meanwhile: then its participant's record is the one to close")
+            raise RetryLater(
+                "the warm server may have been assigned: then its participant's record is the one to close"
+            )
         if closed and closing.cause:
             self._services.failed(closing.cause)
         log = logger.warning if cause else logger.info

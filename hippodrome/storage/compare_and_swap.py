@@ -29,7 +29,10 @@ class SharedDocuments:
         self._documents = documents
 
     def read(self, key: str, kind: type[R]) -> R:
-        """Return the record under a key. One call. Raises ValueError or RecursionError if the document holds none."""
+        """Return the record under a key; an empty one if there is no document. AWS calls: one.
+
+        Raises ValueError or RecursionError if the document cannot be read as such a record.
+        """
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
@@ -38,10 +41,10 @@ class SharedDocuments:
     ) -> Changed[R]:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
-        If `change` returns an equal record, nothing is written: one call instead of two. Raises `RetryLater` after
-        `TRIES` conflicts. If the document holds no such record, raises ValueError or RecursionError and writes nothing.
-        With `renew`, which is for data that can be rebuilt, `change` is applied to an empty record then, or to `anew`,
-        and the result replaces the document.
+        If `change` returns an equal record, nothing is written. AWS calls: two; one if nothing is written. Raises
+        `RetryLater` after `TRIES` conflicts. If the document cannot be read as such a record, this raises ValueError or
+        RecursionError and writes nothing. But with `renew`, which is for data that can be rebuilt, `change` is then
+        applied to `anew` (by default an empty record), and the result replaces the document.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)

@@ -35,16 +35,18 @@ class ProjectCache:
         self._parsed: tuple[str, MasterList] | None = None
 
     def project(self, project_id: str, fresh: timedelta = FRESH) -> Project | None:
-        """The registered project, live or not, from a list at most `fresh` old; None if it has no readable entry."""
+        """Return the registered project, live or not, from a list at most `fresh` old; None if it has no readable
+        entry.
+        """
         found = self._list(fresh).find(project_id)
         return self._secrets.with_secret(found) if found and self._secrets else found
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
-        """All registered projects, without their secrets, from a list at most `fresh` old."""
+        """Return all registered projects, without their secrets, from a list at most `fresh` old."""
         return self._list(fresh).projects
 
     def ids(self) -> list[str]:
-        """The ids of all registered projects, also of those whose entries cannot be read."""
+        """Return the ids of all registered projects, also of those whose entries cannot be read."""
         listed = self._list(FRESH)
         return sorted({project.id for project in listed.projects} | {e.id for e in listed.unreadable if e.id})
 
@@ -61,16 +63,16 @@ class ProjectCache:
         return parsed[1]
 
     def is_unreadable(self, project_id: str) -> bool:
-        """Whether the project is registered but its entry cannot be read, so that it counts as closed."""
+        """Return whether the project is registered but its entry cannot be read, so that it counts as closed."""
         return self._list(FRESH).is_unreadable(project_id)
 
     def live_project(
         self, project_id: str, fresh: timedelta = FRESH, *, fits: Callable[[Project], object] | None = None
     ) -> Project | None:
-        """The project, from a list at most `fresh` old, if it is live; else None.
+        """Return the project if it is live, from a list at most `fresh` old; None if it is closed or not registered.
 
         `fits` says whether a message or a request can belong to the project as it is listed. If not, the cached list
-        may be older than the message: then it is read again, and the project is returned even if it does not fit.
+        may be older than the message: then the list is read again, and the project is returned even if it does not fit.
         """
         project = self.project(project_id, fresh)
         if fits and not (project and project.live and fits(project)):
@@ -78,12 +80,12 @@ class ProjectCache:
         return project if project and project.live else None
 
     def page(self, project: Project, file: str) -> str | None:
-        """The source of a step page; None if the file is missing."""
+        """Return the source of a step page; None if the file is missing. `file` is its name without `.html`."""
         found = self.document(project.page_key(file), PAGE_FRESH, project.version)
         return None if found is None else found.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
-        """The document, at most `fresh` old and read for this version of its project; None if it is missing."""
+        """Return the document, at most `fresh` old and read for this version of its project; None if it is missing."""
         now = self._platform.now()
         kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:

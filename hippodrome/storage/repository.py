@@ -30,7 +30,10 @@ class Versioned:
 
 
 class Repository:
-    """Typed reads and writes over the documents port. A method makes one call unless its docstring says otherwise."""
+    """Reads and writes records by the documents port.
+
+    A method makes one AWS call unless its docstring says otherwise.
+    """
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -38,12 +41,12 @@ class Repository:
     # Participants
 
     def progress(self, project_id: str, user_id: str) -> Progress:
-        """The participant's progress, by a listing of their folder."""
+        """Return the participant's progress, by a listing of their folder."""
         folder = participant_folder(project_id, user_id)
         return Progress.from_listing(folder, self._documents.list(folder))
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
-        """The participant's record; None if there is none or if it cannot be read."""
+        """Return the participant's record; None if there is none or if it cannot be read."""
         found = self._documents.get(participant.participant_key(project_id, user_id))
         try:
             return from_json(found.body, Participant) if found else None
@@ -62,7 +65,7 @@ class Repository:
     # Sessions (`project.players`)
 
     def membership(self, project_id: str, user_id: str) -> Membership | None:
-        """The participant's membership; None as long as it is not decided whether they play or are unmatched.
+        """Return the participant's membership; None as long as it is not decided whether they play or are unmatched.
 
         Raises ValueError or RecursionError if the document cannot be read.
         """
@@ -70,26 +73,26 @@ class Repository:
         return memberships.read(found.body) if found else None
 
     def session_id(self, project: Project, user_id: str) -> str | None:
-        """The id of the session that the participant is a member of; None if there is none.
+        """Return the id of the session that the participant is a member of; None if there is none.
 
-        No call in a project without sessions. Raises the same errors as `membership`.
+        AWS calls: none in a project without sessions. Raises the same errors as `membership`.
         """
         membership = self.membership(project.id, user_id) if project.has_sessions else None
         return membership.session if membership else None
 
     def session(self, project_id: str, session_id: str) -> SessionDocument | None:
-        """The session's document; None if there is none. Raises `BadSession` if it cannot be read."""
+        """Return the session's document; None if there is none. Raises `BadSession` if it cannot be read."""
         found = self._documents.get(session_key(project_id, session_id))
         return session.parse(found.body) if found else None
 
     # Servers
 
     def project_of_own_server(self, project: Project, user_id: str) -> Project | None:
-        """The registration for one player, if the participant still has a server of their own that runs it; else None.
+        """Return the registration for one player, if a server of the participant's own still runs it; else None.
 
-        None too if that server has ended for good, or if the participant has a membership and plays with others (a
-        function that had not read the new registration yet may have started the server). No call if one player is
-        registered, or never was. Raises the same errors as `membership`.
+        The result is None too if that server has ended for good, or if the participant has a membership and plays with
+        others (a function that had not read the new registration yet may have started the server). No AWS call is made
+        if one player is registered now, or never was. Raises the same errors as `membership`.
         """
         before = project.for_session(1) if project.has_sessions else None
         record = self.server_of(project.id, user_id) if before else None
@@ -98,19 +101,20 @@ class Repository:
         return None if self.membership(project.id, user_id) else before
 
     def server_of(self, project_id: str, user_id: str) -> Server | None:
-        """The record of the server of this participant or session; None if there is none."""
+        """Return the record of the server of this participant or session; None if there is none."""
         stored = self.server(ids.server_label(project_id, user_id))
         return stored.server if stored else None
 
     def server(self, label: str) -> Versioned | None:
-        """The record under a label, with its ETag; None if there is none."""
+        """Return the record under a label, with its ETag; None if there is none."""
         found = self._documents.get(server.key(label))
         return Versioned(from_json(found.body, Server), found.etag) if found else None
 
     def owner(self, name: str) -> Versioned | None:
         """Return the record that owns the resources of this name, following handovers; None if there is none.
 
-        One read; two for an assigned warm server. The record may be at another attempt now: compare its `name`.
+        The record may be at another attempt now: compare its `name`. AWS calls: one read; two for an assigned warm
+        server.
         """
         return server.owner(name, self.server, lambda stored: stored.server)
 
@@ -125,7 +129,7 @@ class Repository:
     def update(self, stored: Versioned | None, change: Callable[[Server], Server | None]) -> Versioned | None:
         """Apply `change` to the record and write the result; after a `Conflict`, read the record again and repeat.
 
-        Return the version written; None if `change` returns None or there is no record. Raises `RetryLater` after
+        Returns the version written; None if `change` returns None or there is no record. Raises `RetryLater` after
         `TRIES` conflicts.
         """
         for _ in range(TRIES):

@@ -41,29 +41,29 @@ class Secret(Record, frozen=True):
         return "Secret(…)"
 
     def derive(self, purpose: str, *about: str) -> str:
-        """64 hex digits of an HMAC with the secret, different for each purpose and each `about`."""
+        """Return 64 hex digits of an HMAC with the secret, different for each purpose and each `about`."""
         text = "\0".join((purpose, *about))
         return hmac.new(self.secret.encode(), text.encode(), hashlib.sha256).hexdigest()
 
     def credential(self, name: str, nonce: str) -> str:
-        """The credential with which the server of this name gets presigned requests. No browser ever gets it."""
+        """Return the credential with which the server of this name gets presigned requests. No browser ever gets it."""
         return self.derive("credential", name, nonce)
 
     def token(self, server: Server) -> str:
-        """The token with which the participant plays on this server; empty if there is none."""
+        """Return the token with which the participant plays on this server; empty if there is none."""
         if server.token or not server.nonce:
             return server.token
         return self.derive("token", server.name, server.nonce)[:48]
 
     def project_secret(self, project: Project) -> str:
-        """The key that signs the project's tickets, links and completion codes."""
+        """Return the key that signs the project's tickets, links and completion codes."""
         is_older = project.salt in ("", hippo_entry.SALT)  # it may have a secret that an earlier version stored
         stored = (project.secret or self.projects.get(project.id)) if is_older else ""
         return stored or self.derive("project", project.id, project.salt)
 
 
 class SecretCache:
-    """Reads the installation's secret. Each running function has one cache, which makes one call an hour."""
+    """Reads the installation's secret. Each running function has one cache, which reads the document once an hour."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -72,7 +72,7 @@ class SecretCache:
         self._fresh_until = 0.0
 
     def find(self) -> Secret | None:
-        """The secret; None if none was created yet."""
+        """Return the secret; None if none was created yet."""
         with self._lock:
             if self._cached is None or monotonic() > self._fresh_until:
                 document = self._documents.get(KEY)
@@ -81,7 +81,7 @@ class SecretCache:
             return self._cached
 
     def get_or_create(self) -> Secret:
-        """The secret; it is created if there is none."""
+        """Return the secret; if there is none, create it."""
         found = self.find()
         while found is None:
             with contextlib.suppress(Conflict):  # another function has created it
@@ -90,14 +90,20 @@ class SecretCache:
         return found
 
     def token(self, server: Server) -> str:
-        """The token with which the participant plays on this server; "" if it has none. No call without a nonce."""
+        """Return the token with which the participant plays on this server; "" if the server has none.
+
+        AWS calls: at most one an hour; none for a record without a nonce.
+        """
         if server.token or not server.nonce:
             return server.token
         found = self.find()
         return found.token(server) if found else ""
 
     def with_secret(self, project: Project) -> Project:
-        """The project with its secret, which the master list does not hold. Raises LookupError if `KEY` is gone."""
+        """Return the project with its secret, which the master list does not hold.
+
+        Raises LookupError if the document `_secret.json` is gone.
+        """
         if project.secret and not project.salt:
             return project
         found = self.find()
@@ -109,7 +115,10 @@ class SecretCache:
         return msgspec.structs.replace(project, secret=found.project_secret(project))
 
     def add_project_secrets(self, found: Mapping[str, str]) -> None:
-        """Store projects' secrets that were found in the master list. Raises `Conflict` after `TRIES` conflicts."""
+        """Store projects' secrets that were found in the master list, by project id.
+
+        Raises `Conflict` after `TRIES` conflicts.
+        """
         for _ in range(TRIES if found else 0):
             self.get_or_create()
             document = self._documents.get(KEY)

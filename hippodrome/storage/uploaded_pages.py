@@ -12,18 +12,19 @@ from hippodrome.ports import Documents
 
 
 def at_top(documents: Documents, project_id: str, pages: Iterable[str]) -> set[str]:
-    """The keys of these pages, and of their variants, directly below `{id}/`.
+    """Return those keys of these pages and of their variants that exist directly below `{id}/`.
 
-    Two listings for each page: a listing of the whole folder would include the participants' documents.
+    AWS calls: two listings for each page. A listing of the whole folder would include the participants' documents.
     """
     prefixes = [f"{project_id}/{page}{end}" for page in sorted(set(pages)) for end in (".html", "-")]
     return {entry.key for prefix in prefixes for entry in documents.list(prefix)}
 
 
 def located(documents: Documents, project: Project) -> tuple[Project, list[str]]:
-    """The project with the folder and the variants of its pages, and a sentence for each page with two kinds of files.
+    """Return the project with the folder and the variants of its pages, as they were uploaded.
 
-    The folder is `{id}/`, where HIPPO's script has just written, unless fewer pages are missing in `{id}/steps/`.
+    The second result has a sentence for each page that was uploaded both with and without numbers. The folder is
+    `{id}/`, where HIPPO's script has just written, unless fewer pages are missing in `{id}/steps/`.
     """
     pages = sorted({step.page for step in (*project.steps, *project.pages_in_game) if step.type.has_files})
     top = at_top(documents, project.id, pages)

@@ -121,7 +121,10 @@ class GameStep:
             self._request_server(project, owner, attempt, players)
 
     def _first_attempt_if_lost(self, visit: Visit) -> int | None:
-        """Return 1 if there should be a server by now: its start message was lost. Else None."""
+        """Return 1, the number of the first attempt, if its start message was lost; otherwise None.
+
+        There is no record. The message was lost if the participant may have a server, and should have one by now.
+        """
         project, step, progress = visit.project, visit.step, visit.progress
         since = progress.reached_at(project, step)
         overdue = progress.has_arrived if since is None else self._services.platform.now() - since > ASK_AGAIN

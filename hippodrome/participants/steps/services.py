@@ -28,6 +28,6 @@ class StepServices:
     def state(
         self, project: Project, user_id: str, step: Step | None, record: Server | None, since: datetime | None = None
     ) -> dict[str, Any]:
-        """The state of the participant's server as JSON data (docs/pages.md); see `ServerStates.state`."""
+        """Return the state of the participant's server as JSON data (docs/pages.md); see `ServerStates.state`."""
         dns, now = self.platform.dns, self.platform.now()
         return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)

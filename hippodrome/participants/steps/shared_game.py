@@ -29,7 +29,7 @@ class StepAnswered(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """A participant's standing at a game step: in the lobby, in a session with its server's `record`, or neither."""
+    """Where a participant stands at a game step: in the lobby, in a session with its server's `record`, or neither."""
 
     found: LobbyState | NoServerYet | Membership | None
     record: Server | None = None
@@ -51,17 +51,17 @@ class Standing:
 
 
 class SharedGame:
-    """The lobby, and then the session, of participants at a game step."""
+    """Leads participants at a game step of several players to the lobby, and then to their session."""
 
     def __init__(self, services: StepServices) -> None:
         self._services = services
         self._lobby = Lobby(services.platform, services.repository)
 
     def visit(self, project: Project, user_id: str, step: Step) -> Standing:
-        """Handle a request at this step. Without a membership, the participant waits in the lobby.
+        """Handle a request at this step, and return where the participant stands.
 
-        Before the step at which servers start, and from the step at which they stop, there is no lobby: then only a
-        membership is looked up.
+        A participant without a membership waits in the lobby. Before the step at which servers start, and from the step
+        at which they stop, there is no lobby: then only a membership is looked up.
         """
         if not participant.may_have_server(project, step):
             return self.decided(project, user_id) or Standing(None)
@@ -72,17 +72,17 @@ class SharedGame:
         return self._standing(project, self._lobby.visit(project, user_id, project.group(user_id), answers))
 
     def decided(self, project: Project, user_id: str) -> Standing | None:
-        """The participant's standing if they are in a session or unmatched; else None. Writes nothing."""
+        """Return where the participant stands if they are in a session or unmatched; else None. Writes nothing."""
         membership = self._services.repository.membership(project.id, user_id)
         return self._standing(project, membership) if membership else None
 
     def state_alone(
         self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
     ) -> dict[str, Any] | None:
-        """The state for a page that was made when one player was registered; None if one player never was. One read.
+        """Return the state for a page that was made when one player was registered; None if one player never was.
 
-        Without a server of the participant's own the state is `ended`: the page is loaded again, and is then the page
-        of the lobby or of the participant's session.
+        If the participant has no server of their own, the state is `ended`: the page is loaded again, and is then the
+        page of the lobby or of the participant's session. AWS calls: one read.
         """
         before = project.for_session(1)
         if before is None:
@@ -92,14 +92,17 @@ class SharedGame:
         return state if record else state | {"state": ENDED}
 
     def leave(self, project: Project, user_id: str) -> None:
-        """Note that the participant has closed the lobby's page."""
+        """Note that the participant has closed the lobby's page, unless they are matched already."""
         if self._services.repository.membership(project.id, user_id) is None:
             self._lobby.leave(project, user_id)
 
     def state(
         self, project: Project, user_id: str, step: Step | None, standing: Standing, since: datetime | None = None
     ) -> dict[str, Any]:
-        """The state as JSON data for the page. A member's page gets the member's own token, never the server's."""
+        """Return the state of the lobby, or of the session's server, as JSON data for the game page (docs/pages.md).
+
+        A member's page gets the member's own token, never the server's.
+        """
         state = self._services.state(project, user_id, step, standing.record, since)
         found = standing.found
         if isinstance(found, LobbyState):

@@ -28,7 +28,10 @@ class PageSource:
 
 
 def source_of(services: StepServices, visit: Visit, page: Step) -> PageSource:
-    """Read the page that this participant sees. Raises `PageError` if it was not uploaded."""
+    """Return the text of the page as this participant sees it, and the values for it.
+
+    Raises `PageError` if the page was not uploaded.
+    """
     project = visit.project
     file = project.file(visit.user_id, page)
     text = services.project_cache.page(project, file)

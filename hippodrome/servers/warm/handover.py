@@ -33,10 +33,10 @@ class Handovers:
         self._pools = pools
 
     def reserve(self, project: Project, stored: Versioned) -> Versioned | None:
-        """Write a ready warm server's name into the participant's record; return that record, or None if none is ready.
+        """Write a ready warm server's name into the participant's record, and return that record.
 
-        Four calls, or one if none is ready. Raises `RetryLater` if the record was changed at the same time, by another
-        delivery of the message or by a stop.
+        The result is None if no warm server is ready. AWS calls: four; one if none is ready. Raises `RetryLater` if the
+        record was changed at the same time, by another delivery of the message or by a stop.
         """
         if stored.server.warm_server_name:
             return stored
@@ -57,7 +57,10 @@ class Handovers:
         return named
 
     def assign(self, project: Project, named: Versioned) -> bool:
-        """Hand over the reserved warm server; False if it has ended or is another participant's. About eight calls."""
+        """Hand over the reserved warm server. AWS calls: about eight.
+
+        Returns False if the warm server has ended or is another participant's.
+        """
         record = named.server
         warm_server = self._take_over(record)
         if warm_server is None:

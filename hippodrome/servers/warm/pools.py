@@ -31,7 +31,7 @@ ATTEMPT = 1  # the only attempt of a warm server
 
 
 class Pools:
-    """The pools of all projects. One per running function."""
+    """The pools of all projects. Each running function has one."""
 
     def __init__(self, platform: Platform, project_cache: ProjectCache) -> None:
         self._platform = platform
@@ -39,25 +39,28 @@ class Pools:
         self._shared = SharedDocuments(platform.documents)
 
     def take(self, project: Project) -> tuple[str, WarmServer] | None:
-        """Take a ready warm server out of the pool; return its id and entry. Two calls. None, after one, if none is."""
+        """Take a ready warm server out of the pool, and return its id and its entry; None if none is ready.
+
+        AWS calls: two; one if none is ready.
+        """
         pool = self._change(project.id, lambda pool: pool.without_first(project.version)).before
         first = pool.first(project.version)
         return (first, pool.warm_servers[first]) if first else None
 
     def put_back(self, project: Project, warm_id: str, warm_server: WarmServer) -> None:
-        """Put back a warm server that was taken and is not needed. Two calls."""
+        """Put back a warm server that was taken and is not needed. AWS calls: two."""
         self._change(project.id, lambda pool: pool.with_returned(warm_id, warm_server))
 
     def mark_ready(self, project_id: str, warm_id: str) -> None:
-        """Mark this warm server ready: participants may take it. Two calls."""
+        """Mark this warm server ready, so that participants may take it. AWS calls: two."""
         self._change(project_id, lambda pool: pool.with_ready([warm_id]))
 
     def remove(self, project_id: str, warm_id: str) -> None:
-        """Remove this warm server from the pool. Two calls, or one if the pool does not list it."""
+        """Remove this warm server from the pool. AWS calls: two; one if the pool does not list it."""
         self._change(project_id, lambda pool: pool.without([warm_id]))
 
     def request_adjustment(self, project_id: str) -> None:
-        """Send the message on which `start_server` calls `adjust`."""
+        """Ask `start_server` by a message to adjust the pool (`adjust`)."""
         self._platform.bus.publish(Topic.START, to_message(KeepWarm(project_id)))
 
     def adjust(self, project_id: str) -> None:
@@ -86,8 +89,10 @@ class Pools:
     def repair(self, repository: Repository) -> Collection[str]:
         """Repair all pools after lost messages; return the ids of all warm servers in them.
 
-        One listing; for each pool a read and a message; for each warm server a read. If a pool cannot be read, the
-        others are repaired before the error is raised.
+        AWS calls: two reads of the master list and a listing; for each project with a pool or `warmServers` at most two
+        reads, a write and a message; for each warm server a read, and a message if it is started again or stopped. A
+        write that meets another one is repeated. If a pool cannot be read, the others are repaired before the error is
+        raised.
         """
         configured = self._projects_with_warm_servers()
         known: set[str] = set()
@@ -111,7 +116,10 @@ class Pools:
         return known
 
     def handovers(self) -> Iterator[tuple[str, str]]:
-        """Yield the project's id and the server's name of each handover document. One listing for each pool."""
+        """Yield the project's id and the server's name of each handover document.
+
+        AWS calls: two reads of the master list and a listing; a listing for each project with a pool or `warmServers`.
+        """
         for project_id in sorted(self._projects_with_warm_servers() | self._projects_with_pool()):
             for entry in self._platform.documents.list(handovers_folder(project_id)):
                 name = entry.key.rpartition("/")[2].removesuffix(".json")
