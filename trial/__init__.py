@@ -40,7 +40,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _InteractiveGymFinder:
-    """Finds the modules of Interactive Gym as modules of `trial`: `from trial.remote_game import RemoteGame`.
+    """Imports Interactive Gym's modules as modules of `trial`: `from trial.remote_game import RemoteGame`.
 
     It is the last finder of `sys.meta_path`, so it hides no module of this package.
     """

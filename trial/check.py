@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 LACKS = "MISSING IN THE IMAGE: "
 """The beginning of the line that says what is missing."""
 REMEDY = " => "
-"""Separates, in that line, the missing thing from the advice what to do about it."""
+"""Separates, in the line that begins with LACKS, the missing thing from the advice."""
 PACKAGE = "the package that brings "
-"""Precedes, in the advice, the name of a module: the image does not know which package has it."""
+"""Precedes the name of a missing module in the advice: the image does not know which package has the module."""
 
 _SECONDS = 60.0
 _LIMIT = 300  # characters of an error's message
@@ -49,7 +49,7 @@ _ENVIRONMENT = {
     environment.GAME_STEPS: "check",
 }
 _LIBRARY = re.compile(r"([^\s:]+): cannot open shared object file")
-_MISSING = {"ImportError", "DependencyNotInstalled", "UnregisteredEnv"}  # the last two of gymnasium.error
+_MISSING = {"ImportError", "DependencyNotInstalled", "UnregisteredEnv"}  # the last two are classes of gymnasium.error
 
 
 def main(file: Path, seconds: float) -> int:

@@ -26,7 +26,7 @@ class SettingsError(ValueError):
 
 
 def trial_section(section: Mapping[str, Any]) -> TrialSection:
-    """Check the section `trial`, and return it with a game and with the names of actions in lower case.
+    """Check the section `trial`, and return it with a game and with actions' names in lower case.
 
     Unknown keys are ignored. Raises SettingsError with the first problem.
     """
@@ -86,7 +86,10 @@ class TrialSettings:
 
     @property
     def assigned(self) -> bool:
-        """Whether the server knows who plays here. A warm server, and one without its members yet, learn it later."""
+        """Whether the server knows who plays here.
+
+        A warm server and a session's server without members learn it later.
+        """
         return not self.warm_server and (not self.session or bool(self.members))
 
     @property
@@ -211,7 +214,7 @@ def _group(text: str) -> int | None:
 def _name(env: Mapping[str, str], key: str, pattern: re.Pattern[str]) -> str:
     value = _required(env, key)
     if not pattern.fullmatch(value):
-        raise SettingsError(f"{key} may hold only letters, digits, '-' and '_' (and not too many)")
+        raise SettingsError(f"{key} must have the form {pattern.pattern}")
     return value
 
 

@@ -29,7 +29,7 @@ _KNOWN_KEYS = _HIPPO_KEYS | {"terminated", "truncated", "action"}
 _OLD_GYM = Path(__file__).with_name("old_gym")
 _OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
 _ENV_METHODS = ("step", "render", "reset", "close")
-"""If a class Agent lacks one of these methods, the environment's own method is called."""
+"""The methods that a class Agent may lack: the environment's own method is called then."""
 
 
 class AgentError(Exception):
@@ -38,7 +38,7 @@ class AgentError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """The results of one step. `action` is the index of the action that the agent reports, if any."""
+    """The results of one step. `action` is the number of the action that the agent reports; None if it reports none."""
 
     observation: Any
     reward: float
@@ -91,6 +91,7 @@ class Agent:
         return self.env.reset(seed=seed)
 
     def close(self) -> None:
+        """Close the environment."""
         self.env.close()
 
 
@@ -133,13 +134,13 @@ def _missing(methods: Any) -> list[str]:
 
 
 def _question_about_class(module: Any) -> str:
-    """A question about a class of the module whose name is similar to `Agent`; empty if there is none."""
+    """Return a question about a class of the module with a name similar to `Agent`; empty if there is none."""
     near = nearest("Agent", (name for name, found in vars(module).items() if isinstance(found, type)))
     return f"; is {near} meant to be Agent?" if near else ""
 
 
 def _similar_methods(name: str, agent_class: type) -> list[str]:
-    """The method of the class whose name is most similar to `name`, as a list; empty if none is similar."""
+    """Return the method of the class whose name is most similar to `name`, as a list; empty if none is similar."""
     # `load` refuses the agent because of it, so the names must be more similar than in the questions of
     # `protocol/similar.py`.
     members = {other: getattr(agent_class, other, None) for other in dir(agent_class) if not other.startswith("_")}
@@ -160,7 +161,7 @@ class AgentAdapter:
         action_space: tuple[str, ...] | None,
         reader: PictureReader | None = None,
     ) -> None:
-        """`action_space` has the names of the actions in config.yml, if they are there.
+        """`action_space` has the actions' names from config.yml; None or empty if config.yml has none.
 
         `reader` reads what `render` returns; the default reader takes pixels alone.
         """
@@ -173,7 +174,7 @@ class AgentAdapter:
         self._returned: Any = None  # by start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
         self._unusual_step: Callable[[Any], Any] | None = None
-        self._unusual_render = False  # `render` takes something, or is the environment's
+        self._unusual_render = False  # `render` has parameters, or is the environment's
         self._env_methods: dict[str, Callable[..., Any]] = {}  # the environment's, for those that the agent lacks
         self._feedback: tuple[Callable[..., Any], bool] | None = None  # the agent's method; whether it takes the player
         self._word = signatures.NO_WORD  # the newest word of feedback since the last step
@@ -188,7 +189,7 @@ class AgentAdapter:
 
     @property
     def env(self) -> Any:
-        """What `start` returned, or the agent's attribute `env`; None if there is neither."""
+        """The object that `start` returned, or the agent's attribute `env`; None if there is neither."""
         return self._returned if self._returned is not None else getattr(self._agent, "env", None)
 
     @property
@@ -246,7 +247,7 @@ class AgentAdapter:
         return signatures.PLAYER in self._signatures["render"].order
 
     def _call(self, method: str, *, action: Any = None, seed: int | None = None, player: Any = PLAYER) -> Any:
-        """Call a method with the arguments of its signature.
+        """Call a method of the agent with the arguments that its signature names.
 
         Raises AgentError if the method takes the environment, and `env` is None.
         """
@@ -325,6 +326,7 @@ class AgentAdapter:
             method(word, player=player) if self._feedback[1] else method(word)
 
     def close(self) -> None:
+        """Call `close`, if the agent was loaded."""
         if self._agent is not None:
             self._call("close")
 
@@ -332,7 +334,7 @@ class AgentAdapter:
 def _signatures(
     agent: Any, methods: Sequence[str], env_methods: Mapping[str, Callable[..., Any]]
 ) -> dict[str, Signature]:
-    """The signatures of these methods. Raises AgentError if one of them cannot be called."""
+    """Return the signatures of these methods. Raises AgentError if one of them cannot be called."""
     try:
         return {name: signatures.read(name, env_methods.get(name) or getattr(agent, name)) for name in methods}
     except UnfitSignature as error:
@@ -340,7 +342,7 @@ def _signatures(
 
 
 def _env_methods(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
-    """The methods of what `start` returned that replace the missing ones. Raises AgentError if it lacks one too."""
+    """Return the environment's methods for those that the agent lacks. Raises AgentError if it lacks one, too."""
     lacking = [name for name in missing if not callable(getattr(returned, name, None))]
     if lacking:
         why = "" if returned is None else f", and neither has what start() returned ({type(returned).__name__})"
@@ -362,7 +364,7 @@ def read_step_result(result: Any) -> StepResult:
     if isinstance(result, tuple | list) and len(result) == 4:
         observation, reward, done, info = result
         return _outcome(observation, reward, *_done(done, info), info)
-    if isinstance(result, bool | np.bool_):  # later agents of HIPPO
+    if isinstance(result, bool | np.bool_):  # later agents of HIPPO return `done` alone
         return StepResult(None, 0.0, bool(result), False)
     raise AgentError("step() must return (observation, reward, terminated, truncated, info) or a dict of these")
 
@@ -386,7 +388,7 @@ def _read_dict(result: Mapping[str, Any]) -> StepResult:
 
 
 def _done(done: Any, info: Any) -> tuple[bool, bool]:
-    """Gym's old `done` as terminated and truncated. Gym's TimeLimit noted in the info that it had truncated."""
+    """Split Gym's old `done` into terminated and truncated. Gym's TimeLimit says in the info if it has truncated."""
     over = bool(done)
     truncated = over and isinstance(info, Mapping) and info.get("TimeLimit.truncated") in (True, np.True_)
     return over and not truncated, truncated

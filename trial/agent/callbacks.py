@@ -44,7 +44,7 @@ Record = Callable[[str, Any], None]
 class Session:
     """The state of the session when a callback is called. Mappings are by player.
 
-    `env` is the environment itself. No step is taken for `callbackSeconds`; after that the game goes on.
+    `env` is the environment itself. The game waits at most `callbackSeconds` for the callback, and then takes steps.
     """
 
     trial: str
@@ -58,16 +58,16 @@ class Session:
     ticks: int
     """The number of steps taken in the episode."""
     actions: Mapping[str, Any]
-    """Of the last step, by number; empty before the first."""
+    """The numbers of the actions in the last step; empty before the first step."""
     rewards: Mapping[str, float]
     observations: Mapping[str, Any]
     infos: Mapping[str, Any]
     scores: Mapping[str, float]
-    """Sums of the episode's rewards."""
+    """The sums of the episode's rewards."""
     why: str | None
-    """Why the episode ended: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
+    """The end of the episode: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
     replaying: bool
-    """Whether steps of an earlier server are taken again. Values are not recorded now: its recording has them."""
+    """Whether steps of an earlier server are taken again. Values are not recorded then: its recording has them."""
     env: Any
     record: Record
     """`record(name, value)` writes the value into the recording, under this name."""
@@ -86,7 +86,7 @@ class TrialFacts:
 
 @dataclass(slots=True)
 class _Standing:
-    """The state of the episode for callbacks, as it changes."""
+    """The present facts about the episode for callbacks."""
 
     episode: int = 1
     ticks: int = 0
@@ -99,7 +99,7 @@ class _Standing:
 
 
 def listening(agent: Any) -> dict[str, Callable[..., Any]]:
-    """The callbacks that an agent (an object or a module) has."""
+    """Return the callbacks that an agent (an object or a module) has."""
     found = {name: getattr(agent, name, None) for name in NAMES}
     return {name: method for name, method in found.items() if callable(method)}
 
@@ -148,13 +148,13 @@ class Callbacks:
     # ---- events of the session and the game
 
     def session_begins(self) -> None:
-        """The session begins, or continues on this server. Only the first call has an effect."""
+        """Call `on_session_start`, as the session begins or continues on this server. Only the first call does so."""
         if not self._started:
             self._started = True
             self._call(SESSION_START)
 
     def episode_began(self, episode: int, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> None:
-        """The environment has been reset."""
+        """Call `on_episode_start`, after the environment has been reset."""
         self._now = _Standing(episode, observations=observations, infos=infos)
         self._now.scores = dict.fromkeys(self.facts.players, 0.0)
         self._call(EPISODE_START)
@@ -166,7 +166,7 @@ class Callbacks:
         observations: Mapping[str, Any],
         infos: Mapping[str, Any],
     ) -> None:
-        """A step has been taken."""
+        """Call `on_tick`, after a step has been taken."""
         now = self._now
         now.ticks += 1
         now.actions, now.rewards, now.observations, now.infos = actions, rewards, observations, infos
@@ -175,20 +175,20 @@ class Callbacks:
         self._call(TICK)
 
     def fed_back(self, player: str, word: str) -> None:
-        """A participant has sent a word of feedback, and the agent's `feedback` has been called."""
+        """Call `on_feedback`, after a participant's word of feedback has been given to the agent's `feedback`."""
         self._call(FEEDBACK, player, word)
 
     def episode_ended(self, why: str) -> None:
-        """The episode is over."""
+        """Call `on_episode_end`, after the episode."""
         self._now.why = why
         self._call(EPISODE_END)
 
     def session_ended(self) -> None:
-        """The trial is over."""
+        """Call `on_session_end`, after the trial."""
         self._call(SESSION_END)
 
     def player_moved(self, name: str, player: str) -> None:
-        """A participant has come, gone or returned: `on_join`, `on_leave`, `on_return`."""
+        """Call `on_join`, `on_leave` or `on_return` (`name`), after a participant has come, left or returned."""
         self._call(name, player)
 
     # ---- lines
@@ -199,7 +199,10 @@ class Callbacks:
         return self._notes.recorded
 
     def take(self, recorded: int | None = None) -> list[bytes]:
-        """Take the lines that were not taken yet, of the first `recorded` lines or of all. For the event loop."""
+        """Return the lines for the recording that were not returned before. For the event loop's thread.
+
+        With `recorded`, return only those among the first `recorded` lines, counted with the lines returned before.
+        """
         return self._notes.take(recorded)
 
     def close(self) -> None:
@@ -257,7 +260,7 @@ class Callbacks:
 
 
 class _Notes:
-    """The lines of callbacks for the recording, and the warnings about callbacks, each of which is given once."""
+    """Collects the lines that callbacks record, and gives each different warning about callbacks once."""
 
     def __init__(
         self,
@@ -285,14 +288,14 @@ class _Notes:
             self.recorded += 1
 
     def once(self, text: str) -> bool:
-        """Whether this text is new. After MOST_VALUES different texts, no text counts as new."""
+        """Return whether this text is new. After MOST_VALUES different texts, no text counts as new."""
         first = text not in self._warnings and len(self._warnings) < MOST_VALUES
         if first:
             self._warnings.add(text)
         return first
 
     def failed(self, name: str, error: BaseException, **where: Any) -> None:
-        """A callback raised this error. Record and log each different error once."""
+        """Record and log the error that a callback raised; each different error once."""
         words = " ".join(f"{type(error).__name__}: {_message_of(error)}".split())[:_LONGEST_ERROR]
         if self.once(f"{name} {words}"):
             self.add(**where, name=name, callback=name, error=self._hide(words))
@@ -385,7 +388,7 @@ class _Thread:
 
 
 def _discard(name: str, value: Any) -> None:
-    """Record nothing: steps of an earlier server are taken again."""
+    """Record nothing, while steps of an earlier server are taken again."""
 
 
 def _message_of(error: BaseException) -> str:

@@ -35,7 +35,7 @@ class Calls:
         self._cut = False  # a value in an info of the line before was too large
 
     def run(self, call: Call) -> Any:
-        """Run the call and return its result, which the docstring of each kind of call names.
+        """Run the call, and return the result that the docstring of its class names.
 
         Raises what the researcher's code raises, and Diverged if a replay differs from the recording.
         """
@@ -95,7 +95,7 @@ class Calls:
         return {"extra": self._bounded("what step() returns as %r", values)}
 
     def _line(self, kind: str, /, **fields: Any) -> recording.Line:
-        """A line of the recording. A value in an `info` that is too large is replaced by its size."""
+        """Build a line of the recording. The size of a value in an `info` replaces the value if it is too large."""
         if self._is_settled(fields):
             return recording.LaterLine(kind, fields | {"info": dict(fields["info"])})
         line = None if self._cut else recording.line(kind, **fields)
@@ -106,7 +106,7 @@ class Calls:
         return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
 
     def _is_settled(self, fields: Mapping[str, Any]) -> bool:
-        """Whether all values of a line are small, and no later step can change them. In most games that is so."""
+        """Whether all values of a line are small and no later step can change them, as in most games."""
         if self._record_observations or "extra" in fields:
             return False
         parts = fields["players"].values() if "players" in fields else ()
@@ -114,7 +114,7 @@ class Calls:
         return all(map(recording.is_settled, infos))
 
     def _cut_infos(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """The fields of a line whose infos are too large, with their bounded values."""
+        """Return the fields of a line whose infos are too large, with the sizes of their large values instead."""
         cut: dict[str, Any] = {}
         info = self._cut_info(fields.get("info"))
         if info is not None:
@@ -132,7 +132,7 @@ class Calls:
         return self._bounded("%r in info", info)
 
     def _bounded(self, subject: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The values, with the size of each one that is too large in its place.
+        """Return the values; the size of a value replaces it if it is too large.
 
         The log's warning about such a value starts with `subject`, in which `%r` stands for its name.
         """
@@ -239,7 +239,7 @@ class AgentCalls(Calls):
 
 
 def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:
-    """The `action_mask` of an info, as bools by the actions' numbers; None if there is none, or it cannot be read."""
+    """Return the `action_mask` of an info, a bool for each action; None if there is none or it cannot be read."""
     mask = info.get(ACTION_MASK)
     try:
         return None if mask is None else [bool(one) for one in mask]

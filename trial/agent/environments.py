@@ -27,9 +27,9 @@ class Players:
     starts: Mapping[str, int]
     """The environment's number of each player's first action."""
     counts: Mapping[str, int | None]
-    """How many actions each player has in the environment; None if that is not known."""
+    """The number of each player's actions in the environment; None if it is not known."""
     of_env: bool
-    """Whether `env` is an environment, whose `agents` are the players still in the game; if not, it is the agent."""
+    """Whether `env` is an environment, whose `agents` are the players still in the game. If not, `env` is the agent."""
 
 
 class AecTurns:
@@ -39,7 +39,7 @@ class AecTurns:
         self._aec = aec
 
     def selected(self) -> Any:
-        """The environment's own name of the player who is to act; an empty list if no player is left."""
+        """Return the environment's own name of the player who is to act; an empty list if no player is left."""
         return self._aec.agent_selection if self._aec.agents else []
 
 
@@ -68,7 +68,7 @@ def made_by_module(game: str) -> Any:
 
 
 def _other_modules(game: str) -> list[str]:
-    """The other versions of the game in its package; if there are none, all the package's games."""
+    """Return the other versions of the game in its package; if there are none, all the package's games."""
     package, _, name = game.rpartition(".")
     folder = getattr(importlib.import_module(package), "__path__", [])
     games = [each.name for each in pkgutil.iter_modules(folder) if re.search(r"_v\d+$", each.name)]
@@ -88,7 +88,7 @@ def playable(env: Any) -> Any:
 
 
 def turns(env: Any) -> AecTurns | None:
-    """The turns of an `AECEnv`, or of the `ParallelEnv` that `playable` made of it; None if all act at once."""
+    """Return the turns of an `AECEnv`, also if `playable` has made a `ParallelEnv` of it; None if all act at once."""
     aec = env if is_aec(env) else getattr(env, "aec_env", None)
     return None if aec is None or not is_aec(aec) or _at_once(aec) else AecTurns(aec)
 
@@ -104,7 +104,7 @@ def _at_once(aec: Any) -> bool:
 
 
 def player_keys(owner: Any) -> list[Any]:
-    """The `possible_agents` of an agent, an environment, or the environment that it wraps; empty if there are none."""
+    """Return the `possible_agents` of an agent or environment, or of the one it wraps; empty if there are none."""
     for one in (owner, getattr(owner, "unwrapped", None)):
         keys = getattr(one, "possible_agents", None)
         if isinstance(keys, Iterable) and not isinstance(keys, str) and (listed := list(keys)):
@@ -113,7 +113,7 @@ def player_keys(owner: Any) -> list[Any]:
 
 
 def players_of(env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_env: bool, stepped: bool) -> Players:
-    """The players with these keys, and the names of their actions.
+    """Return the players with these keys, and the names of their actions.
 
     `configured` are the names in config.yml. `of_env` is as in `Players`. `stepped` says that the environment's own
     `step` gets the actions: then each player has as many actions as their action space, and these are numbered as
@@ -136,7 +136,7 @@ def players_of(env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_e
 
 
 def _space(env: Any, name: str, key: Any) -> Any:
-    """A player's space, by PettingZoo's method or a map by player, or the one of all players; None if unknown."""
+    """Return a player's space, by PettingZoo's method, a map by player, or the space of all; None if unknown."""
     found = getattr(env, name, None)
     if callable(found) and not hasattr(found, "sample"):
         try:

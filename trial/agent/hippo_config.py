@@ -10,7 +10,7 @@ from protocol import environment
 
 
 def hippo_config(variables: Mapping[str, str]) -> dict[str, Any]:
-    """The section `trial` of this server's project, in HIPPO's form, from the server's environment `variables`.
+    """Read the section `trial` from a server's environment `variables`, and return it in HIPPO's form.
 
     The keys of `options` stand beside the others, `ui` is a list of the controls that are shown, and `projectId` is
     the project's id.

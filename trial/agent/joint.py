@@ -31,14 +31,14 @@ class Joint(NamedTuple):
     observations: Mapping[str, Any]
     infos: Mapping[str, Mapping[str, Any]]
     rewards: Mapping[str, float]
-    """Of every player; 0 if the environment gives none."""
+    """The reward of every player; 0 if the environment gives none."""
     terminated: Mapping[str, bool]
     truncated: Mapping[str, bool]
-    """Of every player."""
+    """By player, whether the episode was truncated; every player has an entry."""
     to_act: frozenset[str]
     """The players who are to choose an action for the next step; empty when the episode is over."""
     masks: Mapping[str, tuple[bool, ...]]
-    """For each action, whether it is legal now; only of players for whom the environment gives a mask."""
+    """By player, whether each action is legal now, for those players for whom the environment gives a mask."""
     over: bool
     """Whether the episode is over for all players."""
     extra: Mapping[str, Any] | None = None
@@ -66,25 +66,25 @@ class JointAdapter:
         self._terminated: dict[str, bool] = {}
         self._truncated: dict[str, bool] = {}
         self.players: tuple[str, ...] = players.names
-        """In the environment's order."""
+        """The players' names, in the environment's order."""
         self._names = frozenset(players.names)
         self.action_spaces: Mapping[str, tuple[str, ...]] = players.action_names
         """The names of each player's actions, in the order of their numbers."""
         self.observation_spaces: Mapping[str, Any] = players.observation_spaces
-        """Gymnasium's space of each player's observations; None where it is not known."""
+        """The space (Gymnasium) of each player's observations; None if it is not known."""
         self.action_counts: Mapping[str, int | None] = players.counts
-        """How many actions each player has in the environment; None where it is not known."""
+        """The number of each player's actions in the environment; None if it is not known."""
         self.views: tuple[str, ...] = self.players
         """The players whose pictures are drawn, if `render` takes a player."""
 
     @property
     def env(self) -> Any:
-        """As `AgentAdapter.env`."""
+        """The environment, as in `AgentAdapter.env`."""
         return self._adapter.env
 
     @property
     def steps_itself(self) -> bool:
-        """As `AgentAdapter.steps_itself`."""
+        """Whether the researcher has written `step`, as in `AgentAdapter.steps_itself`."""
         return self._adapter.steps_itself
 
     @property
@@ -99,7 +99,7 @@ class JointAdapter:
 
     @property
     def agent_module(self) -> Any:
-        """As `AgentAdapter.agent_module`."""
+        """The imported agent.py, as in `AgentAdapter.agent_module`."""
         return self._adapter.agent_module
 
     def reset(self, seed: int) -> tuple[Joint, bool]:
@@ -142,7 +142,7 @@ class JointAdapter:
         )
 
     def pictures(self) -> dict[str, Picture] | Picture:
-        """The present picture; by player, for those in `views`, if `render` takes a player."""
+        """Draw the present picture; if `render` takes a player, a picture for each player in `views`."""
         if self._adapter.renders_by_player:
             draw, keys = self._adapter.draw, self._players.keys
             return {player: self._reader.read(draw(keys[player]), player) for player in self.views}
@@ -153,6 +153,7 @@ class JointAdapter:
         self._adapter.feedback(word, self._players.keys[player])
 
     def close(self) -> None:
+        """Call the agent's `close`."""
         self._adapter.close()
 
     # ---- what was returned
@@ -196,7 +197,7 @@ class JointAdapter:
             ended.update(dict.fromkeys((player for player in self.players if player not in self._ended), True))
 
     def _by_player(self, method: str, values: Mapping[Any, Any]) -> dict[str, Any]:
-        """The values by the players' names, without the value of ALL. Raises AgentError for an unknown player."""
+        """Return the values by players' names, without the value of ALL. Raises AgentError for an unknown player."""
         if values.keys() == self._names:  # the usual case
             return dict(values)
         found = {}
@@ -212,14 +213,14 @@ class JointAdapter:
         return ", ".join(self.players)
 
     def _no_agents(self) -> set[str]:
-        """The players who are not in the environment's `agents`: PettingZoo removes those whose episode is over."""
+        """Return the players whose episode is over: PettingZoo has removed them from the environment's `agents`."""
         agents = getattr(self._players.env, "agents", None)
         if not isinstance(agents, list | tuple):
             return set()
         return set(self.players) - {str(key) for key in agents}
 
     def _to_act(self, infos: Mapping[str, Mapping[str, Any]]) -> frozenset[str]:
-        """The players who choose an action now.
+        """Return the players who choose an action now.
 
         The agent's method `to_act` names them, or else the turn of an `AECEnv`, or else `to_act` in their infos.
         """
@@ -248,7 +249,7 @@ class JointAdapter:
     def _masks(
         self, observations: Mapping[str, Any], infos: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, tuple[bool, ...]]:
-        """The `action_mask` of each player in the game: in their info, else in their observation, if it is a map."""
+        """Return the `action_mask` of each player in the game, from their info, else from their observation (a map)."""
         found = {}
         for player in self.players:
             if player in self._ended:
@@ -274,13 +275,13 @@ class JointAdapter:
 
 
 def _info(value: Any) -> Mapping[str, Any]:
-    """The info as a map: anything else is put into one, under the name `info`."""
+    """Return an info as a map. Anything but a map becomes the value of `info` in a new one."""
     is_map = type(value) is dict or isinstance(value, Mapping)  # the first check is quicker
     return value if is_map else {} if value is None else {"info": value}
 
 
 def _truth(value: Any, beginning: str, player: str) -> bool:
-    """The value as a bool. Raises AgentError if it has no truth value.
+    """Convert the value to a bool. Raises AgentError if it has no truth value.
 
     The error's sentence starts with `beginning`, in which `%s` stands for the player.
     """
@@ -291,7 +292,7 @@ def _truth(value: Any, beginning: str, player: str) -> bool:
 
 
 def _reward(player: str, value: Any) -> float:
-    """The reward as a number; 0 for None. Raises AgentError if it is no finite number."""
+    """Convert the reward to a number; None to 0. Raises AgentError if it is no finite number."""
     try:
         number = float(0.0 if value is None else value.item() if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError) as error:
@@ -326,7 +327,7 @@ class _Returned(NamedTuple):
 
 
 def _read(result: Any) -> _Returned:
-    """The parts of Gymnasium's five values, Gym's old four values, or a dict. Raises AgentError for anything else."""
+    """Read Gymnasium's five values, Gym's old four values, or a dict. Raises AgentError for anything else."""
     extra: Mapping[str, Any] | None = None
     count = len(result) if isinstance(result, (tuple, list)) else None
     if count == 5:

@@ -38,7 +38,7 @@ class JointCalls(Calls):
         record_observations: bool,
         stand_ins: Iterable[str] = (),
     ) -> None:
-        """`stand_ins` are players in whose place a policy may play while their participant is away."""
+        """`stand_ins` are players for whom a policy may play while their participant is away."""
         super().__init__(stamp, record_observations=record_observations)
         self._agent = agent
         humans = tuple(player.name for player in players if player.human)
@@ -67,7 +67,7 @@ class JointCalls(Calls):
         return Begun(self._line("reset", **self._stamp(), **fields), pictures, self._view(joint))
 
     def _view(self, joint: Joint) -> View:
-        """The players' view for the core. Policies read it while the environment goes on, so they get copies."""
+        """Build the players' view for the core. It holds copies: policies read it while the environment takes steps."""
         watching = self._policies & joint.to_act
         if not watching:
             return View(joint.to_act, masks=joint.masks)
@@ -76,18 +76,18 @@ class JointCalls(Calls):
         return View(joint.to_act, observations, infos, joint.masks)
 
     def _first_observation(self, joint: Joint) -> dict[str, Any]:
-        """The field of a line with the first human's observation, if observations are recorded."""
+        """Return the field of a line with the first human's observation, if observations are recorded."""
         if not self._record_observations:
             return {}
         return {"observation": recording.observation(joint.observations.get(self._first_human))}
 
     def _reset_part(self, player: str, call: ResetCall, joint: Joint) -> dict[str, Any]:
-        """One player's part of a reset's line. Policies have a seed, also if the environment takes none."""
+        """Build one player's part of a reset's line. Policies have a seed even if the environment takes none."""
         seeded = {"seed": policy_seed(call.seed, player)} if player in call.asked else {}
         return {**seeded, **self._info_and_observation(player, joint)}
 
     def _info_and_observation(self, player: str, joint: Joint) -> dict[str, Any]:
-        """A player's info and observation, for their part of a line; the first human's stand in the line itself."""
+        """Return a player's info and observation for their part of a line. The line itself has the first human's."""
         fields: dict[str, Any] = {}
         if player != self._first_human:
             info = joint.infos.get(player)
@@ -133,7 +133,7 @@ class JointCalls(Calls):
         return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint))
 
     def _step_part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
-        """One player's part of a step's line."""
+        """Build one player's part of a step's line."""
         part: dict[str, Any] = {
             "action": action.index if action.acts else None,
             "actionName": action.name if action.acts else None,
@@ -184,14 +184,14 @@ class JointCalls(Calls):
 
 
 def _ended(joint: Joint) -> frozenset[str]:
-    """The players for whom the episode is over."""
+    """Return the players for whom the episode is over."""
     if True not in joint.terminated.values() and True not in joint.truncated.values():
         return _NONE
     return frozenset(player for player in joint.terminated if joint.terminated[player] or joint.truncated[player])
 
 
 class _Observations:
-    """Collects in a replay the observations upon which each policy acted, as the recording names them."""
+    """Collects, while steps are taken again, the observations for which each policy had chosen its actions."""
 
     def __init__(self, unfinished: UnfinishedEpisode) -> None:
         self._wanted: dict[int, list[str]] = defaultdict(list)  # policies' players by the number of steps taken before
@@ -202,7 +202,7 @@ class _Observations:
         self.by_player: dict[str, list[Observed]] = defaultdict(list)
 
     def add(self, steps: int, joint: Joint) -> None:
-        """Keep the observation of each policy that acted upon `joint`, the state after `steps` steps of the episode."""
+        """Keep the observation of each policy that chose an action for `joint`, the results after `steps` steps."""
         for player in self._wanted.get(steps, ()):
             observation = snapshot(joint.observations.get(player))
             info = snapshot(joint.infos.get(player, {}))
@@ -210,7 +210,7 @@ class _Observations:
 
 
 def snapshot(observation: Any) -> Any:
-    """A copy of an observation, which the environment cannot change; of one that contains itself, no copy."""
+    """Copy an observation, so that the environment cannot change it. One that contains itself is not copied."""
     try:
         return _copied(observation)
     except RecursionError:

@@ -12,7 +12,7 @@ from trial.agent.agent import AgentError
 
 NAME = "match"
 SECONDS = 5.0
-"""A call that takes longer is given up, and `match` is called no more on that server."""
+"""The limit of a call, in seconds. If it takes longer, it is given up, and that server calls `match` no more."""
 
 
 class BadGroups(AgentError):
@@ -20,7 +20,7 @@ class BadGroups(AgentError):
 
 
 def function_of(module: ModuleType | None) -> Callable[..., Any] | None:
-    """The function `match` of agent.py; None if there is none."""
+    """Return the function `match` of agent.py; None if there is none."""
     function = getattr(module, NAME, None)
     return function if callable(function) else None
 
@@ -31,7 +31,7 @@ def in_class(agent: Any) -> bool:
 
 
 def candidates(question: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The argument of `match`: a dict for each participant who waits, in the order in which they came."""
+    """Build the argument of `match`: a dict for each participant who waits, in the order in which they came."""
     return [{"waited": 0, "group": None, "answers": {}} | each for each in json.loads(json.dumps(question["waiting"]))]
 
 
@@ -64,7 +64,7 @@ def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[l
 
 
 def _ids(group: Any) -> list[str] | None:
-    """The ids of a group; None if it is no list of ids or candidates."""
+    """Return the ids of a group; None if it is no list of ids or candidates."""
     if isinstance(group, str | bytes | Mapping) or not isinstance(group, Iterable):
         return None
     found: list[str] = []
@@ -77,7 +77,7 @@ def _ids(group: Any) -> list[str] | None:
 
 
 def _fault(ids: list[str], players: int, waiting_ids: set[str], taken: set[str]) -> str:
-    """Why the group cannot be played, in a sentence for the researcher; empty if it can."""
+    """Return why the group cannot be played, in a sentence for the researcher; empty if it can."""
     if not waiting_ids.issuperset(ids):
         return "match() chose an id that is not among those who wait"
     if len(set(ids)) < len(ids):

@@ -47,18 +47,19 @@ _SHOWN = {
 
 
 class UnfitSignature(ValueError):
-    """A method that cannot be called. The message is for the researcher."""
+    """A method of the agent cannot be called. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """The arguments of a method: positional ones, in `order`, and those by name. Each is one of the kinds above."""
+    """The arguments of a method: positional ones in `order`, others by name. Each is of a kind such as GAME or SEED."""
 
     order: tuple[str, ...]
     named: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def needs_env(self) -> bool:
+        """Whether one of the positional arguments is the environment."""
         return ENV in self.order
 
     def call(self, function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
@@ -69,12 +70,12 @@ class Signature:
 
 
 def usual(method: str) -> Signature:
-    """The usual form of a method; also for methods whose parameters cannot be read."""
+    """Return the usual signature of a method, which also counts if its parameters cannot be read."""
     return Signature(_FORMS[method][0])
 
 
 def read(method: str, function: Callable[..., Any]) -> Signature:
-    """The signature of `function`, which is the agent's `start`, `step`, `render`, `reset` or `close`.
+    """Read the signature of `function`, which is the agent's `start`, `step`, `render`, `reset` or `close`.
 
     Raises UnfitSignature if the function needs an argument that no form of the method has.
     """
@@ -100,7 +101,7 @@ def names(function: Callable[..., Any], parameter: str) -> bool:
 
 
 def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str, str], list[inspect.Parameter]]:
-    """The arguments that `reset` takes by name, and the other parameters."""
+    """Return the arguments that `reset` takes by name, and the other parameters."""
     if method != "reset":
         return {}, parameters
     named: dict[str, str] = {}
@@ -117,7 +118,7 @@ def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str
 
 
 def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[str]]:
-    """The names of the positional parameters: of those without a default, and of all."""
+    """Return the names of the positional parameters: of those without a default, and of all."""
     in_order = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     possible = [p.name.lower() for p in in_order]
     possible += [ACTION] * any(p.kind is p.VAR_POSITIONAL for p in parameters) * (not possible)
@@ -125,9 +126,9 @@ def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[st
 
 
 def _order(method: str, needed: list[str], possible: list[str]) -> tuple[str, ...] | None:
-    """The form of the method with as many arguments as it needs, and with most of them under their names.
+    """Choose the form of the method that has as many arguments as it needs, and most of them under their names.
 
-    None if no form has as many arguments.
+    Return None if no form has as many arguments.
     """
     if not needed and method in ("start", "step"):
         needed = possible[:1]

@@ -14,8 +14,8 @@ def start(adapter: AgentAdapter, players: Sequence[str] = ()) -> AgentAdapter | 
 
     `players` are the names in `trial.players`. The game has several players if the environment (`adapter.env`) or the
     agent has `possible_agents`, or if `players` has more than one name. But an agent with a `step` of its own may play
-    the others itself. It has one player unless `players` or its own `possible_agents` name several. Raises AgentError,
-    and whatever the researcher's code raises.
+    the others itself: its game has one player unless `players` or its own `possible_agents` name several. Raises
+    AgentError, and whatever the researcher's code raises.
     """
     adapter.begin()
     env = adapter.env

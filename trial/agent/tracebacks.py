@@ -12,13 +12,13 @@ _LONGEST_CHAIN = 20
 
 
 def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> str:
-    """The traceback. Its last line is the place in the folder's files and the error: `agent.py:30: NameError: …`.
+    """Format the traceback, and after it the place in the folder's files and the error: `agent.py:30: NameError: …`.
 
-    That line has the whole message of the error. The participants' ids in `private` are replaced (`without`).
+    The last line has the whole message of the error. The participants' ids in `private` are replaced (`without`).
     """
     whole, last = traceback.format_exception(error), traceback.format_exception_only(error)
     frames = whole[: -len(last)] if whole[-len(last) :] == last else whole
-    indented = [part for part in last if part.startswith(" ")]  # of a SyntaxError: the line of the file
+    indented = [part for part in last if part.startswith(" ")]  # a SyntaxError quotes the line of the file
     message = " ".join("".join(part for part in last if part not in indented).split())
     message = message.removeprefix("trial.agent.agent.")
     place = where(error, folder)
@@ -26,7 +26,7 @@ def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> s
 
 
 def where(error: BaseException, folder: Path) -> str | None:
-    """The innermost line of the researcher's own code that led to the error, as `agent.py:30`; None without one."""
+    """Return the innermost line of the researcher's own code in the traceback, as `agent.py:30`; None without one."""
     for each in _chain(error):
         places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(each.__traceback__)]
         if isinstance(each, SyntaxError) and each.filename:
@@ -39,7 +39,7 @@ def where(error: BaseException, folder: Path) -> str | None:
 
 
 def _own_path(path: Path, folder: Path) -> str | None:
-    """The file's path within the folder; None for a file outside, of an installed package, or of Hippodrome."""
+    """Return the file's path in the folder; None if it is outside, or of an installed package or of Hippodrome."""
     if not path.is_relative_to(folder) or path.is_relative_to(_OURS):
         return None
     inside = path.relative_to(folder)
@@ -48,7 +48,7 @@ def _own_path(path: Path, folder: Path) -> str | None:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """The error and the errors that led to it, the latest first."""
+    """Yield the error and the errors that led to it, the latest first."""
     each: BaseException | None = error
     for _ in range(_LONGEST_CHAIN):
         if each is None:
@@ -58,7 +58,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def without(private: Iterable[str], text: str) -> str:
-    """The text with `(participant)` in place of these ids of participants. Numbers of up to five digits stay."""
+    """Replace these ids of participants in the text by `(participant)`. Numbers of up to five digits stay."""
     # Such numbers are in every traceback. The longest id comes first, since another may be its beginning.
     ids = [each for each in sorted(private, key=len, reverse=True) if each and not (each.isdigit() and len(each) < 6)]
     if not ids:

@@ -18,12 +18,12 @@ from trial.core.effects import AgentTimeout
 T = TypeVar("T")
 
 Done = Callable[[Any, Exception | None], None]
-"""Takes a function's result, or the exception that it raised."""
+"""A function that gets another function's result, or None and the exception that it raised."""
 
 
 @dataclass(eq=False, slots=True)
 class _Job:
-    """A function that was given to the thread, with `done`, which takes its result. `until` is a time of the loop."""
+    """A function that was given to the thread. `done` gets its result. `until` is a time of the event loop's clock."""
 
     done: Done
     until: float
@@ -87,8 +87,8 @@ class Worker:
     def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
         """Call the function on the thread, then `done` on the event loop with its result or exception.
 
-        If the function has not returned after `limit` seconds, `done` gets an AgentTimeout instead. It is called once
-        in any case. `submit` must be called from the event loop.
+        If the function has not returned after `limit` seconds, `done` gets an AgentTimeout instead. `done` is called
+        exactly once. `submit` must be called from the event loop.
         """
         loop = asyncio.get_running_loop()
         if self._notifier is None or self._notifier.loop is not loop:
@@ -118,7 +118,7 @@ class Worker:
         self._timer = loop.call_at(when, self._give_up_late, loop)
 
     def _give_up_late(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Call `done` of the functions that are late, and set the timer for the next limit."""
+        """Call `done` of each function that is late, and set the timer for the next limit."""
         self._timer = None
         now = loop.time()
         late = [job for job in self._waiting if job.until <= now]

@@ -18,7 +18,7 @@ class AgentCall:
         self.call: Call | None = None
         """The call that has not ended yet; None if there is none."""
         self.give_up_at: float | None = None
-        """When the trial gives the present call up; None: only the call's own limit counts."""
+        """The time at which the trial gives up the present call; None: only the call's own limit counts."""
         self.hangs = False
         """Whether a call has not returned in time."""
 
@@ -28,9 +28,9 @@ class AgentCall:
         self._emit(call)
 
     def has_ended(self, call: Call, *, hangs: bool = False) -> bool:
-        """A call has ended. Return whether it is the present call, and not one that was given up.
+        """Note that a call has ended, and return whether its result counts: a call that was given up does not.
 
-        `hangs`: it has not returned within its limit.
+        `hangs`: the call has not returned within its limit.
         """
         if call is not self.call:
             return False
@@ -39,6 +39,6 @@ class AgentCall:
         return True
 
     def give_up(self, now: float) -> None:
-        """Give the present call up if its time is over. Its result, if one comes later, changes nothing."""
+        """Give up the present call if `give_up_at` has come. A result that comes later changes nothing."""
         if self.give_up_at is not None and now >= self.give_up_at:
             self.call, self.give_up_at, self.hangs = None, None, True

@@ -17,7 +17,7 @@ from trial.settings import TrialSettings
 
 
 class Beginning:
-    """Begins one episode after the other. Its methods return calls of the agent, which the caller makes."""
+    """Begins one episode after the other. Its methods return calls, which the caller gives to the agent."""
 
     def __init__(
         self,
@@ -37,12 +37,12 @@ class Beginning:
         self._emit = emit
         self._seed = 0  # of the episode
         self.unfinished: UnfinishedEpisode | None = None
-        """The next episode, if an earlier server has begun it."""
+        """The next episode if an earlier server has begun it; else None."""
         self.begun_again: int | None = None
         """The number of the episode that began anew because it could not be replayed."""
 
     def begin(self, progress: TrialProgress, participants: Participants) -> Call | None:
-        """Return the call that begins the next episode; None if a recording must be opened first (`opened`)."""
+        """Return the call that begins the next episode; None if a recording is opened first: `opened` returns it."""
         self._timing.begin_episode()  # now, so that states before the reset have the new episode's times
         unfinished = self.unfinished
         self._seed = self._next_seed(progress) if unfinished is None or unfinished.seed is None else unfinished.seed
@@ -56,7 +56,7 @@ class Beginning:
         return self._new_seed() if first is None else first + progress.episode - 1
 
     def opened(self, progress: TrialProgress, participants: Participants, ns: int) -> Call:
-        """The recording is open: return the call that begins the episode. `ns` is the present time in nanoseconds."""
+        """Return the call that begins the episode, whose recording is open. `ns`: the present time in nanoseconds."""
         unfinished, self.unfinished = self.unfinished, None
         if unfinished is not None and unfinished.steps:
             progress.choices.begins(self._seed)
@@ -88,7 +88,7 @@ class Beginning:
             self._emit(ResetPolicy(player.name, seed, observed.get(player.name, ())))
 
     def replayed(self, progress: TrialProgress, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
-        """The replay is done: the episode is where the earlier server left it."""
+        """Continue the episode where the earlier server left it, after its steps have been taken again."""
         steps = len(unfinished.steps)
         self._emit(RecordLine("resume", {"episode": unfinished.number, "steps": steps}))
         self._reset_policies(progress, replayed.observed)
@@ -97,5 +97,5 @@ class Beginning:
         progress.choices.policies.resume(unfinished.last_actions, unfinished.failures)
 
     def repeat_feedback(self, unfinished: UnfinishedEpisode, ns: int) -> None:
-        """Give the agent the feedback that the agent of an earlier server did not hear. `ns` as in `opened`."""
+        """Put feedback that the earlier server's agent did not hear before all other feedback. `ns` as in `opened`."""
         self._message_log.repeat(unfinished.unheard, ns)

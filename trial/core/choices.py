@@ -71,16 +71,16 @@ class Choices:
     # ---- an episode
 
     def begins(self, seed: int) -> None:
-        """The environment is being reset with this seed."""
+        """Prepare the policies for an episode with this seed. Call it before the environment is reset."""
         self.seed = seed
         self.policies.begin()
 
     def began(self) -> None:
-        """The environment has been reset."""
+        """Drop advice for the episode before. Call it after the environment has been reset."""
         self._advice.clear()
 
     def see(self, view: View | None, now: float) -> None:
-        """The players see `view` now: a turn begins. None: all players are to act, and all actions are legal."""
+        """Let the players see `view`: a turn begins. None: all players are to act, and all actions are legal."""
         self._view = view
         if self.turns is not None:
             to_act = frozenset(self._players) if view is None else view.to_act & self._players.keys()
@@ -93,7 +93,7 @@ class Choices:
     # ---- keys and buttons of humans
 
     def act(self, player: str, name: str, held: bool | None, *, lasts: bool, on: bool) -> None:
-        """A human presses a key or a button: see `TrialProgress.act`."""
+        """Take the key or button that a human presses: see `TrialProgress.act`."""
         controls = self.controls[player]
         if self.turns is not None:
             if controls.knows(name) or not lasts:  # HIPPO's clients send an unknown name when nothing is pressed
@@ -116,7 +116,7 @@ class Choices:
             controls.release(name)
 
     def _choose(self, player: str, name: str, held: bool | None, on: bool) -> None:
-        """Turn by turn: a human presses a button, or a key goes down or up. Raises CommandRefused."""
+        """Turn by turn: take a button that a human presses, or a key that goes down or up. Raises CommandRefused."""
         assert self.turns is not None
         controls = self.controls[player]
         if not controls.knows(name):
@@ -129,7 +129,7 @@ class Choices:
         self.turns.choose(player, Action(index, controls.names[index], "human", pressed_at=controls.time))
 
     def set_message_time(self, player: str, ns: int) -> None:
-        """Set the time of the message that is being read, in nanoseconds. An action that it chooses gets this time."""
+        """Set the time of the message that is being read, in nanoseconds. The action that it chooses gets this time."""
         self.controls[player].time = ns
 
     def let_go(self, player: str | None = None) -> None:
@@ -185,12 +185,12 @@ class Choices:
         return self.policies.asks(self._view, steps, now) if self._view is not None and self.policies else ()
 
     def take_place(self, player: str, plays: str) -> None:
-        """From now on the policy `plays` takes the place of the human who plays this player."""
+        """Let the policy `plays` choose this player's actions from now on, in the place of its human."""
         self.let_go(player)
         self.policies.take_place(replace(self._players[player], plays=plays))
 
     def ask(self, player: str, steps: int, now: float) -> AskPolicy | None:
-        """Return the question to the policy that has taken this place; None if the player is not to act now."""
+        """Return a question to the policy that has replaced a human; None if its player is not to act now."""
         view = self._view
         return self.policies.ask(player, view, steps, now) if view is not None and player in view.to_act else None
 
@@ -206,9 +206,9 @@ class Choices:
                     turns.choose(name, action)
 
     def turn_over(self, steps: int) -> bool:
-        """The time of the turn is over: choose for the humans who did not, and return whether the episode ends.
+        """Choose for the humans who have not chosen in the turn's time; return True if the episode ends instead.
 
-        The advice of a program comes first; without it, `turnEnds` decides.
+        A program's advice counts first; without advice, `turnEnds` decides.
         """
         turns = self.turns
         for name in self._waiting():
@@ -247,14 +247,14 @@ class Choices:
     # ---- programs
 
     def advise(self, action: int, player: str | None = None) -> None:
-        """A program advises an action for the next step of a human, or chooses it for a player that it plays.
+        """Take a program's advice for a human's next action, or its choice for a player that the program plays.
 
         `action` is the number of an action. If `player` is None, the first player that a program plays is meant, or
         else the first human. Raises CommandRefused if there is no such action or player, or another policy plays it.
         """
         target = self._player_of_program(player)
         if not target.human and not target.by_program:
-            raise CommandRefused(f"the project has another policy for {target.name}")
+            raise CommandRefused(f"{target.name} is played by {target.plays}, not by a program")
         if not 0 <= action < len(target.action_space):
             raise CommandRefused(f"there is no action {action}; there are 0 to {len(target.action_space) - 1}")
         if target.human:

@@ -25,7 +25,7 @@ class Client:
     window: Window
     player: str
     sent: tuple[object, ...] = ()
-    """The values of the state that was sent last (`state_of`)."""
+    """The values (`state_of`) from which the last state for this client was made."""
 
 
 class Clients:
@@ -43,7 +43,7 @@ class Clients:
         self._emit = emit
         self._scene = _scene_of(config, assets)
         self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
-        """Whether states have times also while the game is on."""
+        """Whether the message with the state holds times also while the game is on."""
         self._by_human: dict[str, Client] = {}
         self.pictures: Pictures | None = None
         """The pictures that clients show now; None before the first ones."""
@@ -56,7 +56,7 @@ class Clients:
         return client
 
     def replace(self, human: str) -> Client | None:
-        """Close and remove the client of a human who opens another one. Return it; None if they have none."""
+        """Close, remove and return the client of a human who opens another one; None if the human has none."""
         client = self._by_human.pop(human, None)
         if client is not None:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
@@ -85,7 +85,7 @@ class Clients:
             self.send(client, text)
 
     def say_each(self, words_for: Callable[[str], str | None]) -> None:
-        """Send each client the sentence that `words_for` returns for its player; nothing if that is None."""
+        """Send each client the sentence that `words_for` returns for its player. None: send nothing."""
         for client in self._by_human.values():
             words = words_for(client.player)
             if words is not None:
@@ -97,7 +97,7 @@ class Clients:
         self.send(client, _controls_of(progress, client.player, times, self._scene))
 
     def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
-        """Send each client its state, if that differs from the one that was sent last."""
+        """Send each client the state of its trial, if one of the values in it has changed."""
         progress.session_version = participants.session_version()
         for client in self._by_human.values():
             player = client.player
@@ -141,21 +141,21 @@ class Clients:
 
 
 def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
-    """Return the values that the client's state depends on. When one of them changes, the state is sent again."""
+    """Return the values (state, episode, score and others) after whose change a client is sent the state again."""
     score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
     members, frozen = progress.session_version, progress.shows_first_picture
     return progress.state, progress.episode, score, progress.frame_rate, frozen, members, to_act
 
 
 def _of_state(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
-    """Return the arguments of `messages.state` for the times, the player's turn and the session."""
+    """Return the arguments of `messages.state` that say the times, the player's turn and the session."""
     turn = _turn_of(progress, player, times.turn_ends_in)
     arguments = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
     return arguments if times.session is None else {**arguments, "session": {**times.session, "you": player}}
 
 
 def _turn_of(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
-    """Return the arguments for the player's turn; none in real time."""
+    """Return the arguments of `messages.state` that say the player's turn; none in real time."""
     if progress.turns is None:
         return {}
     to_act = progress.to_act(player)

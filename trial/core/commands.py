@@ -21,7 +21,7 @@ _COMBINED = re.compile(r"(?:up|down|left|right|fire)+")
 
 
 class Commands:
-    """The clients' commands, actions and keys. `reset` and `stop` wait for the end of a step."""
+    """Carries out the clients' commands, actions and keys. `reset` and `stop` wait for the end of a step."""
 
     def __init__(self, config: TrialSection, clients: Clients, message_log: MessageLog) -> None:
         shown = config.ui.shown()
@@ -95,7 +95,7 @@ class Commands:
 
 
 def not_offered(message: Message, ui: Collection[str]) -> str | None:
-    """Return the control that this message needs and `ui` does not have; None if `ui` has all that it needs.
+    """Return the control that a client needs for this message and `ui` lacks; None if `ui` lacks none.
 
     `ui` are the names of the controls that the project shows.
     """

@@ -13,12 +13,12 @@ from trial.core.players import NOOP
 ARROWS = ("up", "down", "left", "right")
 """The controls of `ui` that are names of actions."""
 DIRECTIONS = frozenset({*ARROWS, "fire"})
-"""Names that may be pressed even if they are actions only in combination ("up" + "right" = "upright")."""
+"""Names that a client may press even if only combinations of them are actions ("up" + "right" = "upright")."""
 
 KEY = "\0"
-"""The prefix of the names of keys, in a project with `keys`. It tells them from the names of actions."""
+"""In a project with `keys`: the prefix of a key's name, so that it differs from every action's name."""
 PRESSES = 4
-"""With `single`, the most presses that may wait for a step; more are dropped."""
+"""With `input: single`, the most presses that may wait for a step; more are dropped."""
 _COMBINED = 4  # the most keys that are combined; people do not hold more on purpose
 
 
@@ -84,7 +84,7 @@ class Controls:
         self._press_left = self._lifespan if self._press is not None else 0
 
     def hold(self, name: str) -> None:
-        """A key went down. It ends a press that still acts."""
+        """Take a key that went down, and end a press that still acts."""
         if name in self._held:  # the keyboard repeats it: its place in the order stays
             return
         self._held.insert(0, name)
@@ -96,12 +96,12 @@ class Controls:
         self._press_left = 0
 
     def _wait(self, index: int | None) -> None:
-        """With `single`: let an action wait for its step. None, and more than PRESSES actions, are dropped."""
+        """With `single`: let an action wait for its step. Drop None, and an action if PRESSES actions wait already."""
         if index is not None and len(self._presses) < PRESSES:
             self._presses.append((index, self.time))
 
     def release(self, name: str) -> None:
-        """A key went up. A key that was pressed and released between two steps still acts on the next one."""
+        """Release a key. A key that was pressed and released between two steps still acts on the next one."""
         if name not in self._held:
             return
         self._held.remove(name)
@@ -150,7 +150,7 @@ class Controls:
         return (self.default, False) if index is None else (index, True)
 
     def choice(self, name: str, held: bool | None) -> int | None:
-        """Return the action that a press (`held` is None) or a key going down (True) or up (False) chooses in a turn.
+        """Turn by turn: return the action that a press (`held` is None), a key going down (True) or up (False) chooses.
 
         None if it chooses none: the key goes up, the keyboard repeats it, or it acts only together with others.
         """

@@ -1,8 +1,9 @@
-"""The effects: what the core of a trial (`trial/core/trial.py`) asks its shell to do. Pure records.
+"""The effects: what the core of a trial (`trial/core/trial.py`) asks its shell (`trial/server/loop.py`) to do.
 
 `connection` is any object with which the shell identifies a connection; the core only compares it. `line` is the line
 of the recording that the shell has made of a step or a reset; the core only hands it back. `text` is a message of
-docs/wire.md. Effects of every step are named tuples: a frozen dataclass takes several times as long to make.
+docs/wire.md. All are pure records. Effects of every step are named tuples: a frozen dataclass takes several times as
+long to make.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class SendMessage:
 
 @dataclass(frozen=True, slots=True)
 class SendState:
-    """Send the trial's state, instead of one that still waits to be sent. `frame_rate` is the game's from now on."""
+    """Send the trial's state; it replaces a state that still waits to be sent. `frame_rate`: the game's from now on."""
 
     connection: Hashable
     text: str
@@ -43,7 +44,7 @@ class SendState:
 
 
 class SendPicture(NamedTuple):
-    """Send a picture, instead of one that still waits to be sent."""
+    """Send a picture; it replaces a picture that still waits to be sent."""
 
     connection: Hashable
     picture: Picture
@@ -52,7 +53,7 @@ class SendPicture(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SendDone:
-    """Say that the trial is over and stored, then close the connection (1000)."""
+    """Tell a client that the trial is over and stored, then close the connection with code 1000."""
 
     connection: Hashable
     episodes: int
@@ -79,26 +80,26 @@ class AgentTimeout(Exception):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Call:
-    """A call of the researcher's code. It fails with AgentTimeout after `limit` seconds."""
+    """Call the researcher's code. The call fails with AgentTimeout after `limit` seconds."""
 
     limit: float
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class ResetCall(Call):
-    """Reset the environment. Returns a `Begun`."""
+    """Reset the environment. The call returns a `Begun`."""
 
     episode: int
     seed: int
     asked: frozenset[str] = frozenset()
-    """The players whose policies begin the episode too: all policies but programs."""
+    """The players whose policies begin the episode, too: those of all policies except programs."""
     fields: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of the reset's line in the recording, in a session."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class ReplayCall(Call):
-    """Take again all steps that an earlier server recorded of an episode. Returns a `Replayed`."""
+    """Take all steps of an episode again that an earlier server has recorded. The call returns a `Replayed`."""
 
     unfinished: UnfinishedEpisode
     default_actions: Mapping[str, int]
@@ -107,25 +108,25 @@ class ReplayCall(Call):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class FeedbackCall(Call):
-    """Give the agent these words of feedback. Returns None."""
+    """Give the agent these words of feedback. The call returns None."""
 
     feedback: tuple[Word, ...]
     messages: int
-    """The number of messages in the message log when the call was made: the line of this call records them."""
+    """The number of messages in the message log when the call was made. The line of this call records them."""
     heard: int = 0
-    """The number of words given to the agent so far. The agent's thread counts, so it is right also after an error."""
+    """The number of words that the agent has heard so far. Its thread counts them, also if the call fails."""
     over: Episode | Break | None = None
     """The episode or the break that has ended, for the agent's callbacks; None in a `StepCall`."""
     last: bool = False
-    """Whether the trial is over with it."""
+    """Whether the trial ends with this episode or break."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class StepCall(FeedbackCall):
-    """Give the agent the words of feedback, then take one step. Returns a `StepTaken`."""
+    """Give the agent the words of feedback, then take one step. The call returns a `StepTaken`."""
 
     actions: Mapping[str, Action]
-    """By player."""
+    """By player, the action of this step."""
     fields: Mapping[str, Any]
     """Further fields of the step's line in the recording."""
     truncated_by: str | None = None
@@ -142,7 +143,7 @@ class TellMoved:
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """The result of a reset: the line of the recording, the first picture, and what the players see.
+    """The result of a `ResetCall`: the line of the recording, the first picture, and what the players see.
 
     `view` is None if all players are to act and all actions are legal.
     """
@@ -153,7 +154,7 @@ class Begun:
 
 
 class StepTaken(NamedTuple):
-    """The result of a step: rewards by player, whether the episode is over, the picture, the line of the recording.
+    """The result of a `StepCall`: rewards by player, whether the episode is over, the picture, the recording's line.
 
     `view` is as in `Begun`.
     """
@@ -168,9 +169,9 @@ class StepTaken(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
-    """The result of a replay: the present picture, and what the players see (`view` as in `Begun`).
+    """The result of a `ReplayCall`: the present picture, and what the players see (`view` as in `Begun`).
 
-    `observed` holds, by player, what its policy had observed for each action in the steps taken again, in their order.
+    `observed`: by player, the observations for which its policy had chosen the actions of these steps, in their order.
     """
 
     pictures: Pictures
@@ -183,7 +184,10 @@ class Replayed:
 
 @dataclass(frozen=True, slots=True)
 class ResetPolicy:
-    """Begin an episode for the player's policy; then ask it about each of `observed` again, and drop its actions."""
+    """Begin an episode for the player's policy, then let it choose an action for each of `observed`, and drop these.
+
+    So the policy reaches the state that it had on an earlier server.
+    """
 
     player: str
     seed: int
@@ -195,14 +199,14 @@ class ResetPolicy:
 
 @dataclass(frozen=True, slots=True)
 class OpenRecording:
-    """Open a new recording; answered with `recording_opened` or `recording_failed`."""
+    """Open a new recording. The shell answers with `Trial.recording_opened` or `recording_failed`."""
 
     episode: int
     seed: int
     frame_rate: int
     action_space: tuple[str, ...]
     players: tuple[Player, ...] = ()
-    """All players of the environment, if there are several; else empty."""
+    """All players of the environment if it has several; else empty."""
 
 
 class WriteLine(NamedTuple):
@@ -228,8 +232,8 @@ class CloseRecording:
 class SaveAnswer:
     """Wait until all recordings are stored, then store the answers, if there are any.
 
-    Answered with `member_saved` for each member's answer, and with `answer_saved` once all answers are stored, those of
-    earlier `SaveMember` included.
+    The shell answers with `Trial.member_saved` for each member's answer, and with `answer_saved` once all answers are
+    stored, also those of earlier `SaveMember`.
     """
 
     answers: Mapping[str, Any] | None
@@ -240,7 +244,7 @@ class SaveAnswer:
 
 @dataclass(frozen=True, slots=True)
 class SaveMember:
-    """Store the answer of a member who is refused while the others play on. Answered with `member_saved`."""
+    """Store the answer of a member who is refused while the others play on. The shell answers with `member_saved`."""
 
     human: str
     answers: Mapping[str, Any]

@@ -43,9 +43,9 @@ class Ending:
         """Whether the last lines are written, and the shell was asked to store the answer."""
 
     def last_feedback(self, progress: TrialProgress) -> FeedbackCall:
-        """Return the call that precedes the record of the first end in `TrialProgress.ended`.
+        """Return the last call of the agent before the first end in `TrialProgress.ended` is recorded.
 
-        It gives the agent the feedback that is left, and its callbacks the end.
+        The call gives the agent the feedback that is left, and tells its callbacks that the episode or break is over.
         """
         return FeedbackCall(
             limit=LAST_CALL_SECONDS if self.closing else self._settings.step_seconds,
@@ -56,7 +56,7 @@ class Ending:
         )
 
     def record(self, call: FeedbackCall, progress: TrialProgress, participants: Participants) -> None:
-        """Record the first end in `TrialProgress.ended`, with the messages before `call`, and remove it there."""
+        """Remove the first end from `TrialProgress.ended`, and record it, with the messages before `call`."""
         over = progress.ended.pop(0)
         if isinstance(over, Episode):
             for player, late in progress.choices.policies.late().items():

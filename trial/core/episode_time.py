@@ -7,9 +7,9 @@ from __future__ import annotations
 
 
 class EpisodeTime:
-    """The times of the present episode.
+    """Measures the times of the present episode, in seconds.
 
-    `freeze`: for how long it shows its first picture. `limit`: for how long it may be played, 0 for no limit.
+    `freeze`: for how long the episode shows its first picture. `limit`: for how long it may be played; 0: no limit.
     """
 
     def __init__(self, freeze: float, limit: float) -> None:
@@ -17,19 +17,19 @@ class EpisodeTime:
         self.begin()
 
     def begin(self) -> None:
-        """An episode begins, with its first picture."""
+        """Begin an episode, which shows its first picture."""
         self._frozen = self._freeze > 0
         self._frozen_since: float | None = None
         self._played = 0.0
         self._runs_since: float | None = None
 
     def resume(self, played: float) -> None:
-        """The episode goes on. It was played for `played` seconds on an earlier server."""
+        """Continue an episode that was played for `played` seconds on an earlier server."""
         self.begin()
         self._frozen, self._played = False, played
 
     def rest(self, now: float) -> None:
-        """The game is held. If the time of the first picture was running, it begins anew afterwards."""
+        """Stop all times, since the game is held. The time of the first picture begins anew when it goes on."""
         if self._runs_since is not None:
             self._played += now - self._runs_since
         self._frozen_since = self._runs_since = None
@@ -45,7 +45,7 @@ class EpisodeTime:
         return left
 
     def run(self, now: float) -> None:
-        """The episode is played from now on, until `rest`."""
+        """Count the time from now on, until `rest`, as played."""
         if self._runs_since is None:
             self._runs_since = now
 

@@ -6,13 +6,13 @@ import math
 from collections import deque
 
 STALLED_SECONDS = 3.0
-"""A client that has acknowledged frames, and has then left one without for so many seconds, is lost or hidden."""
+"""A client is lost or hidden if it has acknowledged frames, but has not acknowledged one for so many seconds."""
 
 _WIDEST = 15  # the most frames under way, however long the round trip is
 
 
 class Window:
-    """Limits the frames that were sent and are not acknowledged: to two more than the game shows in one round trip.
+    """Limits the frames that were sent and not yet acknowledged: two more than the game shows in one round trip.
 
     If the client acknowledges several frames at once, one more is allowed, since the first of them waits for the last.
     A client that has never acknowledged a frame is limited by its write buffer alone.
@@ -32,7 +32,7 @@ class Window:
         return self._round_trip < math.inf
 
     def sent(self, frame_id: int, now: float) -> None:
-        """A message with this frame, or with rows of it, was sent."""
+        """Note that a message with this frame, or with rows of it, was sent."""
         self._under_way.append((frame_id, now, frame_id != self.newest))
         self._sent_at = now
         self.newest = frame_id
@@ -40,7 +40,7 @@ class Window:
             self._under_way.popleft()
 
     def acknowledged(self, frame_id: int, now: float) -> None:
-        """The client has shown this frame, and so all frames before it."""
+        """Note that the client has shown this frame, and so all frames before it."""
         frames = 0
         while self._under_way and self._under_way[0][0] <= frame_id:
             sent_id, at, first = self._under_way.popleft()
@@ -53,7 +53,7 @@ class Window:
     def wait(self, now: float, rate: int) -> float:
         """Return the seconds until another frame may be sent; 0 for at once. `rate`: the game's frames per second.
 
-        Ask again after each acknowledgement: it may make the time shorter.
+        Ask again after each acknowledgement, which may make the time shorter.
         """
         under_way = len(self._under_way)
         if under_way < 2 or not self.acknowledging:  # the first is the usual case

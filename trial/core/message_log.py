@@ -47,7 +47,7 @@ class MessageLog:
         return tuple(self._feedback)
 
     def add(self, message: Message, ns: int, player: str | None = None) -> None:
-        """Add a client's message. It is dropped if too many wait already; its unknown fields, if they are too long."""
+        """Add a client's message. If too many wait already, drop it; if its unknown fields are too long, drop these."""
         if message.fields:
             length = len(str(message.fields))
             self._fields_left -= length
@@ -65,7 +65,7 @@ class MessageLog:
             self._feedback.append(Word(message.command, player))
 
     def note(self, event: str, ns: int, player: str | None = None) -> None:
-        """Add an event that is not a client's message. It is dropped if too many messages wait already."""
+        """Add an event that is not a client's message, such as a new connection. If too many messages wait, drop it."""
         if not self._full(player):
             self._messages.append({"ns": ns, **_of(player), "event": event})
 
@@ -76,7 +76,7 @@ class MessageLog:
         return player is None or sum(record.get("player") == player for record in self._messages) >= MESSAGES_KEPT
 
     def repeat(self, feedback: Sequence[Word], ns: int) -> None:
-        """Insert feedback before all other messages: the agent of an earlier server did not hear it."""
+        """Insert feedback, which an earlier server's agent did not hear, before all other messages."""
         again = [{"ns": ns, **_of(word.player), "command": word.text, "again": True} for word in feedback]
         self._messages[:0] = again
         self._feedback[:0] = feedback
@@ -87,13 +87,13 @@ class MessageLog:
         return dropped
 
     def recorded(self, messages: int, feedback: int) -> None:
-        """The first `messages` are recorded now. The first `feedback` words are not given to the agent any more."""
+        """Remove the first `messages`, which are recorded now, and the first `feedback` words."""
         del self._messages[:messages]
         self._fields_waiting = 0
         self.heard(feedback)
 
     def heard(self, feedback: int) -> None:
-        """The agent has heard the first `feedback` words."""
+        """Remove the first `feedback` words, which the agent has heard."""
         del self._feedback[:feedback]
 
 

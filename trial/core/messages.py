@@ -33,7 +33,7 @@ class CommandRefused(ValueError):
 
 
 class CloseConnection(Exception):
-    """Close the connection with this code, after these words."""
+    """The connection is to be closed with this code, after the client has been sent these words."""
 
     def __init__(self, code: int, words: str) -> None:
         super().__init__(words)
@@ -130,7 +130,7 @@ def parse_hello(data: str | bytes) -> Hello:
 
 
 def words_of(trial: TrialSection) -> tuple[str, ...]:
-    """Return the feedback words of the project's own controls: their names, but for those that name an action."""
+    """Return the project's own words of feedback: the names of its own controls, except those that name an action."""
     actions = {*trial.action_space, *_BUTTONS_OF_ACTIONS}
     return tuple(name for name in trial.ui.own if name.lower() not in actions)
 
@@ -241,7 +241,7 @@ def controls(
 
     It has `words` only if the project has words of its own, the players only if there are several, and `toAct` only
     turn by turn. `scene` are the fields of a game that is drawn by objects. `input_of_project` are the project's keys,
-    labels and kind of input. The arguments that `state` has, too, mean the same.
+    labels and kind of input. The other arguments are those of `state`, or keys of the project.
     """
     return json.dumps(
         {
@@ -284,9 +284,9 @@ def state(
 ) -> str:
     """Build the message with the state of the trial. Times are seconds; a time of None is left out.
 
-    `starts_in`: until the first picture of the episode gives way to the game. `time_left`: of play in the episode.
-    `next_in`: until the break ends. `to_act`: turn by turn, whether it is the client's turn; `turn_ends_in`: until that
-    turn ends. `session`: in a session, the fields about its members.
+    `starts_in`: the time until the game follows the episode's first picture. `time_left`: the time of play that is left
+    in the episode. `next_in`: the time until the break ends. `to_act`: turn by turn, whether it is the client's turn;
+    `turn_ends_in`: the time until that turn ends. `session`: in a session, the fields about its members.
     """
     scores = _scores(score, episode_score, next_in)
     turn, times = _turn(to_act, turn_ends_in), _times(starts_in, time_left)
@@ -312,7 +312,7 @@ def _scores(score: float, episode_score: float, next_in: float | None) -> dict[s
 
 
 def done(episodes: int, score: float, outcome: str | None = None) -> str:
-    """Build the message that the trial is over. `outcome`: in a session, how it has ended for this member."""
+    """Build the message that says that the trial is over. `outcome`: in a session, how it has ended for this member."""
     fields = {"done": True, "episodes": episodes, "score": tidy(score)}
     return json.dumps(fields if outcome is None else {**fields, "outcome": outcome})
 

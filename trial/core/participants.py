@@ -34,55 +34,55 @@ class Alone:
     # ---- what happens
 
     def come(self, player: str, now: float) -> None:
-        """The participant has connected. The game is not on before they send `start`."""
+        """Do nothing when the participant connects: the game is not on before they send `start`."""
 
     def go(self, player: str, now: float, *, closing: bool) -> None:
-        """The participant has left: hold the game. Not if the server is `closing`: it has ended the game already."""
+        """Hold the game because the participant has left. A server that is `closing` has ended the game already."""
         if not closing:
             self._progress.leave(player)
 
     def stalls(self, player: str, now: float) -> bool:
-        """The participant's page has stopped answering: treat them as gone. Return whether that is new."""
+        """Hold the game because the participant's page has stopped answering. Return True: they were here until now."""
         self._progress.leave(player)
         return True
 
     def receive(self, player: str, message: Message, window: Window, now: float) -> bool:
-        """A message has come. Return whether it has an effect: always."""
+        """Return whether a message of the participant has an effect: always."""
         return True
 
     def start(self, player: str, now: float) -> None:
-        """The participant begins or goes on."""
+        """Let the participant begin the game or go on with it."""
         self._progress.start()
 
     def pause(self, now: float) -> None:
-        """The participant holds the game."""
+        """Hold the game."""
         self._progress.pause()
 
     def stop(self, player: str) -> None:
-        """The participant ends the game. There is nothing to remember: `Commands` ends it after the present step."""
+        """Do nothing when the participant ends the game: `Commands` ends it after the present step."""
 
     def stopped(self) -> None:
-        """The game has ended because the participant has stopped it. No one else is to be told."""
+        """Do nothing after the participant has ended the game: no one else is to be told."""
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The participant's browser has answered a ping: no effect, since only sessions limit round trips."""
+        """Do nothing when the browser has answered a ping: only sessions limit round trips."""
 
     def saved(self, human: str) -> None:
-        """A member's answer is stored: no effect, since there are no members."""
+        """Do nothing when a member's answer is stored: there are no members."""
 
     # ---- what follows
 
     def attend(self, now: float, seconds: float) -> None:
-        """Hold the game, or let it go on, depending on who is here: no effect, since commands alone decide that."""
+        """Do nothing: commands alone decide whether the game is held or goes on."""
 
     def wake_at(self, now: float) -> float | None:
-        """Return when to call `attend` again if nothing happens: never."""
+        """Return None: `attend` need not be called again."""
         return None
 
     # ---- recordings and answers
 
     def reset_fields(self) -> Mapping[str, Any]:
-        """Return further fields for the line of a reset: none."""
+        """Return no further fields for the line of a reset."""
         return {}
 
     def outcomes(self) -> Mapping[str, str | None] | None:
@@ -90,7 +90,7 @@ class Alone:
         return None
 
     def write_lines(self) -> None:
-        """Write the lines that wait for an open recording: none do."""
+        """Do nothing: no lines wait for an open recording."""
 
     def answer(self, seconds: float, *, played: bool) -> SaveAnswer:
         """Return what to store, after `seconds` of play: the answer if the game could be `played`, else none."""
@@ -99,23 +99,23 @@ class Alone:
     # ---- what clients are told
 
     def session_version(self) -> None:
-        """Return a value that changes when the fields about members do: always None."""
+        """Return None: there are no fields about members that could change."""
         return None
 
     def session_fields(self, now: float) -> Mapping[str, Any] | None:
-        """Return the fields about members in the messages to clients: None."""
+        """Return None: the messages to clients have no fields about members."""
         return None
 
     def sentence(self, player: str) -> str | None:
-        """Return the sentence that tells a member why the game is over: None."""
+        """Return None: no sentence tells the only participant why the game is over."""
         return None
 
     def has_answered(self, human: str) -> bool:
-        """Whether a member's own answer is stored: no, since there are no members."""
+        """Return False: there are no members whose own answer could be stored."""
         return False
 
     def answer_of(self, human: str) -> Mapping[str, Any] | None:
-        """Return a member's own answer: None."""
+        """Return None: there are no members with answers of their own."""
         return None
 
 

@@ -17,13 +17,13 @@ NOOP = "noop"
 """The name of the idle action, unless `idleAction` names another or the environment has no action of this name."""
 
 ALL = "__all__"
-"""A key that an environment may return beside its players: its value holds for all (RLlib's `MultiAgentEnv`)."""
+"""A key that an environment may return beside its players. Its value is for all of them (RLlib's `MultiAgentEnv`)."""
 
 ACTION_MASK = "action_mask"
 """Under this key an info or an observation says which actions are legal now."""
 
 Mask = Sequence[Any]
-"""One value for each action: whether it is legal now."""
+"""One value for each action: true if the action is legal now."""
 
 
 class PlayersError(ValueError):
@@ -38,7 +38,7 @@ class Player:
     action_space: tuple[str, ...]
     plays: str = HUMAN
     idle: int = 0
-    """The number of its idle action, which it takes in a step for which nothing was chosen."""
+    """The number of the idle action, which the player takes in a step for which nothing was chosen."""
 
     @property
     def human(self) -> bool:
@@ -55,7 +55,7 @@ _NOTHING: Mapping[str, Any] = {}  # may be a default value: its type forbids cha
 
 
 class View(NamedTuple):
-    """What the players see after a reset or a step, by player. The core reads only `to_act` and `masks`."""
+    """The players' view after a reset or a step, by player. The core reads only `to_act` and `masks`."""
 
     to_act: frozenset[str]
     """The players whose actions the next step takes."""

@@ -22,7 +22,7 @@ FAILURES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What a policy is given when it chooses an action: observation, info and action mask."""
+    """The input with which a policy chooses an action: observation, info and action mask."""
 
     observation: Any
     info: Any
@@ -92,12 +92,12 @@ class Policies:
         return tuple(place.player for place in self._places.values() if not place.player.by_program)
 
     def begin(self) -> None:
-        """An episode begins."""
+        """Forget the questions, answers and failures of the episode before."""
         for place in self._places.values():
             place.begin()
 
     def resume(self, actions: Mapping[str, int], failures: Mapping[str, int]) -> None:
-        """The episode goes on where an earlier server left it.
+        """Continue an episode where an earlier server left it.
 
         By player: `actions` are the last choices of policies, which act until these choose again; `failures` is how
         often each policy has failed in a row.
@@ -110,11 +110,11 @@ class Policies:
                 self._places[player].last = action
 
     def take_place(self, player: Player) -> None:
-        """From now on a policy plays for this player."""
+        """Let a policy play for this player from now on."""
         self._places[player.name] = _Place(player)
 
     def give_back(self, player: str) -> None:
-        """A human plays this player again. Late answers of the policy change nothing."""
+        """Let the human play this player again. Late answers of the policy change nothing."""
         self._places.pop(player, None)
 
     def late(self) -> dict[str, int]:
@@ -146,7 +146,7 @@ class Policies:
         return AskPolicy(player, self._asks, view.observations.get(player), view.infos.get(player), place.mask)
 
     def acted(self, player: str, ask_id: int, action: Any) -> str | None:
-        """The policy has answered. Return what is wrong with the answer; None if it is valid, or to an old question."""
+        """Take a policy's answer. Return what is wrong with it; None if it is valid or answers an earlier question."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return None
@@ -166,7 +166,7 @@ class Policies:
         return None
 
     def failed(self, player: str, ask_id: int) -> bool:
-        """The policy has raised an error. Return whether the question was its present one."""
+        """Count a policy's error, if it was asked this question last. Return whether it was."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return False
@@ -180,7 +180,7 @@ class Policies:
         return self._places[player].idles
 
     def advise(self, player: str, action: int) -> None:
-        """The program that plays this player chooses the action of the next step."""
+        """Choose this player's next action for the program that plays it."""
         self._places[player].answer = action
 
     def take(self, name: str, mask: Mask | None) -> Action:
@@ -233,7 +233,7 @@ class Policies:
         return _idle(player, mask, "late", place.asked_after)  # it has seen the observation, and may remember it
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
-        """A turn begins: the time of programs runs from now on, and what they chose before does not count."""
+        """Begin a turn: the time of programs runs from now on, and what they chose before does not count."""
         for name, place in self._places.items():
             if name in to_act and place.player.by_program:
                 place.asked_at, place.answer = now, None

@@ -1,6 +1,6 @@
-"""Which members of a session are here, how long the others wait for the missing ones, and when the game is on. Pure.
+"""Decides which members of a session are here, how long the others wait for the missing ones, and when the game is on.
 
-The game is on while every member is here or a policy plays in their place. Otherwise it is held. A member may be
+Pure. The game is on while every member is here or a policy plays in their place. Otherwise it is held. A member may be
 missing for `gather` seconds before the game, and for `absent` seconds during it. This time runs while the member is
 gone and another member waits. It does not run while all are gone, or while a connected member's round trip is measured.
 A member who plays gets used time back, but slowly: a member who comes and goes uses their time up. Before the game
@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 Where = Literal["here", "reads", "awaited", "away", "policy"]
-"""Where a player is, as clients show it. reads: connected, and still at the page before the game or between two
-episodes; awaited: has not come yet, or is still being measured; away: was here; policy: a policy plays in the place."""
+"""Where a member is, as clients show it. reads: connected, and still at the page before the game or between two
+episodes; awaited: has not come yet, or the round trip is still being measured; away: was here, and is not any more;
+policy: a policy plays in the member's place."""
 LEAST_ABSENCE = 3.0
 """The least time that one absence uses up, in seconds; a third of `absent` (before the game: of `gather`) if that is
-less. So a member cannot hold the game again and again by short absences, each of which is followed by a countdown."""
+less. So a member who comes and goes, and so causes one countdown after the other, soon uses their time up."""
 GIVEN_BACK = 0.25
 """The used time that a member gets back for each second of play, in seconds."""
 MEASURED_SECONDS = 20.0
@@ -36,7 +37,7 @@ class _Countdown:
     left: float
     """The seconds that were left when it last stopped."""
     until: float | None = None
-    """When the countdown is over; None: it does not run."""
+    """The time at which the countdown is over; None if it does not run."""
 
     def run(self, now: float, seconds: float) -> None:
         """Count down `seconds` from now on. It changes nothing if the countdown runs already."""
@@ -57,11 +58,11 @@ class _Member:
     player: str
     samples: deque[float]
     waiting: _Countdown
-    """How long the others still wait for the member. It runs while they do."""
+    """The time for which the others still wait for the member. The countdown runs while they wait."""
     measured: bool
     """Whether the member's round trip is known, or need not be."""
     measuring: _Countdown = field(default_factory=lambda: _Countdown(MEASURED_SECONDS))
-    """How long the member's round trip may still be measured. It runs meanwhile."""
+    """The time for which the member's round trip may still be measured. The countdown runs while it is measured."""
     connected: bool = False
     stalled: bool = False
     """Their page has stopped answering."""
@@ -99,7 +100,7 @@ class _Member:
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """The project's keys about presence: `max_ping` in milliseconds, `ping_samples` a number, the others in seconds."""
+    """The project's keys about presence: `max_ping` in milliseconds, `ping_samples` a count, the others in seconds."""
 
     absent: float
     gather: float
@@ -118,7 +119,7 @@ class Presence:
     reads: bool
     """Whether there is a page before the game: the game begins when all members have gone on from it."""
     begun: bool
-    """Whether the game has begun, here or on an earlier server. Then round trips are not compared with `max_ping`."""
+    """Whether the game has begun, here or on an earlier server. From then on `max_ping` is not applied."""
     paused: bool = False
     """Whether a member has paused the game."""
     version: int = 0
@@ -139,7 +140,7 @@ class Presence:
     # ---- what happens
 
     def come(self, player: str, now: float) -> Literal["joined", "returned"]:
-        """The member has connected. They play again if they had been missing for too long.
+        """Mark a member as connected. They play again even if they had been missing for too long.
 
         Return whether it was their first connection (`joined`) or not (`returned`).
         """
@@ -153,18 +154,18 @@ class Presence:
         return "returned" if returned else "joined"
 
     def go(self, player: str, now: float) -> None:
-        """The member's connection is closed."""
+        """Mark a member as gone, whose connection is closed."""
         self._give_time_back(now)
         self._members[player].connected = False
         self._changed(now)
 
     def stalls(self, player: str, now: float) -> bool:
-        """The member's page has stopped answering. Return whether they were here until now."""
+        """Mark a member as away whose page has stopped answering. Return False if they were away already."""
         member = self._members[player]
         return self._mark_away(member, now, stalled=True, hidden=member.hidden)
 
     def hides(self, player: str, now: float) -> bool:
-        """The member looks at another tab or application. Return whether they were here until now."""
+        """Mark a member as away who looks at another tab or application. Return False if they were away already."""
         member = self._members[player]
         return self._mark_away(member, now, stalled=member.stalled, hidden=True)
 
@@ -177,7 +178,7 @@ class Presence:
         return was_here
 
     def answers_again(self, player: str) -> bool:
-        """The member's page answers. Return whether they were away only because it did not: then call `come`."""
+        """Note that a member's page answers. Return whether that makes them present again; then call `come`."""
         member = self._members[player]
         if member.hidden:
             member.stalled = False
@@ -188,7 +189,7 @@ class Presence:
         return self._members[player].hidden
 
     def goes_on(self, player: str, now: float) -> None:
-        """The member goes on from the page before the game or between two episodes, or from a pause."""
+        """Let a member go on from the page before the game or between two episodes, or end the pause."""
         self._members[player].gone_on = True
         self.paused = False
         if self._page_until is None:
@@ -196,11 +197,11 @@ class Presence:
         self._changed(now)
 
     def pauses(self) -> None:
-        """A member pauses the game, until any member goes on."""
+        """Pause the game for all members, until any of them goes on."""
         self.paused = True
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The member's browser has answered a ping after `seconds`.
+        """Take a sample of a member's round trip: their browser has answered a ping after `seconds`.
 
         Before the game, the median of the first `ping_samples` decides whether the member may play. A member is refused
         as soon as more than half of the samples must be too long.
@@ -220,24 +221,24 @@ class Presence:
         return sum(sample * 1000 > self.rules.max_ping for sample in member.samples)
 
     def begin_break(self) -> None:
-        """A break begins: no member has gone on from its page yet."""
+        """Begin a break: no member has gone on from its page yet."""
         self._page_until = None
         for member in self._members.values():
             member.gone_on = False
         self._tell()
 
     def mark_refused(self, player: str) -> None:
-        """The member is refused, because an earlier server or game has found their round trip too long."""
+        """Refuse a member, because an earlier server or game has found their round trip too long."""
         self._members[player].over = "ping"
 
     def mark_absent(self, player: str) -> None:
-        """The member does not play any more: they stayed away on an earlier server, or their data were erased."""
+        """Count a member as absent: they stayed away on an earlier server, or their data were erased."""
         self._members[player].over = "absent"
 
     # ---- what follows
 
     def look(self, now: float) -> None:
-        """Mark the members who have been missing for too long, and decide about those who were measured for too long.
+        """Mark members who have been missing for too long as absent, and end measurements that take too long.
 
         A member whose measurement takes too long is refused if more than half of their samples so far are too long, or
         if there are none. So one slow answer of several refuses no one.
@@ -300,7 +301,7 @@ class Presence:
         return self.reads and not self.all_gone_on(now)
 
     def time_left(self, player: str) -> float:
-        """Return the seconds for which the others would wait for the member from now on; 0 if they are used up."""
+        """Return the seconds for which the others would wait if the member left now; 0 if that time is used up."""
         left = self._members[player].waiting.left
         return left if left >= self._least else 0.0
 
@@ -359,11 +360,11 @@ class Presence:
         return min(ends, default=math.inf)
 
     def _tell(self) -> None:
-        """The fields about members have changed: clients are sent them again."""
+        """Let clients be sent the fields about members again, since these have changed."""
         self.version += 1
 
     def _changed(self, now: float) -> None:
-        """A member's presence has changed: start and stop the countdowns of all members."""
+        """Start and stop the countdowns of all members, after a member's presence has changed."""
         self._tell()
         waits = self.waits
         for member in self._members.values():

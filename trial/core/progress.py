@@ -15,7 +15,7 @@ from trial.core.ended import PARTNER_LEFT, Break, Episode
 from trial.core.players import Player
 
 FAILURES_ALLOWED = 3
-"""The trial ends as failed when the researcher's code has failed so often since an episode last ended by itself."""
+"""The trial ends as failed after so many failures of the researcher's code without an episode that ended by itself."""
 
 
 class PlayState(Enum):
@@ -33,11 +33,11 @@ class PlayState(Enum):
 
 
 class TrialProgress:
-    """The progress of one trial. The caller steps and resets the environment, and reports the results.
+    """Keeps the progress of one trial. The caller steps and resets the environment, and reports the results.
 
     After each call that can end an episode (`stepped`, `failed`, `reset`, `stop`) the caller looks at `needs_reset` and
     `state`. Between two episodes there is a break of `betweenEpisodes`, unless the game is held. The caller measures
-    its time, takes no step in it, and then calls `go_on`.
+    the break's time, takes no step during the break, and then calls `go_on`.
     """
 
     def __init__(self, config: TrialSection, players: Iterable[Player]) -> None:
@@ -75,7 +75,7 @@ class TrialProgress:
         self.frozen = config.reset_freeze > 0
         """Whether the time of the first picture (`resetFreeze`) runs or is still to come: keys do nothing meanwhile."""
         self.ended: list[Episode | Break] = []
-        """Episodes and breaks that are over and not recorded, in order. The caller removes them."""
+        """The episodes and breaks that are over and not recorded yet, in order. The caller removes them."""
         self._failures = 0
         self._good_episodes = 0
         self.session_version: Hashable = None
@@ -116,7 +116,7 @@ class TrialProgress:
                 scores[player] += score
 
     def replayed(self, steps: int, scores: Mapping[str, float]) -> None:
-        """The episode of an earlier server was replayed: `steps` steps, with these scores by player."""
+        """Continue an earlier server's episode, whose `steps` steps were taken again, with these scores by player."""
         self.needs_reset = self.frozen = False
         self.steps = steps
         self.total_steps += steps
@@ -125,6 +125,7 @@ class TrialProgress:
 
     @property
     def playing(self) -> bool:
+        """Whether the game is on, and not held."""
         return self.state is PlayState.PLAYING
 
     @property
@@ -134,10 +135,12 @@ class TrialProgress:
 
     @property
     def over(self) -> bool:
+        """Whether the trial is over."""
         return self.state is PlayState.ENDED
 
     @property
     def on_break(self) -> bool:
+        """Whether there is a break between two episodes."""
         return self.state is PlayState.BREAK
 
     def start(self) -> None:
@@ -148,7 +151,7 @@ class TrialProgress:
             self.state = PlayState.PLAYING
 
     def go_on(self) -> None:
-        """The time of the break is over: begin the next episode."""
+        """Begin the next episode because the break's time is over."""
         if self.on_break:
             self._end_break("over", PlayState.PLAYING)
 
@@ -157,7 +160,7 @@ class TrialProgress:
         self._hold("pause")
 
     def leave(self, player: str | None = None) -> None:
-        """The human's connection is closed or replaced: hold the game as `pause` does, and release their keys.
+        """Hold the game as `pause` does, and release a human's keys, because their connection is closed or replaced.
 
         If `player` is None, the keys of all humans are released.
         """
@@ -201,13 +204,13 @@ class TrialProgress:
         self.frame_rate = round(min(max(rate, config.min_frame_rate), config.max_frame_rate))
 
     def act(self, name: str, held: bool | None, *, lasts: bool = False, player: str | None = None) -> None:
-        """A human presses a button (`held` is None), or a key goes down (True) or up (False). Raises CommandRefused.
+        """Take a button that a human presses (`held` is None), or a key that goes down (True) or up (False).
 
-        `name` is that of an action or a key. With `lasts`, the action acts until the next one, also over pauses and
-        episodes; an unknown name ends it. `player` is the first human if None.
+        Raises CommandRefused. `name` is that of an action or a key. With `lasts`, the action acts until the next one,
+        also over pauses and episodes; an unknown name ends it. `player`: None is the first player that a human plays.
 
-        While the game is held, a button has no effect. A key that goes down then acts on the first step after that,
-        also if it was released; with `input: single` it never acts.
+        While the game is held, a button has no effect. A key that goes down then acts on the first step after the hold,
+        even if it was released; with `input: single` it never acts.
 
         Turn by turn, each press and each key that goes down is a choice. It has no effect while the game is held, or if
         it is not the player's turn.
@@ -222,7 +225,7 @@ class TrialProgress:
     # ---- turn by turn
 
     def turn_over(self) -> None:
-        """The time of the turn is over: choose for the humans who did not, or end the episode (`turnEnds`)."""
+        """Choose for the humans who have not chosen in the turn's time, or end the episode, as `turnEnds` says."""
         if self.choices.turn_over(self.steps):
             self._good_episodes += 1
             self._end_episode("turnSeconds")
@@ -234,24 +237,24 @@ class TrialProgress:
     # ---- steps
 
     def began(self) -> None:
-        """The environment has been reset: the episode is at its first picture."""
+        """Begin the episode, whose environment has been reset."""
         self.choices.began()
         self.needs_reset = False
 
     def thaw(self) -> None:
-        """The time of the first picture is over: from now on keys act, also those that are held down already."""
+        """End the time of the first picture: from now on keys act, also those that are held down already."""
         self.frozen = False
         self.choices.forget_taps()
 
     def time_over(self) -> None:
-        """`episodeSeconds` are over, and no step is due that could be the episode's last one."""
+        """End the episode because `episodeSeconds` are over, and no step is due that could be its last one."""
         self._good_episodes += 1
         self._end_episode("truncated", "episodeSeconds")
 
     def stepped(
         self, rewards: Mapping[str, float], terminated: bool, truncated: bool, limit: str | None = None
     ) -> None:
-        """A step was taken. `limit`: the key of `trial` whose limit ends the episode with this step, if one does."""
+        """Count a step. `limit`: the key of `trial` whose limit ends the episode with this step; None if none does."""
         if self.over:
             return
         self.steps += 1
@@ -267,7 +270,7 @@ class TrialProgress:
             self._end_episode("terminated" if terminated else "truncated", None if own else limit)
 
     def failed(self, *, fatal: bool = False) -> None:
-        """The researcher's code raised an error: end the episode. `fatal`: end the trial, since it cannot go on."""
+        """End the episode after an error of the researcher's code. `fatal`: end the trial, since it cannot go on."""
         if self.over:
             return
         self._failures += 1

@@ -15,7 +15,7 @@ _LONGEST_ERROR = 2000  # characters
 
 
 class Recordings:
-    """The recordings of a trial, one after the other. Lines can be written while one `is_open`."""
+    """Opens and closes the recordings of a trial, one after the other. Lines can be written while one `is_open`."""
 
     def __init__(self, emit: Callable[[Effect], None]) -> None:
         self._emit = emit
@@ -31,11 +31,11 @@ class Recordings:
         self._emit(OpenRecording(progress.episode, seed, progress.frame_rate, progress.action_space, players))
 
     def opened(self) -> None:
-        """The recording is open."""
+        """Note that the shell has opened the recording."""
         self.is_open, self.is_awaited = True, False
 
     def failed(self) -> None:
-        """The recording cannot be opened."""
+        """Note that the shell cannot open the recording."""
         self.is_awaited = False
 
     def close(self) -> None:
@@ -47,12 +47,12 @@ class Recordings:
     # ---- errors
 
     def agent_failed(self, error: Exception, episode: int, step: int) -> None:
-        """The researcher's code raised this error: write it to the log and to the recording."""
+        """Write an error of the researcher's code to the log and to the recording."""
         self._emit(LogAgentError(error))
         self._emit(RecordLine("error", {"episode": episode, "step": step, "error": words_of(error)}))
 
     def policy_failed(self, progress: TrialProgress, player: str, words: str) -> None:
-        """The player's policy has failed, as `words` say: write that to the log and the recording, each text once."""
+        """Write `words` about a policy that has failed to the log and the recording; the same words only once."""
         plays = progress.players[player].plays
         texts = [f"the policy of {player} ({plays}) failed: {words}"]
         if progress.choices.policies.idles(player):

@@ -35,7 +35,7 @@ def shutdown(progress: TrialProgress, received: Sequence[Mapping[str, Any]]) -> 
 
 
 def answers(progress: TrialProgress, seconds: float, trial_id: str) -> dict[str, Any]:
-    """Build the answer of the step. `seconds`: the time that was played."""
+    """Build the answer of the game step. `seconds`: the time that was played."""
     return {
         "episodes": progress.episodes_played,
         **_scores(progress.score, progress.scores if progress.several else {}),

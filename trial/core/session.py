@@ -47,7 +47,7 @@ NOBODY: frozenset[str] = frozenset()
 
 
 class TrialSession:
-    """The members of a session in one trial. `places` is the player that each of them plays, by the member's id."""
+    """Controls one trial by the presence of a session's members, and keeps what each of them is told and answers."""
 
     def __init__(
         self,
@@ -64,10 +64,12 @@ class TrialSession:
         recording: Recordings,
         emit: Callable[[Effect], None],
     ) -> None:
-        """`vacant` are the players that a policy plays from the start. `erased` are the players of members whose data
-        were erased: they count as absent from the start. `recorded` is what earlier servers have recorded. `answered`
-        holds the answers of this step that some members have already, by their ids: a member whose answer says that
-        they were refused does not play.
+        """`places` is the player that each member plays, by the member's id.
+
+        `vacant` are the players that a policy plays from the start. `erased` are the players of members whose data were
+        erased: they count as absent from the start. `recorded` is what earlier servers have recorded. `answered` holds
+        the answers of this step that some members have already, by their ids: a member whose answer says that they were
+        refused does not play.
 
         `say_each` takes a function from a player to a sentence or None, and sends each client the sentence.
         """
@@ -104,7 +106,7 @@ class TrialSession:
         """Whether an episode of an earlier server is still to be repeated. Until then no one is replaced, and the game
         does not end."""
         self._waiting: list[RecordLine] = []
-        """Lines that wait for an open recording."""
+        """The lines that wait for an open recording."""
         progress.choices.timed_keys = True
         for player, outcome in (recorded.outcomes if recorded is not None else {}).items():
             if player in self._humans and outcome == "ping":
@@ -137,7 +139,7 @@ class TrialSession:
     # ---- what happens
 
     def come(self, player: str, now: float) -> None:
-        """The member has connected. If a policy has replaced them, they play again from the next step on."""
+        """Take part from now on: the member has connected. If a policy plays in their place, they replace it."""
         if self._progress.over:
             return  # too late: each member's outcome is decided
         event = self.presence.come(player, now)
@@ -145,32 +147,32 @@ class TrialSession:
         self._record(player, event)
 
     def go(self, player: str, now: float, *, closing: bool) -> None:
-        """The member's connection is closed: release their keys. `closing` has no effect in a session."""
+        """Release the keys of a member whose connection is closed, and count them as gone. `closing` has no effect."""
         self._progress.choices.let_go(player)
         self.presence.go(player, now)
         self._record(player, "left")
 
     def stalls(self, player: str, now: float) -> bool:
-        """The member's page has stopped answering: treat them as gone. Return whether they were here until now."""
+        """Count a member as gone whose page has stopped answering. Return False if they were gone already."""
         was_here = self.presence.stalls(player, now)
         if was_here:
             self._record_away(player)
         return was_here
 
     def answers_again(self, player: str, now: float) -> None:
-        """The member's page answers. If it had stopped, they are here again."""
+        """Count a member as here again whose page answers, if it had stopped answering."""
         if self.presence.answers_again(player):
             self.come(player, now)
 
     def _hides(self, player: str, hidden: bool, now: float) -> None:
-        """The member looks at another tab or application, which counts as having gone; or at the game again."""
+        """Count a member as gone while they look at another tab or application (`hidden`), and then as here again."""
         if not hidden and self.presence.hidden(player):
             self.come(player, now)
         elif hidden and self.presence.hides(player, now):
             self._record_away(player)
 
     def receive(self, player: str, message: messages.Message, window: Window, now: float) -> bool:
-        """A message has come. Return whether it has an effect: not if the member is refused for their round trip."""
+        """Note from a member's message that they are here or hidden. Return False if they are refused: ignore it."""
         if self.presence.over(player) == "ping":
             return False
         if message.hidden is not None:
@@ -191,28 +193,28 @@ class TrialSession:
         self._record(player, "left")
 
     def start(self, player: str, now: float) -> None:
-        """The member has sent `start`: they go on, from a page or after a pause."""
+        """Let a member go on, from a page or after a pause, who has sent `start`."""
         self.presence.goes_on(player, now)
 
     def stop(self, player: str) -> None:
-        """The member ends the game for all: remember who. `Commands` ends it after the present step."""
+        """Remember who ends the game for all. `Commands` ends it after the present step."""
         self._stopped.add(player)
 
     def stopped(self) -> None:
-        """The game has ended because a member has stopped it: tell the others."""
+        """Tell the other members that the game has ended because one of them has stopped it."""
         self._say_why_over(self.presence.players)
 
     def pause(self, now: float) -> None:
-        """A member holds the game for all members."""
+        """Hold the game for all members."""
         self._progress.pause()
         self.presence.pauses()
 
     def saved(self, human: str) -> None:
-        """The member's answer is stored."""
+        """Note that the member's answer is stored."""
         self._stored.add(human)
 
     def round_trip(self, player: str, seconds: float, now: float) -> None:
-        """The member's browser has answered a ping after `seconds`. Once the game has begun, that is recorded."""
+        """Take a sample of a member's round trip, in seconds. Once the game has begun, the sample is recorded."""
         if self._progress.over:
             return  # too late: each member's outcome is decided
         self.presence.round_trip(player, seconds, now)
@@ -270,7 +272,7 @@ class TrialSession:
         self._progress.start()
 
     def _end_or_replace(self, now: float) -> frozenset[str]:
-        """End the game, or replace members by a policy, if a member is absent or refused. Returns as its caller."""
+        """If members are absent or refused, end the game or let a policy replace them. Returns as `_hold_or_go_on`."""
         presence, progress = self.presence, self._progress
         self._replays = self._replays and progress.needs_reset
         if self._replays:
@@ -399,7 +401,7 @@ class TrialSession:
         return fields
 
     def sentence(self, player: str) -> str | None:
-        """Return the sentence that tells this member why the game is over; None if it is not, or needs no sentence."""
+        """Return the sentence that tells a member why the game is over; None if it is not, or needs no sentence."""
         over = self.presence.over(player)
         if over == "ping":
             return PING

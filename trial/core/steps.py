@@ -15,7 +15,7 @@ from trial.settings import TrialSettings
 
 
 class Stepper:
-    """Takes steps, one after the other. Its methods return calls of the agent, which the caller makes."""
+    """Takes steps, one after the other. `take` returns a call, which the caller gives to the agent."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Stepper:
         )
 
     def taken(self, call: StepCall, step: StepTaken, progress: TrialProgress, now: float) -> None:
-        """The step was taken: record it, count it, and show the new picture."""
+        """Record and count a step that was taken, and show its picture."""
         self._emit(WriteLine(step.line))
         self._message_log.recorded(call.messages, len(call.feedback))
         self._timing.stepped(now, progress.frame_rate)
@@ -65,7 +65,7 @@ class Stepper:
         self._clients.show(step.pictures)
 
     def began(self, begun: Begun, progress: TrialProgress, now: float) -> None:
-        """The environment was reset: record it, and show the first picture."""
+        """Record that the environment was reset, and show the first picture."""
         self._emit(WriteLine(begun.line))
         progress.began()
         self._timing.begin_episode()

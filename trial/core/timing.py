@@ -16,7 +16,7 @@ from trial.core.progress import TrialProgress
 
 
 class Due(Enum):
-    """What is due now. MORE: the progress has changed, so ask again."""
+    """What is due now. MORE: nothing for the caller to do, but the progress has changed, so ask again."""
 
     NOTHING = "nothing"
     MORE = "more"
@@ -25,15 +25,15 @@ class Due(Enum):
 
 
 class StateTimes(NamedTuple):
-    """The times in a state for clients, in seconds from now on. None: there is no such time."""
+    """The times that a client is sent with the trial's state, in seconds from now on. None: there is no such time."""
 
     next_in: float | None = None
-    """Until the break ends; infinite if the participant ends it."""
+    """The time until the break ends; infinite if the participant ends it."""
     turn_ends_in: float | None = None
     starts_in: float | None = None
-    """Until the first picture gives way to the game."""
+    """The time until the game follows the first picture."""
     time_left: float | None = None
-    """Of play in the episode."""
+    """The time of play that is left in the episode."""
     session: Mapping[str, Any] | None = None
     """In a session, the fields about its members."""
 
@@ -45,7 +45,7 @@ class Pacer:
         self._due: float | None = None
 
     def rest(self) -> None:
-        """The game is held: the next frame is due at once when it goes on."""
+        """Let the next frame be due at once when the game goes on. Call it while the game is held."""
         self._due = None
 
     def next(self, now: float, rate: int) -> float:
@@ -62,13 +62,13 @@ class Pacer:
 
 
 class Timing:
-    """The times of one trial. It ends breaks, first pictures, turns and episodes whose time is over."""
+    """Keeps the times of one trial, and ends breaks, first pictures, turns and episodes whose time is over."""
 
     def __init__(self, config: TrialSection) -> None:
         self.seconds = 0.0
         """The time that was played, in seconds."""
         self.wake_at: float | None = None
-        """After `next` returned NOTHING: when to call it again; None: only another event makes something due."""
+        """After `next` returned NOTHING: the time to call it again; None if only another event makes something due."""
         self._between = config.between_seconds
         self._max_steps = config.max_steps
         self._episode = EpisodeTime(config.reset_freeze, config.episode_seconds)
@@ -80,26 +80,26 @@ class Timing:
     # ---- what has happened
 
     def begin_episode(self) -> None:
-        """An episode begins, with its first picture."""
+        """Begin an episode, which shows its first picture."""
         self._episode.begin()
 
     def resume_episode(self, played: float) -> None:
-        """The episode goes on. It was played for `played` seconds on an earlier server."""
+        """Continue an episode that was played for `played` seconds on an earlier server."""
         self._episode.resume(played)
 
     def skip(self) -> None:
-        """The step that was due is not taken."""
+        """Let the next frame be due in the place of the step that was due and is not taken."""
         self._due = None
 
     def stepped(self, now: float, frame_rate: int) -> None:
-        """A step was taken: count the time since the step before as played."""
+        """Count the time since the step before as played, after a step was taken."""
         self.seconds += 1.0 / frame_rate if self._last_step is None else now - self._last_step
         self._last_step = now
 
     # ---- what is due
 
     def next(self, progress: TrialProgress, now: float) -> Due:
-        """Return what is due now. If that is NOTHING, `wake_at` says when to ask again."""
+        """Return what is due now. If NOTHING is due, `wake_at` says when to ask again."""
         self.wake_at = None
         playing = progress.playing
         if not playing:
@@ -122,7 +122,7 @@ class Timing:
         return self._step_due(progress, now) if progress.turns is None else self._turn_over(progress, now)
 
     def _rest(self) -> None:
-        """No steps are taken now. The next one is due at once."""
+        """Let the next step be due at once when steps are taken again."""
         self._pacer.rest()
         self._due = self._last_step = None
 
@@ -146,7 +146,7 @@ class Timing:
         return Due.MORE
 
     def _frozen(self, progress: TrialProgress, now: float) -> bool:
-        """Return whether the time of the first picture is not over. If it is, the episode is played from now on."""
+        """Return whether the first picture is still to be shown. If not, count the time from now on as played."""
         left = self._episode.starts_in(now)
         if left > 0.0:
             self._rest()
@@ -204,7 +204,7 @@ class Timing:
     # ---- what clients are told
 
     def state_times(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
-        """Return the times in a state for clients. `session`: the fields about the members of a session."""
+        """Return the times that clients are sent with the state. `session`: the fields about a session's members."""
         return StateTimes(
             next_in=self._break_left(progress, now),
             turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),

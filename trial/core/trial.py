@@ -79,6 +79,8 @@ TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you h
 
 
 class Phase(Enum):
+    """The phases of a trial, which the module's docstring explains."""
+
     STARTING = "starting"
     PLAYING = "playing"
     SAVING = "saving"
@@ -87,7 +89,7 @@ class Phase(Enum):
 
 
 class Trial:
-    """The trial of one game step on this server. See the module's docstring for events, effects and phases."""
+    """Decides everything about the trial of one game step. The module's docstring lists events, effects and phases."""
 
     def __init__(
         self,
@@ -105,11 +107,11 @@ class Trial:
         self.id = trial_id
         self.phase = Phase.STARTING
         self.ready = False
-        """Whether the first frame is there, or the trial is over."""
+        """Whether there is a first frame, or the trial is over without one."""
         self.callbacks = False
         """Whether the agent has callbacks. They are called when an episode ends, and when players come and go."""
         self.wake_at: float | None = None
-        """When the shell must call `advance` if no other event comes before; None: it need not."""
+        """The time at which the shell must call `advance` if no other event comes before; None if it need not."""
         self.progress = TrialProgress(self.config, alone(self.config.action_space or ("noop",)))
         self._now = 0.0
         self._effects: list[Effect] = []
@@ -134,7 +136,7 @@ class Trial:
 
     @property
     def broken(self) -> bool:
-        """Whether the game could not begin: there is no frame, and there will be no answer. Valid once `ready`."""
+        """Whether the game could not begin: there is no frame and will be no answer. Only `ready` makes it known."""
         return self.progress.outcome == "failed" and self._clients.pictures is None
 
     @property
@@ -160,7 +162,7 @@ class Trial:
     # ---- events: the start
 
     def already_played(self, answers: Mapping[str, Any]) -> list[Effect]:
-        """The answer of the step is stored: an earlier server has played it.
+        """Finish at once, because an earlier server has played the game step and stored its answer.
 
         `answers` is that answer; in a session, the answer of each member by their id.
         """
@@ -170,7 +172,7 @@ class Trial:
         return []
 
     def agent_failed(self, now: float) -> list[Effect]:
-        """The agent cannot be started."""
+        """End the trial as failed, because the agent cannot be started."""
         if self.phase is not Phase.STARTING:
             return []
         self.phase = Phase.PLAYING
@@ -188,11 +190,11 @@ class Trial:
         erased: Sequence[str] = (),
         answered: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> list[Effect]:
-        """The agent has started. `players` are the environment's; `recorded` is what earlier servers have recorded.
+        """Begin the game with the environment's `players`, after what earlier servers have `recorded`.
 
-        In a session: `places` is the player that each member plays, by the member's id. `vacant` are the places without
-        a member, in which policies play. `erased` are the places of members whose data were erased, and who never come.
-        `answered` holds the answers of this step that some members have already, by their ids.
+        In a session: `places` is the player that each member plays, by the member's id. `vacant` are the players
+        without a member, whom policies play. `erased` are the players of members whose data were erased, and who never
+        come. `answered` holds the answers of this step that some members have already, by their ids.
         """
         if self.phase is not Phase.STARTING:
             return []
@@ -223,7 +225,7 @@ class Trial:
     # ---- events: clients
 
     def connect(self, human: str, connection: Hashable, window: Window, now: float) -> list[Effect]:
-        """A human's client has connected. It replaces an earlier client of this human. Call it once `ready`.
+        """Show the trial to a human's client that has connected. It replaces an earlier one. Call it once `ready`.
 
         `window` counts the frames that this connection has not acknowledged.
         """
@@ -254,7 +256,7 @@ class Trial:
         return self.advance(now)
 
     def disconnect(self, connection: Hashable, now: float) -> list[Effect]:
-        """A connection was closed: hold the game until its human starts it again; in a session, until they are back."""
+        """Hold the game after a connection was closed until `start` is sent; in a session, until the member is back."""
         self._now = now
         client = self._clients.remove(connection)
         if client is None:
@@ -263,7 +265,7 @@ class Trial:
         return self.advance(now)
 
     def round_trip(self, human: str, seconds: float, now: float) -> list[Effect]:
-        """The human's browser has answered a ping after `seconds`. Only sessions use it."""
+        """Take a sample of a human's round trip, in seconds, which their browser's answer to a ping has measured."""
         self._now = now
         if self.phase is not Phase.PLAYING:
             return []
@@ -271,7 +273,7 @@ class Trial:
         return self.advance(now)
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
-        """A client has sent a message. It changes nothing if another connection has replaced this one."""
+        """Carry out a client's message. It changes nothing if another connection has replaced this one."""
         self._now = now
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
@@ -280,7 +282,7 @@ class Trial:
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
-        """A program advises an action for the next step, or chooses it for a player that it plays.
+        """Take a program's advice for the next action, or its choice for a player that the program plays.
 
         `action` and `player` are as in `Choices.advise`. Raises CommandRefused.
         """
@@ -292,7 +294,7 @@ class Trial:
     # ---- events: the agent
 
     def call_returned(self, call: Call, result: Any, now: float) -> list[Effect]:
-        """A call of the agent has returned `result`. It changes nothing if the trial has given the call up."""
+        """Go on after a call of the agent has returned `result`. A call that was given up changes nothing."""
         if not self._agent.has_ended(call):
             return []
         self._now = now
@@ -308,7 +310,7 @@ class Trial:
         return self.advance(now)
 
     def call_failed(self, call: Call, error: Exception, now: float) -> list[Effect]:
-        """A call of the agent has raised this error; AgentTimeout if it has not returned in time."""
+        """Go on after a call of the agent has raised this error; AgentTimeout if it has not returned in time."""
         hangs = isinstance(error, AgentTimeout)
         if not self._agent.has_ended(call, hangs=hangs):
             return []
@@ -335,7 +337,7 @@ class Trial:
     # ---- events: policies
 
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
-        """The player's policy has chosen this action. An answer to an earlier question changes nothing."""
+        """Take the action that the player's policy has chosen. An answer to an earlier question changes nothing."""
         self._now = now
         problem = self.progress.choices.policies.acted(player, ask_id, action)
         if problem is not None:
@@ -344,7 +346,7 @@ class Trial:
         return self.advance(now) if problem is not None or self.progress.turns is not None else []
 
     def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
-        """The player's policy raised this error."""
+        """Go on after the player's policy has raised this error."""
         self._now = now
         if self.progress.choices.policies.failed(player, ask_id):
             self._recording.policy_failed(self.progress, player, words_of(error))
@@ -353,21 +355,21 @@ class Trial:
     # ---- events: the store
 
     def recording_opened(self, now: float) -> list[Effect]:
-        """The recording of the last `OpenRecording` is open: begin the episode."""
+        """Begin the episode, since the recording of the last `OpenRecording` is open."""
         self._now = now
         self._recording.opened()
         self._agent.make(self._beginning.opened(self.progress, self._participants, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
-        """The recording cannot be opened: end the game, since every game must be recorded."""
+        """End the game, since its recording cannot be opened and every game must be recorded."""
         self._now = now
         self._recording.failed()
         self._fail(fatal=True)
         return self.advance(now)
 
     def answer_saved(self, now: float) -> list[Effect]:
-        """All recordings and answers are stored, or there was no answer to store."""
+        """Finish the trial, since all recordings and answers are stored, or close it if it has no answer."""
         self._now = now
         if not self.progress.over or self.broken:
             self.phase = Phase.CLOSED
@@ -380,7 +382,7 @@ class Trial:
         return [WriteLog(logging.INFO, text), *self._take_effects()]
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
-        """A member's answer is stored: let them go on to the next step, even if the others still play."""
+        """Let a member whose answer is stored go on to the next step, even if the others still play."""
         self._now = now
         self._participants.saved(human)
         for each, client in self._clients.by_human():
@@ -391,7 +393,7 @@ class Trial:
     # ---- events: time
 
     def advance(self, now: float) -> list[Effect]:
-        """Do everything that is due at this time. The other events do this, too."""
+        """Do everything that is due at this time. The methods for the other events call this one."""
         self._now = now
         self.wake_at = None
         self._agent.give_up(now)
@@ -408,7 +410,10 @@ class Trial:
         return self._take_effects()
 
     def close(self, now: float) -> list[Effect]:
-        """The server must end: stop playing, and write the last lines. There is no answer unless the trial is over."""
+        """Stop playing and write the last lines, because the server must end.
+
+        Only a trial that is over has an answer.
+        """
         self._closing = self._commands.closed = self._ending.closing = True
         if self._agent.call is not None:
             self._agent.give_up_at = now + LAST_CALL_SECONDS
@@ -505,7 +510,7 @@ class Trial:
             self._emit(TellMoved(callback, player))
 
     def _note(self, event: str, client: Client) -> None:
-        """Add an event that is no message to the messages that are recorded."""
+        """Record an event of a client among its messages, such as its connection."""
         self._messages.note(event, self._ns(), self._participants.name_of(client.player))
 
     def _ns(self) -> int:

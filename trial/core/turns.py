@@ -9,7 +9,7 @@ from trial.core.actions import Action
 
 
 class Turns:
-    """The present turn of a game. `seconds`: the time that humans have for each turn; 0 for no limit."""
+    """Keeps the present turn of a game. `seconds`: the time that humans have for each turn; 0: no limit."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -21,7 +21,7 @@ class Turns:
         """By player, the choices of this turn."""
 
     def begin(self, to_act: frozenset[str]) -> None:
-        """A turn begins. Its time does not run before `run`."""
+        """Begin a turn. Its time does not run before `run` is called."""
         self.to_act = to_act
         self.chosen = {}
         self._left, self._since = self._seconds, None
@@ -36,17 +36,17 @@ class Turns:
         return len(self.chosen) < len(self.to_act)
 
     def choose(self, player: str, action: Action) -> None:
-        """The player chooses an action. It changes nothing if they have chosen in this turn, or are not to act."""
+        """Choose a player's action. It changes nothing if the player has chosen in this turn, or is not to act."""
         if self.waits_for(player):
             self.chosen[player] = action
 
     def run(self, now: float) -> None:
-        """Let the time of the turn run: the game goes on."""
+        """Let the time of the turn run, because the game goes on."""
         if self._since is None:
             self._since = now
 
     def hold(self, now: float) -> None:
-        """Stop the time of the turn: the game is held."""
+        """Stop the time of the turn, because the game is held."""
         self._left, self._since = self.left(now), None
 
     def left(self, now: float) -> float:

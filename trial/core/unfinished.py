@@ -12,7 +12,7 @@ from trial.core.policies import FAILURES
 
 @dataclass(frozen=True, slots=True)
 class RecordedAction:
-    """One player's action in a step. `action` is None if it was not their turn; `observed` and `by` as in `Action`."""
+    """One player's action in a step; None if it was not the player's turn. `observed` and `by` are as in `Action`."""
 
     action: int | None
     reward: float
@@ -22,10 +22,10 @@ class RecordedAction:
 
 @dataclass(frozen=True, slots=True)
 class RecordedStep:
-    """One step: the human's action (None: no key acted), the action taken, the reward, and the feedback before it.
+    """One step: the human's action (None: no key acted), the action taken, the reward, the feedback before the step.
 
-    `advice` is the action that the agent was asked to take if no key acted; None: the idle action. `players` are the
-    actions of all players, if there are several.
+    `advice` is the action that the agent was asked to take because no key acted; None: the idle action. `players` are
+    the actions of all players, if there are several.
     """
 
     human: int | None
@@ -38,13 +38,13 @@ class RecordedStep:
 
 @dataclass(slots=True)
 class UnfinishedEpisode:
-    """An interrupted episode. If the environment takes no seed, `seed` is None, and the episode cannot be replayed."""
+    """An interrupted episode. `seed` is None if the environment takes no seed; then the episode cannot be replayed."""
 
     number: int
     seed: int | None
     steps: list[RecordedStep] = field(default_factory=list)
     unheard: list[Word] = field(default_factory=list)
-    """Feedback after the last step. The earlier server's agent did not hear it."""
+    """The feedback after the last step, which the earlier server's agent did not hear."""
 
     @property
     def score(self) -> float:
@@ -62,7 +62,7 @@ class UnfinishedEpisode:
 
     @property
     def last_actions(self) -> dict[str, int]:
-        """Player → its action in the last step, for the players whose policies had chosen that action last."""
+        """By player, the action of the last step, for players whose policies chose that action last."""
         chosen: dict[str, int | None] = {}
         for step in self.steps:
             asked = {player: part for player, part in step.players.items() if part.observed is not None}

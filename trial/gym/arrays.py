@@ -32,7 +32,7 @@ _LENGTH = struct.Struct("<I")
 _DOUBLE = 8  # bytes of a reward
 
 Infos = list[tuple[int, dict[str, Any]]]
-"""Pairs of a step's number, from 0 on, and its info, for the steps that have one. The info of a reset has number 0."""
+"""Pairs of a step's number, from 0 on, and its info, for steps that have an info. A reset's info has the number 0."""
 
 
 class ArrayRequest(NamedTuple):
@@ -62,11 +62,11 @@ class ArrayLayout:
     """Writes and reads batches of values of one space."""
 
     def empty(self, count: int) -> Any:
-        """A new batch of `count` values, which `put` fills."""
+        """Make a batch of `count` values, which `put` fills."""
         raise NotImplementedError
 
     def put(self, batch: Any, row: int, value: Any) -> None:
-        """Set one value of a batch. Raises CodecError if it does not have the space's shape and kind of numbers."""
+        """Set one value of a batch. Raises CodecError if the value lacks the space's shape or kind of numbers."""
         raise NotImplementedError
 
     def put_batch(self, batch: Any, row: int, part: Any, count: int) -> None:
@@ -83,12 +83,12 @@ class ArrayLayout:
         raise NotImplementedError
 
     def rows(self, batch: Any, count: int) -> Sequence[Any]:
-        """The `count` values of a batch as a sequence."""
+        """Return the `count` values of a batch as a sequence."""
         raise NotImplementedError
 
 
 def layout(space: Space, *, action: bool = False) -> ArrayLayout:
-    """The layout of `space`. With `action`, `unpack` refuses the same actions as `values.decoder`.
+    """Make the layout of `space`. With `action`, `unpack` refuses the same actions as `values.decoder`.
 
     Raises CodecError for a class of space that Gymnasium does not have.
     """
@@ -178,7 +178,7 @@ class _Discrete(_Numbers):
 
 
 class _Json(ArrayLayout):
-    """A column of values whose size varies, as JSON: the length of the text, then the text of a list (`values`)."""
+    """Writes values whose size varies as one column in JSON: the text's length, then the text of a list (`values`)."""
 
     def __init__(self, decode: values.Decode) -> None:
         self._decode = decode
@@ -275,7 +275,7 @@ class _Tuple(ArrayLayout):
 
 
 def batch_of(layout: ArrayLayout, rows: Sequence[Any]) -> Any:
-    """The values `rows` as one batch. Raises CodecError if one does not have the space's shape and kind of numbers."""
+    """Make one batch of the values `rows`. Raises CodecError if one lacks the space's shape or kind of numbers."""
     batch = layout.empty(len(rows))
     for row, value in enumerate(rows):
         layout.put(batch, row, value)
@@ -283,14 +283,14 @@ def batch_of(layout: ArrayLayout, rows: Sequence[Any]) -> Any:
 
 
 def step_request(kind: int, handle: int, steps: int, actions: ArrayLayout, batch: Any, *, num_envs: int = 1) -> bytes:
-    """The request STEP or STEP_MANY, with a batch of actions of an environment or a vector."""
+    """Build the request STEP or STEP_MANY, with a batch of actions of an environment or a vector."""
     parts: list[bytes] = [_REQUEST.pack(kind, handle, steps)]
     actions.pack(batch, steps * num_envs, parts)
     return b"".join(parts)
 
 
 def reset_request(handle: int, seed: Any, options: Any) -> bytes:
-    """The request RESET. `seed` is None, a number, or for a vector a list; `options` is a dict or None."""
+    """Build the request RESET. `seed` is None, a number, or for a vector a list; `options` is a dict or None."""
     return _REQUEST.pack(RESET, handle, 0) + exact.to_text({"seed": seed, "options": options}).encode()
 
 
@@ -312,7 +312,7 @@ def read_actions(request: ArrayRequest, actions: ArrayLayout, num_envs: int = 1)
 
 
 def refused(request: ArrayRequest, space: Space, num_envs: int = 1) -> Any:
-    """The first action for which `read_actions` refuses a request. If it cannot be read, the size of the body."""
+    """Return the first action for which `read_actions` refuses a request; the body's size if no action can be read."""
     unchecked, checked = layout(space), layout(space, action=True)
     count = request.steps * num_envs
     with contextlib.suppress(CodecError):
@@ -340,7 +340,7 @@ def read_reset(request: ArrayRequest) -> tuple[Any, dict[str, Any] | None]:
 
 
 def steps_reply(kind: int, handle: int, observations: ArrayLayout, steps: StepRows) -> bytes:
-    """The answer to STEP and STEP_MANY."""
+    """Build the answer to STEP or STEP_MANY."""
     rows = len(steps.rewards)
     columns: list[bytes] = [np.asarray(steps.rewards, "<f8").tobytes()]
     observations.pack(steps.observations, rows, columns)
@@ -349,7 +349,7 @@ def steps_reply(kind: int, handle: int, observations: ArrayLayout, steps: StepRo
 
 
 def reset_reply(handle: int, observations: ArrayLayout, rows: int, batch: Any, infos: Infos) -> bytes:
-    """The answer to RESET: a row for each environment."""
+    """Build the answer to RESET, with a row for each environment."""
     columns: list[bytes] = []
     observations.pack(batch, rows, columns)
     return _reply(RESET, handle, rows, columns, infos)
@@ -398,7 +398,7 @@ def read_reset_reply(data: bytes, observations: ArrayLayout) -> tuple[Any, Infos
 
 
 def _opened(data: bytes) -> tuple[int, int, memoryview, Infos]:
-    """The kind of a reply, the number of its rows, its columns and its infos. Raises CodecError."""
+    """Read a reply: return its kind, the number of its rows, its columns and its infos. Raises CodecError."""
     if len(data) < _REPLY.size:
         raise CodecError("The message is too short for its header.")
     kind, _, rows, length, after = _REPLY.unpack_from(data)
@@ -429,7 +429,7 @@ def _flags(columns: memoryview, at: int, rows: int) -> np.ndarray[Any, np.dtype[
 
 
 def _whole(layout: ArrayLayout, data: memoryview, rows: int) -> Any:
-    """The batch of `rows` values of which `data` consists. Raises CodecError if `data` is longer."""
+    """Read `data` as a batch of `rows` values. Raises CodecError if `data` is longer."""
     batch, end = layout.unpack(data, 0, rows)
     if end != len(data):
         raise CodecError("The message is longer than its values.")

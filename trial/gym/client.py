@@ -20,7 +20,7 @@ from trial.gym.arrays import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
 TIMEOUT = 90.0
-"""Seconds for an answer: more than a server by default allows for a request, so that its sentence arrives first."""
+"""The seconds in which an answer must come: more than a server's default limit, so that its sentence comes first."""
 
 _CLOSE_SECONDS = 2.0  # in which the server must answer a close
 _LARGEST_REPLY = 2**30  # bytes
@@ -35,7 +35,9 @@ class ConnectionLost(RemoteError):
 
 
 class GymClient:
-    """One connection. Each request waits for its answer. Only one thread at a time has a request.
+    """A connection to a server of environments.
+
+    A request waits for its answer, and other threads' requests wait for it.
 
     `url` begins with `ws://` or `wss://`; without a path it gets `/gym`. `timeout` is in seconds, for connecting and
     for each answer. `ca` is a file of certificates in PEM that are trusted beside the system's. Raises ConnectionLost
@@ -89,7 +91,7 @@ class GymClient:
         return answer  # type: ignore[return-value]
 
     def read(self, reader: Callable[..., Any], *arguments: Any) -> Any:
-        """Call `reader`, which reads an answer. If that raises CodecError, end the connection, raise ConnectionLost."""
+        """Read an answer by `reader`. If it raises CodecError, end the connection and raise ConnectionLost."""
         try:
             return reader(*arguments)
         except CodecError as error:
@@ -134,7 +136,7 @@ class GymClient:
 
 
 def _address(url: str, token: str | None) -> str:
-    """The address to connect to, with a path and the token."""
+    """Return the address to connect to, with a path and the token."""
     parts = urlsplit(url)
     path = parts.path if parts.path not in ("", "/") else "/gym"
     query = "&".join(part for part in (parts.query, f"token={quote(token, safe='')}" if token else "") if part)
@@ -142,7 +144,7 @@ def _address(url: str, token: str | None) -> str:
 
 
 def _shown(url: str) -> str:
-    """The address for messages, without its password and query, which may be secrets."""
+    """Return the address as messages show it: without its password and query, which may be secrets."""
     parts = urlsplit(url)
     return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
@@ -162,7 +164,7 @@ def _trusting(ca: str) -> ssl.SSLContext:
 
 
 def _reason(error: BaseException) -> str:
-    """Why there is no connection, for the end of a sentence."""
+    """Return why there is no connection, for the end of a sentence."""
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         return error.rcvd.reason or f"the server closed it with code {error.rcvd.code}"
     if isinstance(error, InvalidStatus):
@@ -178,7 +180,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _result(answer: str) -> Any:
-    """The result in an answer. Raises RemoteError if the answer is an error, and CodecError if it is no JSON."""
+    """Read the result in an answer. Raises RemoteError if the answer is an error, CodecError if it is no JSON."""
     result = values.from_text(answer)
     error = result.get("error") if isinstance(result, dict) else None
     if isinstance(error, dict):

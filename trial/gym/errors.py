@@ -22,7 +22,7 @@ class GymError(Exception):
 
     @property
     def brief(self) -> str:
-        """Gymie's sentence for the error, without further reasons."""
+        """Return Gymie's sentence for the error, without further reasons."""
         return str(self)
 
 
@@ -48,7 +48,7 @@ class WrongParameters(GymError):
 
 
 class _Named(GymError):
-    """An error about an id or an action, which is its first argument; further arguments are reasons.
+    """An error about an id or an action. That is the exception's first argument; further arguments are reasons.
 
     A program's own `get_env` may raise it as in Gymie, also without arguments.
     """
@@ -79,7 +79,7 @@ class EnvironmentMalformed(_Named):
 
     @property
     def brief(self) -> str:
-        """Gymie's sentence, and the reason: Gymie calls an environment malformed also if a package is missing."""
+        """Return Gymie's sentence and the reason: Gymie calls an environment malformed also if a package is missing."""
         return str(self)
 
 
@@ -108,25 +108,25 @@ class LimitReached(GymError):
 
 
 def short(text: str, most: int) -> str:
-    """The text on one line, cut to `most` characters."""
+    """Put the text on one line, cut to `most` characters."""
     line = " ".join(text.split())
     return line if len(line) <= most else line[: most - 1] + "…"
 
 
 def reason(text: str) -> str:
-    """The text, cut to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
+    """Cut the text to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
     encoded = text.encode("utf-8", "replace")
     return text if len(encoded) <= 123 else encoded[:120].decode("utf-8", "ignore") + "…"
 
 
 def unusable(error: OSError | UnicodeError) -> str:
-    """Why a server cannot listen at an address."""
+    """Return why a server cannot listen at an address."""
     number = error.errno or 0 if isinstance(error, OSError) else 0
     return os.strerror(number) if number > 0 else "there is no such host"  # getaddrinfo's numbers are negative
 
 
 def described(error: BaseException) -> str:
-    """The class of an exception and its text; only the class if it has no text, or `str` of it raises."""
+    """Describe an exception by its class and text; by its class alone if it has no text or `str` of it raises."""
     try:
         text = str(error)
     except Exception:  # noqa: BLE001 - the exception is the researcher's

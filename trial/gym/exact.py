@@ -36,7 +36,10 @@ def from_text(text: str | bytes) -> Any:
 
 
 def _tagged(value: Any, depth: int) -> Any:
-    """The value as JSON data."""
+    """Convert the value to JSON data. An object with one key that begins with `$` stands for a type that JSON lacks.
+
+    Deeper than `MAX_DEPTH` levels, only the name of the type of a list, map or array is left.
+    """
     kind = type(value)
     if value is None or kind in (bool, int, str):
         return value
@@ -74,7 +77,7 @@ def _tagged_rare(value: Any, depth: int) -> Any:
 
 
 def _untagged(data: Any) -> Any:
-    """The value of which `_tagged` has made this JSON data."""
+    """Convert JSON data that `_tagged` has made back to the value."""
     if isinstance(data, list):
         return [_untagged(part) for part in data]
     if not isinstance(data, dict):

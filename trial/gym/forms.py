@@ -35,7 +35,7 @@ class MessageForm:
 
 
 def error_message(error: GymError) -> str:
-    """The message for an error, in all forms but Gymie's."""
+    """Build the message for an error, in all forms except Gymie's."""
     return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
 
 

@@ -31,13 +31,13 @@ class Ended(NamedTuple):
     sentence: str
 
     def packed(self) -> bytes:
-        """The message as bytes."""
+        """Write the message as bytes."""
         sentence = self.sentence.encode()[:1000]
         return _ENDED.pack(self.number, self.code, len(sentence)) + sentence
 
 
 def send(control: socket.socket, start: NewConnection) -> None:
-    """Send a connection to the spawner. The caller's own descriptor of it stays open. Raises OSError."""
+    """Send a connection to the spawner. The caller's own descriptor of the connection stays open. Raises OSError."""
     name = start.form.encode()
     header = _START.pack(start.number, len(name), len(start.received))
     sent = socket.send_fds(control, [header], [start.connection.fileno()])

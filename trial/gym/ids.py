@@ -15,7 +15,7 @@ _OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<ram>-ram)?(?P<kind>Deterministi
 
 
 def present(env_id: str) -> tuple[str, dict[str, Any]]:
-    """The id under which the environment is registered now, and further arguments for `gymnasium.make`.
+    """Find the id under which the environment is registered now, and further arguments for `gymnasium.make`.
 
     A version that Gymnasium does not have any more becomes the newest one. An unknown id stays as it is. For the id of
     an Atari game, ALE's environments are registered first, if ALE is installed.
@@ -40,7 +40,7 @@ def present(env_id: str) -> tuple[str, dict[str, Any]]:
 
 
 def _newest(env_id: str, known: list[str]) -> str:
-    """The newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
+    """Return the newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
     given = _ID.fullmatch(env_id)
     if given is None:
         return env_id

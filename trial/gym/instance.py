@@ -15,7 +15,7 @@ from trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongPara
 from trial.gym.recordings import ConnectionRecorder, Recorded
 
 CUT_OFF = "TimeLimit.truncated"
-"""The key of an info by which gym's TimeLimit says that its limit ended the episode."""
+"""The key in an info by which gym's TimeLimit says that its limit ended the episode."""
 
 MODES = {mode.value: mode for mode in AutoresetMode}
 """Gymnasium's autoreset modes by their names in requests."""
@@ -62,7 +62,7 @@ class Instance:
 
     @property
     def processes(self) -> bool:
-        """Whether a program's own `process_step` changes its steps."""
+        """Whether a program's own `process_step` changes this environment's steps."""
         return self._process is not None
 
     @property
@@ -88,7 +88,7 @@ class Instance:
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
         """Begin an episode. Return its first observation and info.
 
-        The first reset uses the seed of `make` if it has no `seed` itself. Raises EnvironmentFailed.
+        Without `seed`, the first reset uses the seed of `make`. Raises EnvironmentFailed.
         """
         made_with, self.seed = self.seed, None
         seed = made_with if seed is None else seed
@@ -96,7 +96,7 @@ class Instance:
         return guarded(self._reset, seed, options)  # type: ignore[no-any-return]
 
     def step(self, action: Any) -> InstanceStep:
-        """Take one step. Raises WrongAction if the environment raises anything, as Gymie does."""
+        """Take one step. Raises WrongAction if the environment raises an exception, as Gymie does."""
         try:
             return InstanceStep(*_five(self.env.step(action)))
         except GymError:
@@ -105,7 +105,7 @@ class Instance:
             raise WrongAction(action, described(error)) from error
 
     def processed(self, step: InstanceStep) -> InstanceStep:
-        """The step as the program's own `process_step` returns it; as it is, if there is none."""
+        """Let the program's own `process_step` change the step. Without one, return the step as it is."""
         if self._process is None:
             return step
         observation, reward, terminated, truncated, info = step
@@ -152,7 +152,7 @@ class Instance:
             raise WrongAction(action, described(error) + where) from error
 
     def _end(self, results: Any) -> Any:
-        """The results of an episode's last step, as `mode` has them."""
+        """Return the results of an episode's last step, in the form that `mode` requires."""
         observation, reward, terminated, truncated, last_info = results
         if self.mode is not AutoresetMode.SAME_STEP:
             self._ended = True
@@ -216,7 +216,7 @@ def make(
     *,
     recorder: ConnectionRecorder | None = None,
 ) -> Instance:
-    """Make an environment, or with `num_envs` a vector of that many, all recorded by `recorder`. Raises GymError."""
+    """Make an environment, or with `num_envs` a vector of so many. `recorder` records them all. Raises GymError."""
     own = overrides.replaced("get_env")
     get_env = overrides.get_env if own is None else own
 
@@ -248,7 +248,7 @@ def _reset_takes_seed(env: Any) -> bool:
 
 
 def _five(results: Any) -> Any:
-    """The five results of a step, also of the four of gym's old kind. Raises EnvironmentFailed for anything else."""
+    """Read a step's five results, or the four of gym's old kind. Raises EnvironmentFailed for anything else."""
     if not isinstance(results, tuple | list) or len(results) not in (4, 5):
         raise EnvironmentFailed("step() must return five values: observation, reward, terminated, truncated and info.")
     if len(results) == 5:
@@ -259,7 +259,7 @@ def _five(results: Any) -> Any:
 
 
 def number(reward: Any) -> float:
-    """The reward of one environment as a float. Raises EnvironmentFailed if it is no number."""
+    """Convert one environment's reward to a float. Raises EnvironmentFailed if it is no number."""
     if type(reward) is float:
         return reward
     try:
@@ -270,5 +270,5 @@ def number(reward: Any) -> float:
 
 
 def as_dict(info: Any) -> Any:
-    """The info as a dict: {} for None; anything else that is no dict becomes the value of the key `info`."""
+    """Convert an info to a dict: None to {}; anything else that is no dict becomes the value of the key `info`."""
     return info if isinstance(info, Mapping) else {} if info is None else {"info": info}

@@ -9,28 +9,28 @@ from trial.gym.errors import LimitReached
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of a server. Each is the highest value that is allowed."""
+    """The limits of a server of environments. Each is the highest value that is allowed."""
 
     connections: int = 1000
-    """Connections at a time."""
+    """The connections at a time."""
     workers: int = 64
-    """Connections at a time that have a process (a worker), since they have sent a request."""
+    """The connections at a time that have a process (a worker), since they have sent a request."""
     environments: int = 256
-    """Environments of a connection. Those of a vector are counted one by one."""
+    """The environments of a connection. Each environment of a vector counts."""
     seconds: float = 60.0
-    """Seconds for one request."""
+    """The seconds for one request."""
     idle_seconds: float = 3600.0
-    """Seconds without a request after which a connection with a worker is closed; 0: no limit."""
+    """The seconds without a request after which a connection with a worker is closed; 0: no limit."""
     megabytes: int = 2048
-    """Memory of each process of a connection beyond what it begins with, and of all of them together."""
+    """The memory of each process of a connection beyond what it begins with, and of all of them together."""
     processes: int = 64
-    """Processes that the environments of a connection start."""
+    """The processes that the environments of a connection start."""
     steps_per_second: int = 0
-    """Steps of a connection in a second; 0: no limit."""
+    """The steps of a connection in a second; 0: no limit."""
     message_bytes: int = 4 * 2**20
-    """Bytes of a client's message."""
+    """The bytes of a client's message."""
     reply_bytes: int = 256 * 2**20
-    """Bytes of the observations in one reply."""
+    """The bytes of the observations in one reply."""
 
 
 class Rate:

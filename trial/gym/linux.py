@@ -25,9 +25,9 @@ def die_with_parent() -> None:
 
 
 def limit_memory(megabytes: int) -> None:
-    """Limit the private memory of this process, and of each child, to its present size and `megabytes` more.
+    """Limit the private memory of this process, and of each of its children, to its present size plus `megabytes`.
 
-    By RLIMIT_DATA, which counts private writable mappings since Linux 4.7 (setrlimit(2)).
+    RLIMIT_DATA does so: since Linux 4.7 it counts private writable mappings (setrlimit(2)).
     """
     if not _LINUX:
         return
@@ -40,7 +40,7 @@ def limit_memory(megabytes: int) -> None:
 
 
 def children(pid: int) -> list[int]:
-    """The children of a process (/proc/PID/task/TID/children, proc(5)); empty if the system has no such file."""
+    """Return the children of a process (/proc/PID/task/TID/children, proc(5)); empty if the system has no such file."""
     pids: list[int] = []
     with contextlib.suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):
@@ -50,7 +50,7 @@ def children(pid: int) -> list[int]:
 
 
 def descendants(pid: int) -> list[int]:
-    """The children of a process, their children, and so on."""
+    """Return the children of a process, their children, and so on."""
     pids: list[int] = []
     waiting = [pid]
     while waiting:
@@ -68,7 +68,7 @@ def runs(pid: int) -> bool:
 
 
 def private_megabytes(pid: int) -> float:
-    """The resident memory of a process without its shared pages (/proc/PID/statm); 0 if it has ended."""
+    """Return the resident memory of a process without its shared pages (/proc/PID/statm); 0 if it has ended."""
     try:
         _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
     except (OSError, ValueError):

@@ -32,14 +32,14 @@ def override(func_name: str) -> Callable[[F], F]:
 
 
 def replaced(func_name: str) -> Callable[..., Any] | None:
-    """The function by which the program has replaced this one; None if it has not."""
+    """Return the program's own function in the place of the one named `func_name`; None if it has not replaced that."""
     return _replaced.get(func_name)
 
 
 def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
-    """Make an environment of Gymnasium's registry. `seed` is not used here: the first reset uses it.
+    """Make an environment of Gymnasium's registry. `seed` has no effect here: the first reset uses it.
 
-    An id of gym 0.17 that Gymnasium does not have becomes the newest one (`ids.py`). An id with a module
+    An id of gym 0.17 that Gymnasium does not have is replaced by the newest one (`ids.py`). An id with a module
     (`module:Name-v0`) is refused, since Gymnasium would import that module. Raises EnvironmentNotFound, and
     EnvironmentMalformed with Gymnasium's reason.
     """

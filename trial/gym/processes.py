@@ -58,7 +58,7 @@ def serve_from(
     record: Path | None = None,
     ready: Callable[[], None] = lambda: None,
 ) -> int:
-    """As `serve`, for the connections that `listener` accepts. `ready` is called without the port."""
+    """Serve environments, as `serve` does, to the connections of `listener`. `ready` is called without a port."""
     _allow_files(limits.connections + 2 * WITHOUT_HANDSHAKE)
     control, spawner = _fork_spawner(listener, limits, modules, output=output, record=record)
     with control:
@@ -100,7 +100,7 @@ def _allow_files(count: int) -> None:
 def _fork_spawner(
     listener: ListeningSocket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None
 ) -> tuple[socket.socket, int]:
-    """Start the spawner. Return our end of the socket to it, and its process id."""
+    """Start the spawner. Return this process's end of the socket to it, and the spawner's process id."""
     ours, theirs = socket.socketpair()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -123,7 +123,7 @@ def _fork_spawner(
 
 
 def _is_ready(control: socket.socket) -> bool:
-    """Wait for the spawner's first message. Return False if it has ended instead."""
+    """Wait for the spawner's first message. Return False if the spawner has ended instead."""
     received = bytearray()
     while handover.read_ended(received) is None:
         data = control.recv(4096)

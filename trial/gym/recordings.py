@@ -22,7 +22,7 @@ from trial.recordings.recording import Recording
 
 PROJECT = "gym"
 FLUSH_SECONDS = 1.0
-"""The seconds between two writes to the disk. The steps of that time are lost if the process is killed."""
+"""The seconds between two writes to the disk. If the process is killed, the steps since the last write are lost."""
 
 
 class ConnectionRecorder:
@@ -34,7 +34,7 @@ class ConnectionRecorder:
         self._user = f"{began}-{uuid.uuid4().hex[:12]}"
 
     def record(self, env: Any, env_id: str, seed: int | None) -> Recorded:
-        """Begin a recording. Return the environment as one that is recorded. Raises EnvironmentFailed if it cannot."""
+        """Begin a recording of the environment, and wrap it. Raises EnvironmentFailed if the file cannot be written."""
         server = uuid.uuid4().hex
         step = re.sub("[^A-Za-z0-9_-]", "-", env_id)[:64] or "environment"
         key = f"{recordings_folder(PROJECT, self._user)}{server}/{step}-trial.jsonl.gz"
@@ -59,7 +59,7 @@ class ConnectionRecorder:
 
 
 class Recorded:
-    """An environment whose steps are written into a recording. It has all attributes of the environment."""
+    """Wraps an environment, and writes its steps into a recording. It has all attributes of the environment."""
 
     def __init__(self, env: Any, file: Recording, stamp: dict[str, Any]) -> None:
         self.env = env

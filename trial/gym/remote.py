@@ -22,7 +22,7 @@ Columns = tuple[Any, Any, Any, Any, list[dict[str, Any]]]
 
 
 class _RemoteInstance:
-    """An environment on the server, or a vector, with its description; sends its requests and reads the answers."""
+    """Sends the requests about one environment or vector on the server, and reads the answers."""
 
     def __init__(self, client: GymClient, env_id: str, **params: Any) -> None:
         self.client = client
@@ -85,7 +85,7 @@ class _RemoteInstance:
         self.closer()
 
     def _batch(self, actions: Any, rows: int) -> Any:
-        """The actions, a list or an array of them, as a batch of the layout. Raises CodecError."""
+        """Make a batch of the actions, a list or an array. Raises CodecError."""
         if len(actions) != rows:
             raise CodecError(f"{rows} actions are needed, not {len(actions)}.")
         space = self.action_space
@@ -96,7 +96,7 @@ class _RemoteInstance:
 
 @dataclass(frozen=True)
 class _Maker:
-    """The entry point of a RemoteEnv's spec: makes another RemoteEnv, with a connection of its own."""
+    """Makes another RemoteEnv, with a connection of its own: the entry point in a RemoteEnv's spec."""
 
     url: str
     env_id: str
@@ -272,7 +272,7 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 def _infos(pairs: arrays.Infos, steps: int) -> list[dict[str, Any]]:
-    """The infos of all steps; {} for the steps without one."""
+    """Return an info for every step; {} for those without one."""
     infos: list[dict[str, Any]] = [{} for _ in range(steps)]
     for step, info in pairs:
         infos[step] = info
@@ -280,7 +280,7 @@ def _infos(pairs: arrays.Infos, steps: int) -> list[dict[str, Any]]:
 
 
 def _by_step(space: Any, batch: Any, steps: int, num_envs: int) -> Any:
-    """A batch of the rows of several steps, with a first axis for the steps and a second for the environments."""
+    """Return the rows of several steps as a batch: its first axis is for steps, its second for environments."""
     if isinstance(space, Dict):
         return {key: _by_step(part, batch[key], steps, num_envs) for key, part in space.spaces.items()}
     if isinstance(space, Tuple):

@@ -37,7 +37,7 @@ _HANDSHAKE_BYTES = 16 * 1024  # of a handshake
 _CLOSE_SECONDS = 2.0  # for a client to close its end
 _NO_FILES_SECONDS = 0.05  # to wait if no file can be opened
 WITHOUT_HANDSHAKE = 100
-"""Connections beyond the limit that are accepted, so that their handshakes can be answered with a refusal."""
+"""The connections beyond the limit that are accepted, so that their handshakes are answered with a refusal."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -45,10 +45,10 @@ class ListeningSocket(Protocol):
     """A listening socket, or an object that accepts connections in another way."""
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection. Raises OSError if there is none, and KeyboardInterrupt if there will be no more."""
+        """Accept the next connection. Raises OSError if none waits, KeyboardInterrupt if there will be no more."""
 
     def fileno(self) -> int:
-        """The descriptor that becomes readable when there is a connection."""
+        """Return the descriptor that becomes readable when there is a connection."""
 
     def setblocking(self, flag: bool, /) -> None:
         """Set whether `accept` waits for a connection."""
@@ -61,10 +61,10 @@ class ListeningSocket(Protocol):
 class _Connection:
     socket: socket.socket
     deadline: float | None
-    """When the connection is dropped: if its handshake, or the client's close, has not come by then; None: never."""
+    """The time by which its handshake, or the client's close, must have come, or it is dropped; None: no limit."""
     received: bytes = b""
     form: str = ""
-    """The name of its form; empty until the handshake is done."""
+    """The name of the form of its messages; empty until the handshake is done."""
     number: int = 0
     """Its number for the spawner; 0 if it has no worker."""
     closing: bool = False
@@ -87,7 +87,7 @@ class GymServer:
         self._from_spawner = bytearray()  # the beginning of a message that is not complete yet
 
     def run(self) -> None:
-        """Serve until a signal raises KeyboardInterrupt. Raises that, and EOFError if the spawner has ended."""
+        """Serve until a signal raises KeyboardInterrupt, which passes on. Raises EOFError if the spawner has ended."""
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._control, selectors.EVENT_READ, self._listen_to_spawner)
@@ -113,7 +113,7 @@ class GymServer:
                     self._drop(connection)
 
     def close(self) -> None:
-        """Close all connections, and tell the clients that the server ends."""
+        """Tell all clients that the server ends, and close their connections."""
         for connection in list(self._connections):
             if connection.form and not connection.closing:
                 self._send_close(connection, 1001, "The server ends.")
@@ -121,7 +121,7 @@ class GymServer:
         self._selector.close()
 
     def _timed(self) -> list[_Connection]:
-        """The connections with a deadline."""
+        """Return the connections with a deadline."""
         return [connection for connection in self._connections if connection.deadline is not None]
 
     # ---- connections without a worker
@@ -189,7 +189,7 @@ class GymServer:
             _keep_alive(connection.socket)
 
     def _refused(self, request: Request) -> Response | None:
-        """The HTTP answer that refuses the request; None if it is a handshake, and the client may connect."""
+        """Return the HTTP answer that refuses the request; None if it is a handshake, and the client may connect."""
         path, origin = urlsplit(request.path).path, request.headers.get("Origin")
         if "websocket" not in request.headers.get("Upgrade", "").lower():
             return _response(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
@@ -208,7 +208,7 @@ class GymServer:
         return None
 
     def _between_requests(self, connection: _Connection) -> None:
-        """Answer pings and closes. At the first data frame, hand the connection over to a worker."""
+        """Answer pings and closes. At the first data frame, let the spawner start a worker for the connection."""
         while len(connection.received) >= 2:
             first, second = connection.received[:2]
             opcode, length = first & 0x0F, second & 0x7F
@@ -298,7 +298,7 @@ class GymServer:
 
 
 def _close_answer(payload: bytes) -> bytes:
-    """The payload that answers a client's close: the same, or the code for a malformed one (RFC 6455, 7.4.1)."""
+    """Return the payload that answers a client's close: the same, or a code for a malformed one (RFC 6455, 7.4.1)."""
     try:
         Close.parse(payload)
     except ProtocolError:
@@ -309,12 +309,12 @@ def _close_answer(payload: bytes) -> bytes:
 
 
 def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Our subprotocol if the client offers it; None for Gymie's clients and others that speak JSON."""
+    """Return SUBPROTOCOL if the client offers it; None for Gymie's clients and others that speak JSON."""
     return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in offered else None
 
 
 def _form(request: Request) -> str | None:
-    """The form that the address asks for, by default Gymie's; None if there is no such form."""
+    """Return the name of the form that the address asks for, by default Gymie's; None if there is no such form."""
     asked = parse_qs(urlsplit(request.path).query).get("form", [FORMS[0]])[0]
     return asked if asked in FORMS else None
 

@@ -47,9 +47,9 @@ class HeldEnvironment:
         self.instance_id = instance_id
         self.handle = handle
         self.decode = guarded(values.decoder, instance.env.action_space, action=True)
-        """Reads an action from JSON data. Raises CodecError."""
+        """A function that reads an action from JSON data. It raises CodecError."""
         self.bytes = _bytes(instance.single_observation_space) * instance.size
-        """The bytes of the observations of one step, without parts whose size varies."""
+        """The size of one step's observations in bytes, without parts whose size varies."""
         self._layouts: tuple[ArrayLayout, ArrayLayout] | None = None
 
     @property
@@ -90,7 +90,7 @@ class GymSession:
         }
 
     def answer(self, text: str) -> str:
-        """The reply to a request in JSON. Raises GymError."""
+        """Carry out a request in JSON, and return the reply. Raises GymError."""
         try:
             message = _read(text)
         except (ValueError, RecursionError):
@@ -115,7 +115,7 @@ class GymSession:
             raise EnvironmentFailed(str(error)) from error
 
     def answer_arrays(self, data: bytes) -> bytes:
-        """The reply to a binary request. Raises GymError."""
+        """Carry out a binary request, and return the reply. Raises GymError."""
         if not self.form.arrays:
             raise InvalidMessage(f"Binary messages are for the subprotocol {arrays.SUBPROTOCOL}.")
         try:
@@ -178,7 +178,7 @@ class GymSession:
         autoreset_mode: str = AutoresetMode.NEXT_STEP.value,
         **options: Any,
     ) -> str:
-        """Make an environment, or a vector of `num_envs`. Answer its id. `options` go to `gymnasium.make`."""
+        """Make an environment, or a vector of `num_envs`, and answer with its id. `options` go to `gymnasium.make`."""
         _check(type(env_id) is str, "env_id must be a text")
         _check(_is_seed(seed), "seed must be a whole number of 0 or more")
         _check(num_envs is None or (type(num_envs) is int and num_envs > 0), "num_envs must be 1 or more")
@@ -214,7 +214,7 @@ class GymSession:
         return self._quick_answer(step) or values.to_text(self._shaped(step, instance))
 
     def step_many(self, instance_id: str, actions: Any) -> str:
-        """Take a step for each action; after the end of an episode begin the next one. Answer five lists."""
+        """Take a step for each action, and answer with five lists. After the end of an episode, begin the next one."""
         held = self._find(instance_id)
         _check(isinstance(actions, list), "actions must be a list")
         self._allow(held, len(actions))
@@ -228,7 +228,7 @@ class GymSession:
         return values.to_text(columns)
 
     def reset(self, instance_id: str, seed: Any = None, options: Any = None) -> str:
-        """Begin an episode. Answer its first observation, or with `form.five` its first observation and info."""
+        """Begin an episode. Answer with its first observation; if `form.five`, with that and its info."""
         held = self._find(instance_id)
         _check(
             _is_seed(seed) or (isinstance(seed, list) and held.instance.num_envs > 0 and all(map(_is_seed, seed))),
@@ -246,19 +246,19 @@ class GymSession:
         return values.to_text(True)
 
     def observation_space(self, instance_id: str) -> str:
-        """Answer the description of the observation space; of a vector, that of all its environments together."""
+        """Answer with the description of the observation space; of a vector, that of all its environments together."""
         return values.to_text(spaces.describe(self._find(instance_id).instance.env.observation_space))
 
     def action_space(self, instance_id: str) -> str:
-        """Answer the description of the action space; of a vector, that of all its environments together."""
+        """Answer with the description of the action space; of a vector, that of all its environments together."""
         return values.to_text(spaces.describe(self._find(instance_id).instance.env.action_space))
 
     def action_sample(self, instance_id: str) -> str:
-        """Answer a random action of the action space."""
+        """Answer with a random action of the action space."""
         return values.to_text(guarded(self._find(instance_id).instance.env.action_space.sample))
 
     def render(self, instance_id: str) -> str:
-        """Answer what the environment's `render` returns, a picture as PNG."""
+        """Answer with what the environment's `render` returns; a picture as PNG."""
         return values.to_text(values.picture(self._find(instance_id).instance.render()))
 
     # ---- shared by these methods
@@ -287,7 +287,7 @@ class GymSession:
             raise WrongAction(json.dumps(action), str(error)) from None
 
     def _quick_answer(self, step: InstanceStep) -> str:
-        """The answer to a usual step, with an array of numbers and no info, made quickly; empty for any other step."""
+        """Write the answer to a usual step (an array of numbers, no info) in a faster way. Empty for any other step."""
         observation, reward, terminated, truncated, info = step
         if info or type(observation) is not np.ndarray or observation.dtype.kind not in "fiu":
             return ""
@@ -299,7 +299,7 @@ class GymSession:
         return numbers + (_ENDS_OF_FIVE[terminated] if self.form.five else _ENDS[terminated])
 
     def _shaped(self, step: InstanceStep, instance: Instance) -> list[Any]:
-        """The step's results as the form of the connection has them."""
+        """Return the step's results in the connection's form."""
         observation, reward, terminated, truncated, info = step
         if type(observation) is np.ndarray and not self.form.arrays:
             observation = observation.tolist()
@@ -316,7 +316,7 @@ class GymSession:
 
 
 def _description(held: HeldEnvironment) -> dict[str, Any]:
-    """The answer to `make` in the form of arrays."""
+    """Build the answer to `make` for the form `arrays`: a description of the environment."""
     instance = held.instance
     return {
         "instance_id": held.instance_id,
@@ -377,7 +377,7 @@ def _vector_steps(held: HeldEnvironment, batch: Any, count: int) -> arrays.StepR
 
 
 def _together(instance: Instance, actions: Sequence[Any]) -> Any:
-    """The actions of a vector's environments as one action of the vector."""
+    """Join the actions of a vector's environments to one action of the vector."""
     if isinstance(instance.env.action_space, Tuple):
         return tuple(actions)
     empty: Any = create_empty_array(instance.single_action_space, instance.size)
@@ -397,7 +397,7 @@ def _spec(env: Any) -> Any:
 
 
 def _numbers(rewards: list[Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The rewards as an array. Raises EnvironmentFailed if one is no number."""
+    """Convert the rewards to an array. Raises EnvironmentFailed if one is no number."""
     try:
         array = np.array(rewards, np.float64)
         if array.ndim == 1 and not np.isnan(array).any():  # NumPy turns None into NaN
@@ -417,12 +417,12 @@ def _is_seed(seed: Any) -> bool:
 
 
 def _truth(flag: Any) -> Any:
-    """The flag as a bool; those of a vector stay an array."""
+    """Convert a flag to a bool. The flags of a vector stay an array."""
     return flag if isinstance(flag, np.ndarray) else bool(flag)
 
 
 def _bytes(space: Any) -> int:
-    """The bytes of one observation, without parts whose size varies."""
+    """Return the size of one observation in bytes, without parts whose size varies."""
     shape, dtype = getattr(space, "shape", None), getattr(space, "dtype", None)
     if shape is None or dtype is None:
         inner = getattr(space, "spaces", None)

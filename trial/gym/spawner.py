@@ -39,14 +39,14 @@ _AWAY, _FAILED = 1001, 1011  # close codes
 
 @dataclass(slots=True)
 class _Watched:
-    """A worker, by the number of its connection and its slot in the shared memory."""
+    """A worker: the number of its connection, its slot in the shared memory, and what the spawner has done to it."""
 
     number: int
     slot: int
     state: WorkerState
     interrupted: bool = False
     verdict: tuple[int, str] | None = None
-    """The close code and the sentence for its client, if the spawner has killed it."""
+    """The close code and the sentence for its client if the spawner has killed it, else None."""
 
 
 class Spawner:
@@ -122,7 +122,7 @@ class Spawner:
         self._workers[pid] = _Watched(start.number, slot, state)
 
     def _become_worker(self, start: NewConnection, state: WorkerState, wakeup: Wakeup) -> None:
-        """Be the worker, in the new process. Does not return."""
+        """Be the worker, in the new process. This call does not return."""
         status = 1
         try:
             wakeup.close()
@@ -136,7 +136,7 @@ class Spawner:
             os._exit(status)
 
     def _reap(self) -> None:
-        """Collect the processes that have ended, and kill the processes that they have left."""
+        """Collect processes that have ended, and kill the processes that these have left."""
         for _ in range(_ROUNDS):
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -165,7 +165,7 @@ class Spawner:
         self._tell(ended.number, code, sentence)
 
     def _strays(self) -> list[int]:
-        """The processes that have lost their worker: they are children of the spawner now."""
+        """Return the ids of processes whose worker has ended: they are children of the spawner now."""
         children = linux.children(os.getpid())
         return [pid for pid in children if pid not in self._workers]
 
@@ -209,7 +209,7 @@ class Spawner:
             _kill_worker(pid, worker, _FAILED, sentence)
 
     def _tell(self, number: int, code: int, sentence: str) -> None:
-        """Tell the server, but do not wait for it: it may be waiting until this process takes a connection."""
+        """Tell the server, without waiting for it: it may be waiting until this process takes a connection."""
         self._unsent += Ended(number, code, sentence).packed()
         self._send_unsent()
 
@@ -241,7 +241,7 @@ def _how(status: int) -> str:
 
 
 def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None) -> int:
-    """Be the spawner. Return the exit status. First import `modules`, which register environments."""
+    """Import `modules`, which register environments, then be the spawner. Return the exit status."""
     sys.path.insert(0, os.getcwd())
     try:
         for module in modules:

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from trial.gym.spaces import CodecError, Space
 
 Decode = Callable[[Any], Any]
-"""Reads a value of a space from JSON data. Raises CodecError."""
+"""A function that reads a value of a space from JSON data. It raises CodecError."""
 
 MAX_DEPTH = 100
 """The most levels of lists and objects in a value that is sent."""
@@ -49,7 +49,7 @@ def from_text(text: str | bytes) -> Any:
 
 
 def plain(value: Any, depth: int = 0) -> Any:
-    """`value` as lists, dicts with texts as keys, and JSON's other types; below MAX_DEPTH, the name of its class."""
+    """Convert `value` to JSON's types, with texts as the keys of dicts; below MAX_DEPTH, to the name of its class."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if depth > MAX_DEPTH:
@@ -89,7 +89,7 @@ _strict = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_simp
 
 
 def decoder(space: Space, *, action: bool = False) -> Decode:
-    """Make a function that reads a value of `space` from JSON data. Raises CodecError if it knows no such space.
+    """Make a function that reads a value of `space` from JSON data. Raises CodecError for an unknown class of space.
 
     The function checks the value's shape and type, and the range of the dtype, and raises CodecError. An `action` must
     also lie in the space; but the finite numbers of a Box of floats may lie beyond its bounds, since many environments
@@ -156,14 +156,14 @@ def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
 
 
 def _without_numbers(array: np.ndarray[Any, Any], shape: tuple[int, ...], batch: bool) -> np.ndarray[Any, Any]:
-    """An array without numbers in the shape that is needed. JSON's lists have no axes after an empty one."""
+    """Give an array without numbers the shape that is needed: JSON's lists have no axes after an empty one."""
     whole = (len(array), *shape) if batch else shape
     known = whole[: whole.index(0) + 1] if 0 in whole else whole
     return array.reshape(whole) if array.shape == known else array
 
 
 def _array(data: Any, nan: bool) -> np.ndarray[Any, Any]:
-    """The array of a number or lists of numbers. With `nan`, None stands for NaN. Raises CodecError."""
+    """Make an array of a number or lists of numbers. With `nan`, None stands for NaN. Raises CodecError."""
     try:
         array = np.asarray(data)
         if array.dtype == object and nan:
@@ -324,7 +324,7 @@ def _shape(shape: tuple[int, ...], batch: bool) -> str:
 
 
 def picture(rendered: Any, depth: int = 0) -> Any:
-    """The result of `render()` as JSON data: a picture as `{"png": base64, "shape"}`, a text or None as it is.
+    """Convert the result of `render()` to JSON data: a picture to `{"png": base64, "shape"}`; a text or None stays.
 
     A picture is an array of bytes: height x width, or height x width x 1, 3 or 4. Any other array becomes
     `{"array": lists, "dtype": name, "shape"}`. A list may have all of these. Raises CodecError for anything else.
@@ -347,7 +347,7 @@ def picture(rendered: Any, depth: int = 0) -> Any:
 
 
 def rendered(data: Any) -> Any:
-    """The result of `render()`, from the data that `picture` has made. Raises CodecError."""
+    """Convert the data that `picture` has made back to the result of `render()`. Raises CodecError."""
     if data is None or isinstance(data, str):
         return data
     if isinstance(data, list):

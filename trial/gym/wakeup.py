@@ -11,7 +11,7 @@ class Wakeup:
     """Ends a wait in the main thread at a signal, also if the signal comes just before, or reaches another thread.
 
     Python runs a signal's handler between two bytecode instructions of the main thread, so not while a system call
-    waits. So wait for this object too, as for a socket, and `clear` it once it is readable.
+    waits. So wait for this object, too, as for a socket, and `clear` it once it is readable.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class Wakeup:
         self._before = signal.set_wakeup_fd(self._wake.fileno(), warn_on_full_buffer=False)
 
     def fileno(self) -> int:
-        """The descriptor to wait for."""
+        """Return the descriptor that becomes readable at a signal."""
         return self._awake.fileno()
 
     def clear(self) -> None:
@@ -30,7 +30,7 @@ class Wakeup:
             self._awake.recv(4096)
 
     def close(self) -> None:
-        """Restore the wakeup descriptor of before, and close the sockets."""
+        """Restore the earlier wakeup descriptor, and close the sockets."""
         signal.set_wakeup_fd(self._before)
         self._awake.close()
         self._wake.close()

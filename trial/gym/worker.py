@@ -38,7 +38,7 @@ _CLOSE_SECONDS = 2  # in which a client must answer a close
 
 
 class WorkerState:
-    """The time since which a worker is busy; negated, since which it is idle. The spawner reads it."""
+    """Holds the time since which a worker is busy, or negated the time since which it is idle. The spawner reads it."""
 
     def __init__(self, memory: Any, at: int) -> None:
         self._memory = memory
@@ -46,20 +46,20 @@ class WorkerState:
         self.rest()
 
     def work(self) -> None:
-        """A request begins."""
+        """Note that a request begins."""
         self._memory[self._at] = time.monotonic()
 
     def rest(self) -> None:
-        """A request has been answered."""
+        """Note that a request has been answered."""
         self._memory[self._at] = -time.monotonic()
 
     def busy(self, now: float) -> float:
-        """The seconds since the present request began; 0 if there is none."""
+        """Return the seconds since the present request began; 0 if there is none."""
         since: float = self._memory[self._at]
         return now - since if since > 0 else 0.0
 
     def idle(self, now: float) -> float:
-        """The seconds since the last request was answered; 0 during a request."""
+        """Return the seconds since the last request was answered; 0 during a request."""
         since: float = self._memory[self._at]
         return now + since if since < 0 else 0.0
 
@@ -116,7 +116,7 @@ class ConnectionWorker:
         return data
 
     def _receive(self, data: bytes) -> None:
-        """Handle the bytes that were read: here requests of one frame, by `websockets` all other frames."""
+        """Handle bytes that were read: requests of one frame here, all other frames by `websockets`."""
         if self._incomplete:
             data = self._incomplete + data
         while data:

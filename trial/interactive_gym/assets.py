@@ -15,7 +15,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 def asset_files(
     config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The files of `assets/`, by their paths in it. `remark` gets a sentence about each image that is left out."""
+    """Return the files of `assets/` by their paths. `remark` is called with a sentence on each image left out."""
     files: dict[str, bytes] = {}
     given = "assets_dir" in config.given
     folder = locate(config.assets_dir)
@@ -57,7 +57,7 @@ def _add(
 
 
 def _single(atlas: bytes, name: str, remark: Callable[[str], None]) -> bytes:
-    """The atlas for one image. Of Phaser's multiatlas (`textures`) only the first image is used."""
+    """Return an atlas of one image. Of Phaser's multiatlas (`textures`) only the first image is used."""
     try:
         textures = json.loads(atlas).get("textures")
     except (ValueError, AttributeError):
@@ -86,6 +86,6 @@ def _animate(config: RemoteConfig, files: dict[str, bytes], remark: Callable[[st
 
 
 def _plain(spec: Any) -> Mapping[str, Any]:
-    """The fields of a description by name."""
+    """Return the fields of a description of images by name."""
     fields: Mapping[str, Any] = spec.as_dict() if hasattr(spec, "as_dict") else spec
     return fields

@@ -29,22 +29,22 @@ class GameCallback:
         """Take any options, as Interactive Gym does."""
 
     def on_episode_start(self, remote_game: Any) -> Any:
-        """An episode has begun."""
+        """Do nothing. Called when an episode has begun."""
 
     def on_episode_end(self, remote_game: Any) -> Any:
-        """An episode has ended."""
+        """Do nothing. Called when an episode has ended."""
 
     def on_game_tick_start(self, remote_game: Any) -> Any:
-        """The next step will be taken."""
+        """Do nothing. Called before each step."""
 
     def on_game_tick_end(self, remote_game: Any) -> Any:
-        """A step has been taken."""
+        """Do nothing. Called after each step."""
 
     def on_graphics_start(self, remote_game: Any) -> Any:
-        """A step has been taken, and `on_game_tick_end` has been called."""
+        """Do nothing. Called after each step, after `on_game_tick_end`."""
 
     def on_graphics_end(self, remote_game: Any) -> Any:
-        """A step has been taken, and `on_graphics_start` has been called."""
+        """Do nothing. Called after each step, after `on_graphics_start`."""
 
     def on_waitroom_start(self, remote_game: Any) -> Any:
         """Never called."""
@@ -59,7 +59,7 @@ class GameCallback:
         """Never called."""
 
     def on_game_end(self, remote_game: Any) -> Any:
-        """The trial is over, in the middle of an episode."""
+        """Do nothing. Called when the trial ends in the middle of an episode."""
 
 
 class MultiCallback(GameCallback):

@@ -8,6 +8,6 @@ import numpy as np
 
 
 def sample_action_via_softmax(logits: Any) -> int:
-    """The number of a random action, with the probabilities of the softmax of `logits`."""
+    """Draw the number of an action, with the probabilities of the softmax of `logits`."""
     weights = np.exp(np.asarray(logits, float).reshape(-1) - np.max(logits))
     return int(np.random.choice(len(weights), p=weights / weights.sum()))

@@ -31,9 +31,9 @@ class Look:
     counts: Mapping[Any, int]
     """The number of actions by player."""
     spaces: Mapping[Any, Any]
-    """With several players: the observation space of each, None if it is not known."""
+    """With several players: the observation space of each player; None if it is not known."""
     observations: Mapping[Any, Any]
-    """With several players: the first observation of each that has one."""
+    """With several players: the first observation of each player who has one."""
     human: Any
     """The first human player."""
     joined_as_sorted: bool
@@ -75,14 +75,14 @@ def look(config: RemoteConfig) -> Look:
 
 
 def is_file(config: RemoteConfig, plays: Any) -> bool:
-    """Whether a policy is an ONNX file that Hippodrome can play, since the experiment has no functions of its own."""
+    """Whether `plays` is an ONNX file that Hippodrome itself plays, since the experiment has no functions for that."""
     ours = (onnx_inference_utils.load_onnx_policy_fn, onnx_inference_utils.onnx_model_inference_fn)
     functions = (config.load_policy_fn, config.policy_inference_fn)
     return isinstance(plays, str) and plays.endswith(".onnx") and functions in (ours, (None, None))
 
 
 def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> list[str]:
-    """The actions' names: the constants of the experiment's module (`LEFT = 1`), if each action has exactly one.
+    """Name the actions by the constants of the experiment's module (`LEFT = 1`), if each action has exactly one.
 
     Otherwise the actions' numbers are their names.
     """
@@ -98,7 +98,7 @@ def names_of(config: RemoteConfig, actions: int, module: Mapping[str, Any]) -> l
 
 
 def labels_of(names: Iterable[str], module: Mapping[str, Any]) -> dict[str, str]:
-    """The labels that participants read, of actions whose constants have several words: `Pick up` for `PickUp`."""
+    """Return the labels of actions whose constants have several words, for participants: `Pick up` for `PickUp`."""
     labels = {}
     for name in names:
         constant = next((key for key, value in module.items() if type(value) is int and key.lower() == name), name)
@@ -161,7 +161,7 @@ def _check_players(players: tuple[Any, ...], observation: Any) -> None:
 
 
 def _count(env: Any, player: Any, *, several: bool) -> int:
-    """The number of a player's actions. Raises Unplayable if the environment does not say it."""
+    """Return the number of a player's actions. Raises Unplayable if the environment does not say it."""
     space = env.action_space(player) if several else space_of(env, "action_space", player)
     count = getattr(space, "n", None)
     if count is None:

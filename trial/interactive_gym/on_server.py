@@ -16,23 +16,23 @@ _loading = False
 
 
 def is_loading() -> bool:
-    """Whether an experiment's file is being loaded here. Then `server_app.run` does nothing."""
+    """Whether `load` is importing an experiment's file. Meanwhile `server_app.run` does nothing."""
     return _loading
 
 
 class Experiment:
-    """An experiment in its project's folder."""
+    """An experiment in the folder of the project that was made of it."""
 
     def __init__(self, folder: Path, config: RemoteConfig) -> None:
         self._config = config
         self._locate = playing.located(folder)
 
     def agent(self) -> type:
-        """The class `Agent` of the experiment."""
+        """Make the class `Agent` of the experiment."""
         return playing.agent_class(self._config)
 
     def policy(self, player: Any) -> type:
-        """The class of the policy that plays this player."""
+        """Make the class of the policy that plays this player."""
         return playing.policy_class(self._config, player, self._locate)
 
 

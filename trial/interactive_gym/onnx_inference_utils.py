@@ -28,7 +28,7 @@ def load_onnx_policy_fn(onnx_model_path: str) -> str:
 
 
 def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
-    """The model's outputs for these inputs. Its other inputs, such as recurrent states, get zeros."""
+    """Run the model, and return its outputs. Inputs that `input_dict` lacks, such as recurrent states, get zeros."""
     session = ORT_SESSIONS[model_path]
     feeds = {
         each.name: input_dict[each.name] if each.name in input_dict else _zeros(each) for each in session.get_inputs()
@@ -37,14 +37,14 @@ def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
 
 
 def _zeros(port: Any) -> Any:
-    """The value of an input without a value: zeros, but 1 for a `seq_lens` with at most one axis."""
+    """Return the value of an input that was given none: zeros, but 1 for a `seq_lens` with at most one axis."""
     shape = [size if isinstance(size, int) else 1 for size in port.shape]
     fill = 1 if port.name == "seq_lens" and len(shape) <= 1 else 0
     return np.full(shape, fill, _TYPES.get(port.type, np.float32))
 
 
 def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
-    """An action drawn by the model's output for an observation. The parts of a dictionary are joined in their order."""
+    """Draw an action by the model's output for an observation. A dictionary's parts are joined in their order."""
     if isinstance(observation, Mapping):
         observation = np.hstack([np.asarray(part).reshape(-1) for part in observation.values()])
     inputs = {"obs": np.asarray(observation, np.float32).reshape(1, -1)}

@@ -21,16 +21,16 @@ class Option:
     name: str
     method: str
     default: Any
-    """The default value, or the type of which an empty value is the default."""
+    """The default value; a type such as `list` stands for an empty value of this type."""
     becomes: str
     """The option's meaning here, for the table in docs/interactive-gym.md."""
     ignored: str = ""
     """The reason, if the option has no effect here. It is printed if an experiment sets the option."""
     of_several: bool = False
-    """Whether the option has an effect if several players are human. Then `ignored` is about other experiments alone."""
+    """Whether the option has an effect if several players are human. Then `ignored` is about other experiments."""
 
     def new_default(self) -> Any:
-        """The default; a list or a dictionary is a new one."""
+        """Return the default value. A list or a dictionary is a new one at each call."""
         return self.default() if isinstance(self.default, type) else self.default
 
 
@@ -118,12 +118,12 @@ METHODS = tuple(dict.fromkeys(option.method for option in OPTIONS if option.meth
 
 
 def of_method(method: str) -> tuple[str, ...]:
-    """The names of the options that a method sets, in the order of its parameters."""
+    """Return the names of the options that a method sets, in the order of its parameters."""
     return tuple(option.name for option in OPTIONS if option.method == method)
 
 
 def table() -> str:
-    """The options as a table in Markdown."""
+    """Return the options as a table in Markdown."""
     rows = ["| option of `RemoteConfig` | set by | what becomes of it |", "|---|---|---|"]
     for option in OPTIONS:
         why = f": {option.ignored}" if option.ignored else ""
@@ -144,7 +144,7 @@ _ASSERTIONS: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 
 def problem_of(name: str, value: Any) -> str | None:
-    """Why Interactive Gym refuses this value of the option, as a sentence; None if it does not."""
+    """Return a sentence on why Interactive Gym refuses this value of the option; None if it does not."""
     is_allowed, rule = _ASSERTIONS.get(name, (lambda _: True, ""))
     return None if is_allowed(value) else f"{name} {rule}, not {value!r}"
 

@@ -17,17 +17,17 @@ _TAG = re.compile(r"<[A-Za-z/!]")
 _JINJA = re.compile(r"\{[{%#]")
 
 Locate = Callable[[str], Path | None]
-"""Finds a file that an option names. Returns None if there is none."""
+"""A function that finds a file that an option names, and returns None if there is none."""
 
 
 def welcome(config: RemoteConfig) -> str:
-    """The first page."""
+    """Make the first page of the study."""
     heading = config.welcome_header_text or config.page_title
     return _page(heading, config.welcome_text, plain="<p>Press the button to begin.</p>")
 
 
 def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
-    """The pages before the game, and those after it, by their names, in their order."""
+    """Make the pages before the game and those after it. Return both by the pages' names, in their order."""
     before: list[Any] = getattr(config, "before", [])
     after: list[Any] = getattr(config, "after", [])
     if not before and not after:
@@ -38,7 +38,7 @@ def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def _name(where: str, number: int, scene: Any) -> str:
-    """The name of a scene's page. It begins with the scene's id, if that can be part of a name."""
+    """Return the name of a scene's page. It begins with the scene's id, if that can be part of a name."""
     name = str(scene.scene_id or "")
     fits = re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name) and name not in ("game", "instructions", "between")
     return f"{name}_{where}_{number}" if fits else f"{where}_{number}"
@@ -55,7 +55,7 @@ def _static(scene: Any) -> str:
 
 
 def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, remark: Callable[[str], None]) -> str:
-    """The page with the instructions; empty if the experiment has none. `human` is the first human player."""
+    """Make the page with the instructions; empty if the experiment has none. `human` is the first human player."""
     parts = []
     if config.instructions_html_file is not None:
         path = locate(config.instructions_html_file)
@@ -79,7 +79,10 @@ def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, re
 
 
 def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
-    """The page between two episodes; empty if there is none. A `reset_timeout` has no effect then: that is a remark."""
+    """Make the page between two episodes; empty if there is none.
+
+    `remark` is called if `reset_timeout`, which has no effect beside a page, is set, too.
+    """
     if not (config.between_episode_header or config.between_episode_text):
         return ""
     if config.reset_timeout != RemoteConfig().reset_timeout:
@@ -88,7 +91,7 @@ def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
 
 
 def final(config: RemoteConfig) -> str:
-    """The last page, with a link if the experiment has an address for it. Unmatched participants get another text."""
+    """Make the last page, with a link if the experiment has an address. Unmatched participants get another text."""
     page = _page(config.final_page_header_text or "Thank you!", config.final_page_text, plain="<p>This is the end.</p>")
     page += _redirect(config, config.experiment_end_redirect_url or config.end_game_redirect_url)
     if len(humans_of(config)) == 1:
@@ -99,7 +102,7 @@ def final(config: RemoteConfig) -> str:
 
 
 def _redirect(config: RemoteConfig, address: str | None) -> str:
-    """The link to this address, and the script that follows it after `redirect_timeout`; empty without an address."""
+    """Return a link to this address, and a script that opens it after `redirect_timeout`; empty without an address."""
     if not address:
         return ""
     appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect
@@ -112,13 +115,13 @@ def _redirect(config: RemoteConfig, address: str | None) -> str:
 
 
 def _onward(address: str, appended: bool) -> str:
-    """A link to another site. If `appended`, the participant's id stands at the end of its address."""
+    """Make a link to another site. If `appended`, its address ends in the participant's id."""
     user_id = "{{ participant.userId|urlencode }}" if appended else ""
     return f'<p><a id="onward" href="{raw(html.escape(address, quote=True))}{user_id}">Go on</a></p>\n'
 
 
 def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:
-    """Add the files that the page links to `files`, beside the page. Return the page with links to them there."""
+    """Add the files to which the page links to `files`, beside the page. Return the page with links to their places."""
 
     def beside(link: re.Match[str]) -> str:
         path = locate(link["path"])
@@ -131,12 +134,12 @@ def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:
 
 
 def raw(text: str) -> str:
-    """The text in a form that a template shows unchanged."""
+    """Write the text in a form that a template shows unchanged."""
     return "{% raw %}" + text + "{% endraw %}" if _JINJA.search(text) else text
 
 
 def as_html(text: str) -> str:
-    """HTML as it is; plain text in paragraphs."""
+    """Put plain text into paragraphs; return HTML as it is."""
     if _TAG.search(text):
         return text
     return "\n".join(f"<p>{html.escape(part.strip(), quote=False)}</p>" for part in text.split("\n\n") if part.strip())
@@ -153,5 +156,5 @@ def _has_heading(parts: Iterable[str]) -> bool:
 
 
 def quoted(text: str) -> str:
-    """The text as a literal of Python, which is one of JSON too."""
+    """Write the text as a literal of Python, which is one of JSON, too."""
     return json.dumps(text, ensure_ascii=False)

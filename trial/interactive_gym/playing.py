@@ -21,7 +21,7 @@ class Unplayable(ValueError):
 
 
 class Several:
-    """An environment with several players, with the attributes by which a PettingZoo `ParallelEnv` describes them."""
+    """Wraps an environment with several players: adds the attributes by which a PettingZoo `ParallelEnv` names them."""
 
     def __init__(self, env: Any, players: Iterable[Any]) -> None:
         self.env = env
@@ -33,16 +33,16 @@ class Several:
         return getattr(self.env, "unwrapped", self.env)
 
     def action_space(self, player: Any) -> Any:
-        """The space of a player's actions; None if it is not known."""
+        """Return the space of a player's actions; None if it is not known."""
         return space_of(self.env, "action_space", player)
 
     def observation_space(self, player: Any) -> Any:
-        """The space of a player's observations; None if it is not known."""
+        """Return the space of a player's observations; None if it is not known."""
         return space_of(self.env, "observation_space", player)
 
 
 def space_of(env: Any, name: str, player: Any) -> Any:
-    """A player's space, by a method or a map by player, or the one of all players; None if it is not known."""
+    """Return a player's space, by a method, a map by player, or the space of all players; None if it is not known."""
     for attribute in (getattr(env, name, None), getattr(env, f"{name}s", None)):
         if callable(attribute) and not hasattr(attribute, "sample"):
             try:
@@ -60,14 +60,14 @@ def space_of(env: Any, name: str, player: Any) -> Any:
 
 
 def mapping_of(config: RemoteConfig) -> dict[Any, Any]:
-    """`policy_mapping`. If it is empty, the one player is human: `human_id`, or else player_0."""
+    """Return `policy_mapping`. If it is empty, the only player is human: `human_id`, or else player_0."""
     if config.policy_mapping:
         return dict(config.policy_mapping)
     return {"player_0" if config.human_id is None else config.human_id: PolicyTypes.Human}
 
 
 def humans_of(config: RemoteConfig) -> list[Any]:
-    """The players that participants play."""
+    """Return the players that participants play."""
     return [player for player, plays in mapping_of(config).items() if plays == PolicyTypes.Human]
 
 
@@ -169,20 +169,20 @@ class ListeningAgent(ExperimentAgent):
     """
 
     def on_episode_start(self, session: Any) -> Any:
-        """The environment has been reset."""
+        """Call the experiment's `on_episode_start`, and `on_game_tick_start` for the first step."""
         self._tell(session, "on_episode_start", "on_game_tick_start")
 
     def on_tick(self, session: Any) -> Any:
-        """A step has been taken."""
+        """Call the experiment's callbacks of a step, and `on_game_tick_start` for the next one."""
         more = () if self._game.over else ("on_game_tick_start",)
         self._tell(session, "on_game_tick_end", "on_graphics_start", "on_graphics_end", *more)
 
     def on_episode_end(self, session: Any) -> Any:
-        """The episode is over."""
+        """Call the experiment's `on_episode_end`."""
         self._tell(session, "on_episode_end")
 
     def on_session_end(self, session: Any) -> Any:
-        """The trial is over. Interactive Gym calls `on_game_end` only if a game ends in the middle of an episode."""
+        """Call the experiment's `on_game_end` if the game ends in the middle of an episode, as Interactive Gym does."""
         if not self._game.over:
             self._tell(session, "on_game_end")
 
@@ -208,7 +208,7 @@ class ListeningAgent(ExperimentAgent):
 
 
 def agent_class(config: RemoteConfig) -> type:
-    """The class `Agent` of the project's agent.py."""
+    """Make the class `Agent` for the project's agent.py."""
     base = ExperimentAgent if config.callback is None else ListeningAgent
 
     class Agent(base):  # type: ignore[misc, valid-type]
@@ -221,7 +221,7 @@ def agent_class(config: RemoteConfig) -> type:
 
 
 def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]) -> type:
-    """The class of agent.py that plays this player by the experiment's functions.
+    """Make a class for agent.py that plays this player by the experiment's functions.
 
     `locate` returns the path of a policy's file, if its name is that of a file; else it returns the name.
     """
@@ -234,7 +234,7 @@ def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]
             self._policy = plays if config.load_policy_fn is None else config.load_policy_fn(plays)
 
         def act(self, observation: Any, _info: Any) -> int:
-            """The action that the experiment's function chooses."""
+            """Choose an action by the experiment's function."""
             if config.policy_inference_fn is not None:
                 return int(config.policy_inference_fn(observation, self._policy))
             return int(self._policy(observation))
@@ -243,7 +243,7 @@ def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]
 
 
 def located(folder: Path) -> Callable[[Any], Any]:
-    """The function `locate` of `policy_class`, for the policies' files in the project's folder."""
+    """Make the argument `locate` of `policy_class`: it finds policies' files in the project's folder."""
 
     def locate(name: Any) -> Any:
         if isinstance(name, str | os.PathLike):

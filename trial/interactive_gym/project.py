@@ -27,7 +27,7 @@ _MADE_BY = "made by `python {file}`; change that file and run it again"
 
 @dataclass(frozen=True, slots=True)
 class MadeProject:
-    """A project that was made of an experiment."""
+    """The project that was made of an experiment."""
 
     folder: Path
     remarks: list[str] = field(default_factory=list)
@@ -53,7 +53,7 @@ def make(config: RemoteConfig, folder: Path | None = None, candidates: tuple[Any
 def files_of(
     config: RemoteConfig, source: ConfigModule, target: Path, remark: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The project's files, by their paths in it. Raises Unplayable, and what the experiment's code raises."""
+    """Make the project's files, by their paths in it. Raises Unplayable, and what the experiment's code raises."""
     look = looking.look(config)
     looking.check_actions(config, look.actions)
     find = sources.locate(source)
@@ -105,7 +105,7 @@ def files_of(
 
 
 def ignored(config: RemoteConfig) -> list[str]:
-    """A sentence about each option that the experiment sets and that has no effect here."""
+    """Return a sentence about each option of the experiment that has no effect here."""
     several = len(playing.humans_of(config)) > 1
     return [f"{name} has no effect: the game runs on a server" for name in getattr(config, "ignored", ())] + [
         f"{option.name} has no effect: {option.ignored}"
@@ -116,7 +116,7 @@ def ignored(config: RemoteConfig) -> list[str]:
 
 
 def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[str, Any]:
-    """The section `trial` of config.yml, without pages and players. `names` are the names of the actions."""
+    """Make the section `trial` of config.yml, without pages and players. `names` are the actions' names."""
     trial: dict[str, Any] = {
         "game": config.env_name or "experiment",
         "maxEpisodes": config.num_episodes,
@@ -153,7 +153,7 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
 
 
 def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
-    """The project's agent.py. `policies` has the name of each policy's class, and the player."""
+    """Write the project's agent.py. `policies` has the name of each policy's class, and the player whom it plays."""
     lines = [
         f'"""The agent of {source.file.name}, {_MADE_BY.format(file=source.file.name)}."""',
         "",
@@ -203,7 +203,7 @@ def _players(
     files: dict[str, bytes],
     remark: Callable[[str], None],
 ) -> dict[Any, tuple[str, str]]:
-    """By player: the value in `trial.players`, and the name of the policy's class in agent.py, or an empty name.
+    """Return, by player, the value in `trial.players`, and the policy's class in agent.py or an empty name.
 
     Adds the files of policies to `files`.
     """

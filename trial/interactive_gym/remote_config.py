@@ -68,7 +68,7 @@ class RemoteConfig:
         return bool(max(self.waitroom_time_randomization_interval_s) > 0)
 
     def to_dict(self, serializable: bool = False) -> dict[str, Any]:
-        """The values by the options' names; with `serializable`, only the values that JSON can hold."""
+        """Return the values by the options' names; with `serializable`, only the values that JSON can hold."""
         import json  # noqa: PLC0415 - rarely used
 
         all_values = {name: getattr(self, name) for name in options.BY_NAME}

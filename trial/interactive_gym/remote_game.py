@@ -20,17 +20,17 @@ class GameStatus:
 
 
 def _unrecorded(name: str, value: Any) -> None:
-    """Record nothing: values can be recorded in a callback alone."""
+    """Record nothing: only a callback can record values."""
 
 
 class RemoteGame:
-    """The state of the game, in Interactive Gym's attributes. To change them does not change the game.
+    """The present facts about the game, in Interactive Gym's attributes. Changing them does not change the game.
 
     `current_ping` is always 0, and `document_focus_status` always true: neither is measured here.
     """
 
     def __init__(self, config: Any, env: Any, players: Mapping[Any, Any], subject: str = "") -> None:
-        """`players` is `policy_mapping`, and `subject` the id of the participant, if there is one alone."""
+        """`players` is `policy_mapping`. `subject` is the participant's id; empty if several people play."""
         self.config = config
         self.env = env
         self.status = GameStatus.Inactive
@@ -66,7 +66,7 @@ class RemoteGame:
         return self.prev_rewards
 
     def began(self, observation: Any, infos: Any) -> None:
-        """The environment has been reset."""
+        """Set the attributes after the environment has been reset."""
         self.status = GameStatus.Active
         self.obs, self.current_infos = observation, infos
         self.prev_rewards, self.prev_actions = {}, {}
@@ -76,7 +76,7 @@ class RemoteGame:
         self.episode_rewards = collections.defaultdict(float)
 
     def stepped(self, actions: Mapping[Any, Any], result: tuple[Any, Any, Any, Any, Any]) -> None:
-        """A step has been taken."""
+        """Set the attributes after a step has been taken."""
         self.obs, rewards, self.terminateds, self.truncateds, self.current_infos = result
         self.prev_actions = dict(actions)
         self.prev_rewards = rewards if isinstance(rewards, dict) else {"reward": rewards}

@@ -19,5 +19,5 @@ class Animation:
     hideOnComplete: bool = False  # noqa: N815 - as above
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields by name."""
+        """Return the fields by name."""
         return dataclasses.asdict(self)

@@ -33,7 +33,7 @@ class _Scene:
 
 
 class GymScene(_Scene, RemoteConfig):
-    """A game. It is a `RemoteConfig`, but some options of texts have other names."""
+    """The scene of a game: a `RemoteConfig` in which some options of texts have other names."""
 
     def __init__(self, scene_id: str | None = None, **_more: Any) -> None:
         super().__init__()
@@ -102,14 +102,14 @@ class CompletionCodeScene(EndScene):
 
 
 class Stager:
-    """Scenes in their order."""
+    """Holds the scenes of an experiment in their order."""
 
     def __init__(self, scenes: Iterable[Any] = ()) -> None:
         self.scenes = list(scenes)
 
 
 class ExperimentConfig:
-    """An experiment of scenes."""
+    """An experiment that consists of scenes."""
 
     def __init__(self) -> None:
         self.stager: Stager | None = None

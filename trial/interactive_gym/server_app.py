@@ -73,9 +73,9 @@ def _interrupt(*_: Any) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """End the local run, and wait while it stores the last data; a second Ctrl-C does not interrupt that at once.
+    """End the local run, and wait while it stores the last data. A second Ctrl-C does not interrupt that at once.
 
-    Return 0, or 1 if it has not ended even by SIGKILL.
+    Return 0; 1 if the run has not ended even by SIGKILL.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is None:

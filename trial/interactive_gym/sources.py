@@ -34,7 +34,7 @@ _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
 
 @dataclass(frozen=True, slots=True)
 class ConfigModule:
-    """The module that has a config as its `variable`."""
+    """The module of the researcher's that holds a config, and the name of its `variable`."""
 
     module: str
     variable: str
@@ -85,9 +85,9 @@ def _source(module: ModuleType, variable: str, file: Path) -> ConfigModule:
 
 
 def locate(source: ConfigModule) -> Any:
-    """A function that finds a file or folder that an option names, and returns None if there is none.
+    """Make a function that finds the file or folder that an option names, and returns None if there is none.
 
-    It looks in the current folder, in that of the experiment's file, and in the four above.
+    It looks in the current folder, in the folder of the experiment's file, and in the four folders above that one.
     """
     folders = [Path.cwd(), source.file.parent, *list(source.file.parents)[1:5]]
 
@@ -105,7 +105,7 @@ def locate(source: ConfigModule) -> Any:
 
 
 def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list[str]]:
-    """The files that go into the project, by their paths in it, and sentences about those that are left out.
+    """Find the files for the project, by their paths in it. Return them, and sentences about those left out.
 
     They are the modules that the experiment has imported from folders of the researcher's, and all files in the folder
     of the experiment's file. Raises Unplayable if these are too large.
@@ -137,7 +137,7 @@ def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list
 
 
 def requirements(files: Iterable[Path], given: Iterable[str], modules: Collection[str] = ()) -> list[str]:
-    """The lines of requirements.txt: the packages that these files import, in their versions here, and `given` lines.
+    """Write the lines of requirements.txt: the packages that these files import, in the versions here, and `given`.
 
     `modules` are modules that other code imports. Of these `onnxruntime` gets a line even if it is not installed here.
     """
@@ -152,7 +152,7 @@ def requirements(files: Iterable[Path], given: Iterable[str], modules: Collectio
 
 
 def _imports(file: Path) -> Iterator[str]:
-    """The top-level names of the modules that a file imports."""
+    """Yield the top-level names of the modules that a file imports."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
@@ -183,7 +183,7 @@ def _is_own(file: Path, root: Path, target: Path) -> bool:
 
 
 def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) -> str | None:
-    """The path in the project of a module that comes from another folder of PYTHONPATH; None for other modules."""
+    """Return the path in the project for a module of another folder of PYTHONPATH; None for other modules."""
     parts = module.__name__.split(".")
     if file.name == "__init__.py":
         parts.append("__init__")
@@ -201,7 +201,7 @@ def _from_elsewhere(module: ModuleType, file: Path, root: Path, target: Path) ->
 
 @functools.cache
 def _installed() -> tuple[Path, ...]:
-    """The folders of Python's own modules and of packages."""
+    """Return the folders of Python's own modules and of packages."""
     return tuple(_resolved(folder) for folder in (*_INSTALLED, *site.getsitepackages(), site.getusersitepackages()))
 
 

@@ -21,7 +21,7 @@ _LONGEST = 300  # characters of an error
 
 
 def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | None], root: Path) -> Iterator[str]:
-    """Try each player's policy with that player's first observation. Yield a sentence if some cannot be tried.
+    """Try each player's policy with that player's first observation. Yield a sentence if policies cannot be tried.
 
     `find` finds a file that an option names, `root` is the folder of the experiment's modules. Raises Unplayable if a
     policy's file cannot be read, if a policy does not fit the environment or raises an exception, or if it chooses an

@@ -23,7 +23,7 @@ MOST_BYTES = 4 * 2**20
 MOST_BYTES_IN_ALL = 20 * 2**20
 """The most bytes of all images, packed with their atlases."""
 LONGEST_SIDE = 4096
-"""In pixels; some phones draw no larger images."""
+"""The longest side of an image, in pixels: some phones draw no larger images."""
 MOST_PIXELS_IN_ALL = 64 * 2**20
 """The most pixels of all images. A browser needs four bytes for each pixel."""
 MOST_FRAMES = 2_000
@@ -40,7 +40,7 @@ Box = tuple[int, int, int, int]
 
 
 class AssetError(ValueError):
-    """A file cannot be used. The message follows the file's name in a sentence."""
+    """A file cannot be used. The message is the end of a sentence that begins with the file's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +76,12 @@ class Assets:
     problems: tuple[str, ...] = ()
 
     def table(self) -> list[dict[str, Any]]:
-        """The table of the images for a client, which asks for those whose hash it does not have."""
+        """Return the images' table for a client, which asks for the images whose hashes it does not have."""
         return [{"name": each.name, "bytes": len(each.packed), "hash": each.hash} for each in self.by_name.values()]
 
 
 def load(project: Path, folder: str) -> Assets:
-    """Read the images of a project's folder. Does not raise for files that cannot be used: `problems` names them."""
+    """Read the images in a folder of a project. Files that cannot be used raise nothing: `problems` names them."""
     assets_folder = project / folder
     if not assets_folder.is_dir():
         return Assets()
@@ -101,7 +101,7 @@ def load(project: Path, folder: str) -> Assets:
             if not IMAGE.search(path.name):
                 continue
             if name in found:
-                raise AssetError("has the name of another image, apart from its extension")
+                raise AssetError("has the name of another image, apart from its extension; rename one of them")
             asset = read(path, name)
             total += len(asset.packed)
             pixels += asset.size[0] * asset.size[1]
@@ -118,7 +118,7 @@ def load(project: Path, folder: str) -> Assets:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """The files in a folder and below it, in the order of their names, without links and hidden files."""
+    """Yield the files in a folder and below it, in the order of their names, without links and hidden files."""
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or path.is_symlink():
             continue
@@ -161,7 +161,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
-    """The media type and the size of an image. Raises AssetError."""
+    """Return the media type and the size of an image. Raises AssetError."""
     import io  # noqa: PLC0415 - as below
     import warnings  # noqa: PLC0415
 
@@ -191,7 +191,7 @@ def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[
     `frameWidth` and `frameHeight` for frames of one size. Raises AssetError.
     """
     if not isinstance(value, dict):
-        raise AssetError("is no atlas")
+        raise AssetError("is no atlas, which is a JSON object with `frames` or with `frameWidth`")
     frames = _grid(value, size) if "frameWidth" in value else dict(_listed(value, size))
     if len(frames) > MOST_FRAMES:
         raise AssetError(f"has {len(frames)} frames; at most {MOST_FRAMES}")
@@ -202,7 +202,7 @@ def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[
 
 
 def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
-    """Frames of one size, counted from 0, row by row."""
+    """Return an atlas's frames of one size, named by their numbers from 0, row by row."""
     width, height = value.get("frameWidth"), value.get("frameHeight", value.get("frameWidth"))
     if not _is_whole(width, 1) or not _is_whole(height, 1):
         raise AssetError("has a frameWidth or frameHeight that is no whole number of pixels")
@@ -217,7 +217,7 @@ def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
 
 
 def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[str, Box]]:
-    """The frames that the atlas lists, by name."""
+    """Yield the name and the box of each frame that the atlas lists."""
     frames = value.get("frames")
     textures = value.get("textures")
     if frames is None and isinstance(textures, list) and len(textures) == 1 and isinstance(textures[0], dict):
@@ -232,7 +232,7 @@ def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[s
     for name, each in pairs[: MOST_FRAMES + 1]:
         box = each.get("frame") if isinstance(each, dict) else None
         if not isinstance(name, str) or not isinstance(box, dict):
-            raise AssetError("has a frame without a name or a place")
+            raise AssetError("has a frame without a name, or without a box (x, y, w, h) as its `frame`")
         if each.get("rotated"):
             raise AssetError(f"has the frame {name[:40]!r} turned; pack it without rotation")
         left, top, width, height = (box[key] if _is_whole(box.get(key), 0) else -1 for key in ("x", "y", "w", "h"))

@@ -14,7 +14,7 @@ _SAVINGS = 4  # raw pictures; a key frame is sent once differences would have sa
 
 
 class Encoder:
-    """Packs frames for one connection.
+    """Encodes the frames of one connection.
 
     Without `lossy` every frame is exact: a key frame, or a difference to the frame before it.
 
@@ -34,7 +34,7 @@ class Encoder:
         self._begin()
 
     def forget(self) -> None:
-        """Let `encode` send the next frame whole, since the client was shown something else."""
+        """Let the next frame be encoded whole, since the client was shown something else."""
         if self._shown is not None:
             self._begin()
 
@@ -55,7 +55,10 @@ class Encoder:
         return self._exact is self._shown
 
     def encode(self, frame: Frame, frame_id: int) -> bytes:
-        """The bytes of one frame. `frame` is kept for the next difference, so it must not be changed."""
+        """Encode one frame, and return its bytes.
+
+        `frame` is kept for the next difference, so it must not be changed.
+        """
         if self._shown is not None and self._shown.shape != frame.shape:
             self.forget()
         if not self.lossy or max(frame.shape) > frames.LONGEST_JPEG_SIDE:
@@ -73,7 +76,7 @@ class Encoder:
         return data
 
     def sharpen(self, frame_id: int) -> bytes:
-        """The bytes of the next rows of the picture that was sent last, without loss: at most as many as its JPEG has.
+        """Return the next rows of the picture that was sent last, without loss: at most as many bytes as its JPEG has.
 
         One row may be larger than that. Call it only while `exact` is False.
         """
@@ -91,7 +94,7 @@ class Encoder:
         return frames.header(ROWS, shown, frame_id) + frames.FIRST_ROW.pack(first) + body
 
     def _cheapest(self, frame: Frame, frame_id: int) -> bytes | None:
-        """A lossless coding that takes no more bytes than a JPEG. If it is None, `_jpeg` is the frame's JPEG."""
+        """Return a lossless coding that takes no more bytes than a JPEG. If it is None, `_jpeg` is the frame's JPEG."""
         data, measured = None, False
         trying = self.exact or self._jpegs_left == 0
         if not self._jpeg_bytes or self._unmeasured > _MEASURE_AFTER * self._jpeg_bytes:
@@ -116,7 +119,7 @@ class Encoder:
         self._unmeasured = 0
 
     def _lossless(self, frame: Frame, frame_id: int) -> bytes | None:
-        """A difference or a key frame, if one of them takes no more bytes than the last JPEG."""
+        """Return a difference or a key frame, if one of them takes no more bytes than the last JPEG."""
         bases = [None] if self._exact is None else [self._exact, None]
         if self._keys_first > 0:
             self._keys_first -= 1
@@ -130,7 +133,7 @@ class Encoder:
         return None
 
     def _key_that_pays(self, frame: Frame, frame_id: int) -> bytes | None:
-        """A key frame of any size, if differences have been small for long: it makes them possible again."""
+        """Return a key frame of any size if differences have been small for long: it makes them possible again."""
         if self._shown is None or self.exact:
             return None
         body = frames.packed(frame, self._shown, self._jpeg_bytes // 2)
@@ -151,7 +154,7 @@ def _whole(rows: Frame, base: Frame | None = None) -> bytes:
 
 
 def _same(one: Frame, other: Frame) -> bool:
-    """Whether the pixels are equal. Compares the rows in parts, and stops at the first difference."""
+    """Whether the pixels are equal. It compares some rows at a time, and stops at the first difference."""
     count = max(1, 65_536 // one[0].nbytes)
     return all(
         np.array_equal(one[first : first + count], other[first : first + count]) for first in range(0, len(one), count)

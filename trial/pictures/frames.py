@@ -26,14 +26,14 @@ Frame = npt.NDArray[np.uint8]
 """height x width x channels; channels is 3 (RGB) or 1 (grey)."""
 
 LARGEST = 4096 * 4096
-"""The most pixels of a picture. The page needs four bytes for each, and refuses more (web/game/frames.js)."""
+"""The most pixels of a picture. The page, which needs four bytes for each, refuses more (web/game/frames.js)."""
 
 KEY, DIFFERENCE, JPEG, ROWS = 0, 1, 2, 3
-"""Kinds of frames: whole, as XOR with the last exact frame, as a JPEG, or some rows of it."""
+"""Kinds of frames: the whole picture, its XOR with the last exact frame, a JPEG, or some rows without loss."""
 HEADER = struct.Struct("!BIHHB")
 """Kind, id, width, height, channels."""
 FIRST_ROW = struct.Struct("!H")
-"""The number of the first row; it follows the header of ROWS."""
+"""The number of the first row, which follows the header of a ROWS frame."""
 LONGEST_JPEG_SIDE = 65_500
 """In pixels; libjpeg's JPEG_MAX_DIMENSION."""
 
@@ -45,7 +45,7 @@ class FrameError(ValueError):
 
 
 def as_frame(picture: Any) -> Frame:
-    """A contiguous copy of the pixels that `render()` returned. Raises FrameError if they are no picture."""
+    """Copy the pixels that `render()` returned into a contiguous array. Raises FrameError if they are no picture."""
     if picture is None:
         raise FrameError("render() returned nothing; make the environment with render_mode='rgb_array'")
     array = np.asarray(picture)
@@ -64,13 +64,13 @@ def as_frame(picture: Any) -> Frame:
 
 
 def header(kind: int, frame: Frame, frame_id: int) -> bytes:
-    """The first bytes of a binary frame. Ids begin again at 0 after 2**32 frames."""
+    """Build the header of a binary frame. Ids begin again at 0 after 2**32 frames."""
     height, width, channels = frame.shape
     return HEADER.pack(kind, frame_id & 0xFFFFFFFF, width, height, channels)
 
 
 def packed(rows: Frame, base: Frame | None = None, limit: float = math.inf) -> bytes | None:
-    """The deflated pixels of some rows, or of their XOR with `base`; None if these are more than `limit` bytes."""
+    """Deflate the pixels of some rows, or their XOR with `base`. Return None if the result exceeds `limit` bytes."""
     packer = _deflate.compressobj(_LEVEL, zlib.DEFLATED, -15)
     # Each call takes time and adds bytes, so the chunks grow.
     count = len(rows) if limit == math.inf else max(1, _FIRST_CHUNK // rows[0].nbytes)
@@ -88,7 +88,7 @@ def packed(rows: Frame, base: Frame | None = None, limit: float = math.inf) -> b
 
 
 def jpeg(frame: Frame, quality: int = 80) -> bytes:
-    """The picture as a JPEG.
+    """Encode the picture as a JPEG.
 
     Quality 80 takes 15 % more bytes and no more time than Pillow's default of 75, which HIPPO's servers send. WebP
     takes six times as long for about as many bytes.
@@ -110,7 +110,7 @@ class Decoder:
         self._rows = 0  # the rows so far of a picture that comes as ROWS
 
     def decode(self, data: bytes) -> tuple[int, Frame]:
-        """The frame's id, and the picture that is shown now.
+        """Decode a binary frame. Return its id, and the picture that is shown now.
 
         Raises FrameError for bytes that are no frame, or that cannot follow the frames before.
         """
@@ -181,5 +181,5 @@ def _unpacked_jpeg(body: bytes, shape: tuple[int, int, int]) -> Frame:
 
 
 def jpeg_message(frame: Frame, frame_id: int) -> str:
-    """A frame as HIPPO's browsers expect it: JSON with the JPEG in base64, in Pillow's default quality."""
+    """Build the message of a frame for HIPPO's page: JSON with the JPEG in base64, in Pillow's default quality."""
     return json.dumps({"frame": base64.b64encode(jpeg(frame, quality=75)).decode("ascii"), "frameId": frame_id})

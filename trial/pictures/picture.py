@@ -13,7 +13,7 @@ Picture = Frame | Scene
 
 
 def as_picture(value: Any, before: Scene | None = None, *, scenes: bool = True) -> Picture:
-    """Read the picture that `render()` returned. `before` is the scene before it in the same episode (`as_scene`).
+    """Read the picture that `render()` returned. `before` is the episode's last scene (see `as_scene`).
 
     `scenes` says whether config.yml has `trial.scene`. Raises FrameError or SceneError, with a sentence for the
     researcher.

@@ -108,7 +108,7 @@ class Raster:
         self._lay(canvas, self._sprite(each["image"], frame, width, height, each.get("alpha", 1)), each)
 
     def _new_sprite(self, name: str, frame: str | None, width: int, height: int, alpha: float) -> Image.Image:
-        """The picture of a sprite before it is turned; a grey box if there is no such image or frame."""
+        """Draw a sprite, not yet turned; a grey box if there is no such image or frame."""
         asset = self._assets.by_name.get(name)
         picture = None if asset is None else _cut(asset, frame)
         if picture is None:
@@ -137,7 +137,7 @@ class Raster:
 
 
 def _cut(asset: Asset, frame: str | None) -> Image.Image | None:
-    """A frame of an image, or without a `frame` the whole image; None if the image has no such frame."""
+    """Cut a frame out of an image. Return the whole image without `frame`, None if the image has no such frame."""
     if frame is not None and frame not in asset.frames:
         return None
     whole = _opened(asset.image)
@@ -155,12 +155,12 @@ def _opened(image: bytes) -> Image.Image:
 
 
 def _bounded(number: float) -> float:
-    """The number, from -20,000 to 20,000: Pillow takes time and memory for shapes far outside of the picture."""
+    """Limit the number to ±20,000: Pillow takes time and memory for shapes far outside of the picture."""
     return max(-20_000.0, min(20_000.0, number))
 
 
 def _length(value: Any) -> int:
-    """A length in pixels, from 1 to 4,096; 0 for None."""
+    """Limit a length in pixels to 1 to 4,096; 0 for None."""
     return 0 if value is None else max(1, min(4_096, round(value)))
 
 
@@ -177,6 +177,6 @@ def _outline_width(each: CheckedObject) -> int:
 
 
 def _ink(color: str, each: CheckedObject) -> Rgba:
-    """The color with the object's `alpha`."""
+    """Return the color as RGBA, with the object's `alpha`."""
     red, green, blue, *rest = ImageColor.getcolor(color, "RGBA")  # type: ignore[misc]
     return red, green, blue, round((rest[0] if rest else 255) * each.get("alpha", 1))

@@ -17,7 +17,7 @@ _MOST_SENTENCES = 100  # for `tell`: a long game may have ever new mistakes
 
 
 class PictureReader:
-    """Reads the pictures of one agent. `tell` gets each sentence about objects that cannot be drawn, once.
+    """Reads the pictures of one agent. `tell` is called with each sentence about objects that cannot be drawn, once.
 
     `section` is `trial.scene` of config.yml. If it is None, `render()` may return pixels alone.
     """
@@ -35,7 +35,8 @@ class PictureReader:
         self._images: dict[str, frozenset[str]] = {}  # the images of that scene, by view
         self._told: set[str] = set()
         self.first_due = False
-        """Whether the episode's first picture must still be read: permanent objects may be in that one alone."""
+        """Whether the episode's first picture must still be read, since permanent objects may be in that picture
+        alone."""
 
     def begin_episode(self) -> None:
         """Forget the permanent objects of the episode before, since the environment was reset."""
@@ -56,7 +57,7 @@ class PictureReader:
         return picture
 
     def _look_for_images(self, scene: Scene, view: str) -> None:
-        """Tell which images of the scene are missing."""
+        """Call `tell` about images of the scene that are missing."""
         images = images_of(scene)
         if images == self._images.get(view):
             return

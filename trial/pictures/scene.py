@@ -40,10 +40,11 @@ class SceneError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A picture as objects. It never changes, so connections may keep it."""
+    """A picture that is described by objects. It never changes, so connections may keep it."""
 
     objects: Mapping[str, CheckedObject]
-    """By id, permanent ones first, then in the order of `render()`. At the same depth a later one covers the others."""
+    """The objects by id: permanent ones, then in the order of `render()`. At the same depth a later one covers
+    others."""
     hud: str = ""
     """A line of text beside the score."""
     permanent: frozenset[str] = frozenset()
@@ -51,11 +52,11 @@ class Scene:
     problems: tuple[str, ...] = field(default=(), compare=False)
     """The mistakes in single objects, in sentences for the researcher. Objects that cannot be drawn are left out."""
     given: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, compare=False, repr=False)
-    """Objects as `render()` returned them, by id: if it returns one of them unchanged, that needs no second check."""
+    """The objects as `render()` returned them, by id. One that it returns unchanged needs no second check."""
     images: frozenset[str] | None = field(default=None, compare=False, repr=False)
     """The names of the images that its sprites show; None if they are not known yet (see `images_of`)."""
     letters: int = field(default=0, compare=False, repr=False)
-    """At least the number of characters of all texts: more, if texts were replaced or removed since the last count."""
+    """The number of characters of all texts, or more if texts were replaced or removed since they were counted."""
 
 
 def is_scene(picture: Any) -> bool:
@@ -80,7 +81,7 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
 
 
 def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene | None:
-    """The scene `before` with new values of some objects; None if anything else has changed. Most scenes are such.
+    """Return the scene `before` with new values of some objects, as most scenes are; None if anything else changed.
 
     `map` compares all objects in one call, since a loop in Python over them would take most of the time of a scene.
     """
@@ -114,7 +115,7 @@ class _SceneBuilder:
         self._permanent = permanent = set(before.permanent)
         self._objects = {name: each for name, each in before.objects.items() if name in permanent} if permanent else {}
         self._not_returned = set(self._objects)
-        """Permanent objects of `before` that `render()` has not returned again, so far."""
+        """The permanent objects of `before` that `render()` has not returned again so far."""
         self._given: dict[str, Mapping[str, Any]] = {}
         self._problems: list[str] = []
         self._points = sum(len(each.get("points", ())) for each in self._objects.values())
@@ -175,7 +176,7 @@ class _SceneBuilder:
             self._given[name] = dict(given)
 
     def _has_room(self, text: Any) -> bool:
-        """Whether the scene may have this text too. To check far too many texts would delay the game."""
+        """Whether the scene has room for this text. Texts without room are not checked, which would delay the game."""
         letters = 0 if text is None else len(text if isinstance(text, str) else str(text))
         if letters > LONGEST_TEXT:
             return True  # `checked_object` refuses it
@@ -186,7 +187,7 @@ class _SceneBuilder:
         return True
 
     def _unchanged(self, given: Mapping[str, Any]) -> str | None:
-        """The object's id if the scene before has it with the same values; else None."""
+        """Return the object's id if the scene before has it with the same values; else None."""
         name = given.get("id") or given.get("uuid")
         if type(name) is not str or name not in self._before.objects:
             return None
@@ -211,7 +212,7 @@ class _SceneBuilder:
         self._objects[name] = checked
 
     def scene(self, hud: str) -> Scene:
-        """The scene of the objects so far. Permanent ones come first, as they will in the scenes after this one."""
+        """Return a scene of the objects so far. Permanent ones come first, as they will in later scenes."""
         objects, permanent = self._objects, self._permanent
         if permanent:
             first = {name: each for name, each in objects.items() if name in permanent}
@@ -224,7 +225,10 @@ class _SceneBuilder:
         return Scene(objects, hud, frozenset(permanent), problems, self._given, _images(objects), letters)
 
     def _with_few_letters(self, objects: dict[str, CheckedObject]) -> tuple[dict[str, CheckedObject], int]:
-        """The objects without the texts for which there is no room, and the number of characters of all texts."""
+        """Leave out the texts for which there is no room.
+
+        Return the objects, and the number of all texts' characters.
+        """
         fitting: dict[str, CheckedObject] = {}
         letters = 0
         for name, each in objects.items():
@@ -244,7 +248,7 @@ _SCALARS = frozenset({str, int, float, bool, type(None)})
 
 
 def images_of(scene: Scene) -> frozenset[str]:
-    """The names of the images that the scene's sprites show."""
+    """Return the names of the images that the scene's sprites show."""
     return _images(scene.objects) if scene.images is None else scene.images
 
 
@@ -253,7 +257,7 @@ def _images(objects: Mapping[str, CheckedObject]) -> frozenset[str]:
 
 
 def _parts(value: Any) -> tuple[Sequence[Any], str]:
-    """The objects and the text of the HUD."""
+    """Return the objects and the text of the HUD in what `render()` returned."""
     hud: Any = ""
     if not isinstance(value, list) and isinstance(value, Mapping):  # a list is the usual case
         if "objects" not in value:

@@ -25,7 +25,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False)
 
 
 class SceneEncoder:
-    """Packs scenes for one connection: the first scene whole, of each later one the changes since the scene before.
+    """Encodes the scenes of one connection: the first scene whole, of each later one the changes since the one before.
 
     A WebSocket loses no message and keeps their order, so the client has the scene that was sent last.
     """
@@ -34,24 +34,24 @@ class SceneEncoder:
         self._sent: Scene | None = None
 
     def forget(self) -> None:
-        """Let `encode` send the next scene whole, since the client was shown something else."""
+        """Let the next scene be encoded whole, since the client was shown something else."""
         self._sent = None
 
     def encode(self, scene: Scene, scene_id: int) -> bytes:
-        """The bytes of one scene. `scene` is kept, to compare it with the next one."""
+        """Encode one scene, and return its bytes. `scene` is kept, to compare it with the next one."""
         kind, body = _CACHE.packed(self._sent, scene)
         self._sent = scene
         return HEADER.pack(kind, scene_id & 0xFFFFFFFF) + body
 
 
 class _Cache:
-    """The changes that were packed last: players of one game mostly see the same scene after the same one."""
+    """Keeps the changes that were packed last, since players of one game mostly see the same two scenes in a row."""
 
     def __init__(self) -> None:
         self._last: tuple[Scene | None, Scene, tuple[int, bytes]] | None = None  # never changed: threads may read it
 
     def packed(self, before: Scene | None, scene: Scene) -> tuple[int, bytes]:
-        """The kind of the message, and its bytes after the header."""
+        """Return the kind of the message, and its bytes after the header."""
         last = self._last
         if last is not None and last[0] is before and last[1] is scene:
             return last[2]
@@ -72,7 +72,10 @@ def _pack(message: Mapping[str, Any]) -> tuple[int, bytes]:
 
 
 def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
-    """The message for a client that shows the scene `before`. With `new`, the client forgets all objects first."""
+    """Build the message for a client that shows the scene `before`.
+
+    With `new` in it, the client first forgets all objects.
+    """
     if before is None:
         return {"new": True, "set": dict(scene.objects), "hud": scene.hud}
     message: dict[str, Any] = {}
@@ -103,7 +106,7 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
 
 
 def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
-    """The fields that changed, with None for those that have their default again."""
+    """Return the fields that have changed; None as the value of those that have their default again."""
     if list(before) == list(now):  # the usual case
         return dict(compress(now.items(), map(ne, before.values(), now.values())))
     changed = {key: value for key, value in now.items() if key not in before or before[key] != value}
@@ -111,7 +114,7 @@ def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
 
 
 def _same_order(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Whether the objects get their order if the client puts the new ones behind the others."""
+    """Whether the client gets the objects' order right by putting the new ones behind the others."""
     stayed = [name for name in before if name in now]
     return all(one == other for one, other in zip(stayed, now, strict=False))
 
@@ -121,7 +124,7 @@ class SceneDecoder:
 
     def __init__(self) -> None:
         self.objects: dict[str, dict[str, Any]] = {}
-        """By id, in the order in which they are drawn."""
+        """The objects by id, in the order in which they are drawn."""
         self.hud = ""
 
     def decode(self, data: bytes) -> int:

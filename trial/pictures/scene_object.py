@@ -20,7 +20,7 @@ MOST_POINTS = 5_000
 LONGEST_TEXT = 1_000
 """The most characters of one text."""
 LONGEST_TWEEN = 10_000
-"""In milliseconds."""
+"""The longest tween, in milliseconds."""
 
 _LONGEST_ID = 100  # characters
 _FARTHEST = 1e6  # the largest coordinate or length
@@ -30,11 +30,14 @@ _EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # the names of
 _FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
 
 CheckedObject = Mapping[str, Any]
-"""The fields of an object that are sent, as JSON values. A field with its default value is left out."""
+"""An object's fields as clients are sent them, as JSON values. A field with its default value is left out."""
 
 
 class UnusableValue(ValueError):
-    """A value of an object cannot be used. The message follows the object's or the field's name in a sentence."""
+    """A value of an object cannot be used.
+
+    The message ends a sentence that begins with the object's or field's name.
+    """
 
 
 # ---- what `render()` returns of one object
@@ -53,7 +56,7 @@ def has_fields(value: Any) -> bool:
 
 
 def mapping_of(value: Any) -> Mapping[str, Any]:
-    """The object's fields, of a map, of an object with `as_dict()`, or of a dataclass. Raises UnusableValue."""
+    """Return the fields of a map, of an object with `as_dict()`, or of a dataclass. Raises UnusableValue."""
     if is_map(value):
         return value
     convert = getattr(value, "as_dict", None)
@@ -67,7 +70,7 @@ def mapping_of(value: Any) -> Mapping[str, Any]:
 
 
 def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[str, Any]]:
-    """The object's id, and its other fields under their shorter names. A field that is None counts as left out.
+    """Return the object's id, and its other fields under their shorter names. A field that is None counts as left out.
 
     An object without a usable id gets one by its `index`, such as `#1`, and a sentence in `problems`. Raises
     UnusableValue if the object has no fields.
@@ -87,7 +90,7 @@ def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[st
 
 
 def shown_name(value: Any, index: int) -> str:
-    """The object's name in a sentence: by its id, or else by its `index`."""
+    """Return the object's name in a sentence: by its id, or else by its `index`."""
     name = None
     if isinstance(value, Mapping):
         name = value.get("id", value.get("uuid"))
@@ -97,7 +100,9 @@ def shown_name(value: Any, index: int) -> str:
 
 
 def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) -> CheckedObject:
-    """The object's fields as they are sent. Appends a sentence to `problems` for each field that its type lacks.
+    """Check an object's fields, and return those to send.
+
+    Each field that its type lacks gives a sentence in `problems`.
 
     Raises UnusableValue if the object cannot be drawn.
     """
@@ -128,7 +133,7 @@ def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) ->
 
 
 def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
-    """The checked object with the new values of its fields, of which only these are checked.
+    """Return a checked object with new values of some fields, and check only these.
 
     `earlier` is the checked object, made of `given`; `value` is what `render()` returned now. Returns None if the whole
     object must be checked again.
@@ -158,7 +163,7 @@ _NO_NUMBERS = (bool, np.bool_, str, bytes)  # `float` takes them, too
 
 
 def _number(low: float, high: float) -> Callable[[Any], float]:
-    """The check of a number from `low` to `high`."""
+    """Return a function that checks a number, which must be from `low` to `high`."""
 
     def check(value: Any) -> float:
         if isinstance(value, _NO_NUMBERS):
@@ -177,13 +182,13 @@ def _number(low: float, high: float) -> Callable[[Any], float]:
 
 
 def _short(number: float) -> float:
-    """The rounded number, as an int if it is whole: both take fewer bytes in JSON."""
+    """Return the rounded number, as an int if it is whole: both take fewer bytes in JSON."""
     rounded = round(number, _DIGITS)
     return int(rounded) if rounded == int(rounded) else rounded
 
 
 def _points(least: int) -> Callable[[Any], list[list[float]]]:
-    """The check of a list of at least `least` points, as pairs of numbers."""
+    """Return a function that checks a list of at least `least` points, which are pairs of numbers."""
 
     def check(value: Any) -> list[list[float]]:
         try:
@@ -207,7 +212,7 @@ def _points(least: int) -> Callable[[Any], list[list[float]]]:
 
 
 def _color(value: Any) -> str:
-    """The check of a color in CSS: `#rgb`, `#rgba`, `#rrggbb`, `#rrggbbaa` or a name."""
+    """Check a color of CSS: `#rgb`, `#rgba`, `#rrggbb`, `#rrggbbaa` or a name."""
     if not isinstance(value, str):
         raise UnusableValue("is no color; write it as '#rrggbb'")
     if not _HEX.fullmatch(value) and not _is_color_name(value):
@@ -265,7 +270,7 @@ def _origin(value: Any) -> list[float]:
 
 
 def _tween(fields: Mapping[str, Any]) -> float:
-    """The milliseconds of a tween: `tween` if it is a number, or `tween_duration` if `tween` is true."""
+    """Return the milliseconds of a tween: `tween` if it is a number, or `tween_duration` if `tween` is true."""
     value = fields["tween"]
     if isinstance(value, bool | np.bool_):
         value = fields.get("tween_duration", _DEFAULT_TWEEN)

@@ -42,7 +42,7 @@ def load(
 
 
 def _file(folder: Path, name: str) -> Path:
-    """The file of this name in the folder or below it. Raises PolicyError if there is none."""
+    """Find the file of this name in the folder or below it. Raises PolicyError if there is none."""
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise PolicyError(f"{name} leads out of the project's folder")

@@ -18,11 +18,11 @@ Encoding = Callable[[Any], Array]
 """Turns an observation into an array."""
 
 MOST_ONE_HOT = 10_000_000
-"""The most numbers of an observation whose discrete parts are one-hot; no policy takes more."""
+"""The most numbers of an observation with one-hot discrete parts: no policy takes more."""
 
 
 def without_mask(observation: Any) -> Any:
-    """The observation without the `action_mask` that PettingZoo's games put beside it.
+    """Return the observation without the `action_mask` that PettingZoo's games put beside it.
 
     A map with one entry left becomes the value of that entry.
     """
@@ -33,7 +33,7 @@ def without_mask(observation: Any) -> Any:
 
 
 def flat(observation: Any) -> Array:
-    """All numbers of an observation in one row; those of a map in the order of its keys, as in RLlib and Gymnasium."""
+    """Return all numbers of an observation in one row; a map's in the order of its keys, as RLlib and Gymnasium do."""
     if isinstance(observation, Mapping):
         parts = [flat(observation[key]) for key in sorted(observation, key=str)]
     elif isinstance(observation, tuple):
@@ -44,14 +44,14 @@ def flat(observation: Any) -> Array:
 
 
 def numbers(observation: Any) -> Array:
-    """The observation as an array: of a map or a tuple all numbers in a row, anything else in its own shape."""
+    """Convert an observation to an array: a map or a tuple to one row, anything else in its own shape."""
     return flat(observation) if isinstance(observation, Mapping | tuple) else np.asarray(observation)
 
 
 def encodings(space: Any) -> list[Encoding]:
-    """The encodings that a file may expect for observations of this space, the likeliest first.
+    """Return the encodings that a file may expect for observations of this space, the likeliest first.
 
-    They are the numbers as they are, and those with each discrete value as one-hot.
+    One takes the numbers as they are, the other turns each discrete value into one-hot numbers.
     """
     possible: list[Encoding] = [numbers]
     if space is not None and one_hot_size(space) <= MOST_ONE_HOT:
@@ -60,7 +60,7 @@ def encodings(space: Any) -> list[Encoding]:
 
 
 def one_hot_size(space: Any) -> int:
-    """How many numbers an observation of this space has if each discrete value is one-hot; 0 if that is not known."""
+    """Return how many numbers an observation of this space has if each discrete value is one-hot; 0 if unknown."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         return sum(map(one_hot_size, inner.values()))
@@ -75,7 +75,7 @@ def one_hot_size(space: Any) -> int:
 
 
 def _one_hot(space: Any, observation: Any) -> Array:
-    """The numbers in a row, each discrete value as one-hot, as Gymnasium's `flatten` and RLlib do it."""
+    """Put the numbers in a row, each discrete value as one-hot, as Gymnasium's `flatten` and RLlib do it."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         parts = [_one_hot(inner[key], observation[key]) for key in sorted(inner, key=str) if key in observation]
@@ -97,7 +97,7 @@ def _one_hot(space: Any, observation: Any) -> Array:
 
 
 def zero(space: Any) -> Any:
-    """An observation of zeros, with `start` for each `Discrete`. None if the space is not known."""
+    """Return an observation of zeros, with `start` for each `Discrete`. None if the space is not known."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping):
         return {key: zero(part) for key, part in inner.items()}
@@ -110,7 +110,7 @@ def zero(space: Any) -> Any:
 
 
 def fitted(values: Array, shape: Shape) -> Array | None:
-    """The values in the shape of an input, with a batch of one; None if they do not fit.
+    """Give the values the shape of an input, with a batch of one. Return None if they do not fit.
 
     They may fit as they are, with one or two axes of size 1 before them (batch and time), in one row, or as an image
     with its channels as the first axis.
@@ -138,7 +138,7 @@ def _fits(sizes: Sequence[int], shape: Shape) -> bool:
 
 
 def shown(shape: Shape) -> str:
-    """The shape as a text, without the batch: `12 numbers` or `84 x 84 x 3`."""
+    """Describe the shape in words, without the batch: `12 numbers` or `84 x 84 x 3`."""
     sizes = [str(size) if isinstance(size, int) else "any" for size in shape]
     if len(sizes) > 1 and sizes[0] in ("any", "1"):
         sizes = sizes[1:]

@@ -24,7 +24,7 @@ from trial.policies.policy import PolicyError
 
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
-"""Inputs with a constant value, and that value if the file gets one observation at a time."""
+"""The inputs with a constant value, each with its value for one observation at a time."""
 _TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16,
     "tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(int16)": np.int16, "tensor(int8)": np.int8,
@@ -33,7 +33,7 @@ _TYPES: dict[str, type[np.generic]] = {
 _OUTPUTS = (
     ("_in", "_out"), ("in_", "out_"), ("", "_out"), ("", "n"), ("", "_n"), ("0", "n"), ("_0", "_n"), ("", "_next"),
 )  # fmt: skip
-"""How a state's output is named after its input: the first text in the input's name is replaced by the second."""
+"""The ways to name a state's output after its input: the second text replaces the first one in the input's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +50,12 @@ class _Port:
 
 @dataclass(frozen=True, slots=True)
 class _Ports:
-    """The purposes of the inputs and outputs of a file."""
+    """The inputs and outputs of a file by their purpose."""
 
     observation: tuple[_Port, ...]
-    """One input for the whole observation, or one for each part of the observation, with the part's name."""
+    """The input for the whole observation, or an input for each of its parts, which has the part's name."""
     states: Mapping[str, _Port]
-    """Recurrent states: by the name of an output, the input that gets its value at the next call."""
+    """The recurrent states: by the name of an output, the input that gets its value at the next call."""
     constants: Mapping[str, Array]
     mask: _Port | None
     action: str
@@ -76,7 +76,7 @@ class OnnxPolicy:
         self.reset(0)
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
-        """The number of the action. Raises PolicyError if the observation does not fit, or the output is no action."""
+        """Choose an action, and return its number. Raises PolicyError if the observation or the output does not fit."""
         try:
             inputs = self._inputs(observation)
         except RecursionError:
@@ -106,7 +106,7 @@ class OnnxPolicy:
         return {"kind": "policy", "policy": self._spec, "sha256": self._sha256}
 
     def _inputs(self, observation: Any) -> dict[str, Array]:
-        """The values of the inputs that take the observation, by the names of the inputs."""
+        """Return the values of the inputs that take the observation, by the names of the inputs."""
         observation = without_mask(observation)
         if len(self._ports.observation) == 1:
             port = self._ports.observation[0]
@@ -124,7 +124,7 @@ class OnnxPolicy:
         return array.astype(port.dtype)
 
     def _chosen(self, output: Array, mask: Mask | None) -> int:
-        """The action: the one with the best value, or the one whose number the file returned."""
+        """Return the number of the action with the best value, or the number that the file returned."""
         row = output.reshape(-1)
         if row.size != self._count or (self._count == 1 and output.dtype.kind in "iu"):
             return self._chosen_by_file(row, mask)
@@ -195,7 +195,7 @@ def _port(spec: str, port: Any) -> _Port:
 
 
 def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _Ports:
-    """The purposes of all inputs and outputs; `first` is an observation, or None.
+    """Find out what each input and output is for. `first` is an observation, or None.
 
     Raises PolicyError for an input of unknown purpose.
     """
@@ -219,7 +219,7 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
 
 
 def _observation_inputs(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
-    """The inputs for the observation: those with the names of its parts, or one with a usual name, or the first."""
+    """Return the inputs for the observation: those with its parts' names, or one with a usual name, or the first."""
     if isinstance(first, Mapping):
         parts = tuple(port for port in inputs if port.name in first)
         if len(parts) == len(first):
@@ -229,9 +229,9 @@ def _observation_inputs(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
 
 
 def _states(spec: str, inputs: list[_Port], outputs: list[_Port]) -> dict[str, _Port]:
-    """By the name of an output, the state's input that gets its value at the next call.
+    """Pair the recurrent states: return, by an output's name, the input that gets its value at the next call.
 
-    They are paired by their names, and the others by their shapes, in their order. Raises PolicyError for an input
+    Names decide, and for the others the shapes, in their order. Raises PolicyError for an input
     without an output.
     """
     free = {port.name: port for port in outputs}
@@ -258,7 +258,7 @@ def _states(spec: str, inputs: list[_Port], outputs: list[_Port]) -> dict[str, _
 
 
 def _output_names(name: str) -> Iterable[str]:
-    """The possible names of a state's output, by the name of its input."""
+    """Yield the possible names of a state's output, by the name of its input."""
     for old, new in _OUTPUTS:
         if not old:
             yield name + new
@@ -275,7 +275,7 @@ def _same_shape(one: Shape, other: Shape) -> bool:
 
 
 def _encoding(spec: str, ports: _Ports, space: Any, first: Any) -> Encoding:
-    """The encoding with which observations fit the file's one input. Raises PolicyError if there is none."""
+    """Choose the encoding with which observations fit the file's one input. Raises PolicyError if there is none."""
     possible = encodings(_without_mask_space(space))
     if first is None or len(ports.observation) > 1:
         return possible[0]
@@ -288,7 +288,7 @@ def _encoding(spec: str, ports: _Ports, space: Any, first: Any) -> Encoding:
 
 
 def _without_mask_space(space: Any) -> Any:
-    """The space of observations from which `without_mask` has removed the mask."""
+    """Return the space of observations from which `without_mask` has removed the mask."""
     inner = getattr(space, "spaces", None)
     if isinstance(inner, Mapping) and ACTION_MASK in inner:
         rest = {key: part for key, part in inner.items() if key != ACTION_MASK}
@@ -298,7 +298,7 @@ def _without_mask_space(space: Any) -> Any:
 
 
 def _fit(spec: str, values: Array, port: _Port) -> Array:
-    """The values in the shape and type of an input. Raises PolicyError if they do not fit."""
+    """Give the values the shape and type of an input. Raises PolicyError if they do not fit."""
     array = fitted(values, port.shape)
     if array is None:
         raise PolicyError(
@@ -309,7 +309,7 @@ def _fit(spec: str, values: Array, port: _Port) -> Array:
 
 
 def _fixed_batch(values: Array, port: _Port) -> str:
-    """A remedy, for the end of a message, if the file takes only several observations at once; else empty."""
+    """Return what to do if the file takes only several observations at once, for the end of a message; else empty."""
     batch = port.shape[0] if len(port.shape) > 1 else 1
     if not isinstance(batch, int) or batch == 1 or fitted(values, (1, *port.shape[1:])) is None:
         return ""
@@ -317,7 +317,7 @@ def _fixed_batch(values: Array, port: _Port) -> str:
 
 
 def _drawn(values: Array, allowed: list[int], random: Random) -> int:
-    """A random one of the allowed actions, with the probabilities of the softmax of their values."""
+    """Draw one of the allowed actions, with the probabilities of the softmax of their values."""
     allowed_values = values[allowed]
     best = allowed_values.max()
     if not np.isfinite(best):  # the softmax is not defined: all actions with this value are equally good
@@ -326,7 +326,7 @@ def _drawn(values: Array, allowed: list[int], random: Random) -> int:
 
 
 def _sha256(file: Path) -> str:
-    """The hash of the file and, if there is one, the file of weights that PyTorch's newer export puts beside it."""
+    """Return the hash of the file and of the file of weights that PyTorch's newer export may put beside it."""
     digest = hashlib.sha256(file.read_bytes())
     weights = file.with_name(f"{file.name}.data")
     if weights.is_file():

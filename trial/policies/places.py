@@ -16,7 +16,7 @@ from trial.policies.simple import IdlePolicy, RandomPolicy
 from trial.policies.thread import PolicyThread
 
 Acted = Callable[[str, int, int | None, Exception | None], None]
-"""Takes the player, the id of a question, and the action or else the exception that the policy raised."""
+"""A function that gets the player, the id of a question, and the action, or None and the policy's exception."""
 
 NO_POLICIES: Mapping[str, Policy] = {}
 _UNUSED = -1  # the id of questions whose answers are not used
@@ -64,7 +64,7 @@ class Places:
         stand_ins: Mapping[str, Policy] = NO_POLICIES,
         seats: Sequence[str] = (),
     ) -> None:
-        """Set who plays. From now on each policy belongs to this trial alone.
+        """Set who plays. From then on each policy belongs to this trial alone.
 
         `policies` and `stand_ins` are by player; a stand-in plays while the player's human is away. `seats` has the
         players of the session's members, in the order of their seats.
@@ -94,7 +94,7 @@ class Places:
         self._policies[effect.player].ask(effect.ask_id, effect.observation, effect.info, effect.mask)
 
     def reset(self, effect: ResetPolicy) -> None:
-        """Begin an episode for a policy. In a replay, ask it again about each observation on which it has acted."""
+        """Begin an episode for a policy. After a replay, let it choose again for each observation that it has had."""
         policy = self._policies[effect.player]
         policy.reset(effect.seed)
         for observed in effect.observed:

@@ -9,7 +9,10 @@ from trial.core.players import Mask
 
 
 class PolicyError(Exception):
-    """A policy cannot be used, or chose no action. The message is a sentence for the researcher, without its stop."""
+    """A policy cannot be used, or chose no action.
+
+    The message is a sentence for the researcher, without a full stop.
+    """
 
 
 class PolicyFileMissing(PolicyError):
@@ -20,7 +23,7 @@ class Policy(Protocol):
     """Chooses the actions of one player. All methods run on the policy's thread (`trial/policies/thread.py`)."""
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
-        """The number of the action to take; `mask` says which actions are legal now.
+        """Choose an action, and return its number. `mask` says which actions are legal now.
 
         Raises PolicyError if the policy chooses no legal action, and whatever the researcher's code raises.
         """
@@ -35,5 +38,5 @@ class Policy(Protocol):
         ...
 
     def description(self) -> Mapping[str, Any]:
-        """The policy's fields in a recording: `kind`, `policy` as config.yml has it, and of a file its `sha256`."""
+        """Return the policy's fields in a recording: `kind`, `policy` as in config.yml, and of a file its `sha256`."""
         ...

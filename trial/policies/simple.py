@@ -26,7 +26,7 @@ class RandomPolicy:
         self._random.seed(seed)
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Do nothing: there is nothing to free."""
 
     def description(self) -> Mapping[str, Any]:
         return {"kind": "policy", "policy": "random"}
@@ -43,10 +43,10 @@ class IdlePolicy:
         return self._idle if self._idle in allowed else allowed[0]
 
     def reset(self, seed: int) -> None:
-        """Nothing changes."""
+        """Do nothing: no episode differs from another."""
 
     def close(self) -> None:
-        """Nothing to free."""
+        """Do nothing: there is nothing to free."""
 
     def description(self) -> Mapping[str, Any]:
         return {"kind": "policy", "policy": "idle"}
@@ -84,7 +84,7 @@ class AgentPolicy:
 
 
 def checked(action: Any, count: int, mask: Mask | None) -> int:
-    """The number of the action that `act` returned. Raises PolicyError if it is no action, or is not legal now."""
+    """Return the action of `act` as a number. Raises PolicyError if it is no action, or is not legal now."""
     try:
         if isinstance(action, bool):
             raise TypeError
@@ -134,6 +134,6 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
 def _has_signature(function: Callable[..., Any]) -> bool:
     try:
         inspect.signature(function)
-    except (TypeError, ValueError):  # such as one written in C
+    except (TypeError, ValueError):  # some functions written in C have none, and can be called all the same
         return False
     return True

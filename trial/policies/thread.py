@@ -13,7 +13,7 @@ from trial.core.players import Mask
 from trial.policies.policy import Policy
 
 Done = Callable[[int, int | None, Exception | None], None]
-"""Takes the id of a question, and the action or else the exception that the policy raised."""
+"""A function that gets the id of a question, and the action, or None and the policy's exception."""
 
 
 class PolicyThread:
@@ -54,7 +54,10 @@ class PolicyThread:
         self._jobs.put(answer)
 
     def reset(self, seed: int) -> None:
-        """Begin an episode for the questions asked from now on. If the policy's `reset` raises, they get its error."""
+        """Begin an episode for the questions from now on.
+
+        If the policy's `reset` raises, they are answered by its error.
+        """
 
         def begin() -> None:
             try:
@@ -92,7 +95,7 @@ class PolicyThread:
 
 
 def _plain(problem: BaseException) -> Exception:
-    """The exception itself; a RuntimeError for SystemExit and others that would end the thread."""
+    """Return the exception; a RuntimeError in the place of SystemExit and others that would end the thread."""
     if isinstance(problem, Exception):
         return problem
     return RuntimeError(repr(problem)).with_traceback(problem.__traceback__)

@@ -59,7 +59,7 @@ def prepare(websocket: ServerConnection, request: Request) -> Response | None:
 
 
 class Environments:
-    """The process that makes environments, and the programs that are connected to it. For the event loop."""
+    """Starts the process that makes environments, and connects programs to it. For the event loop."""
 
     def __init__(self, agent_dir: Path) -> None:
         self._agent_dir = agent_dir
@@ -72,7 +72,7 @@ class Environments:
         """The number of programs that are connected."""
 
     async def serve(self, websocket: ServerConnection) -> None:
-        """Pass on messages until the program or the process closes; then close the other one, too."""
+        """Pass messages on between a program and the process until one of them closes; then close the other, too."""
         self.connections += 1
         try:
             await self._serve(websocket)
@@ -189,5 +189,5 @@ class Environments:
 
 
 def _form(path: str) -> str:
-    """Return the form that an address asks for; the first of FORMS if it names none, as for `make gym`."""
+    """Return the form of messages that an address asks for; without one, the first of FORMS, as `make gym` does."""
     return parse_qs(urlsplit(path).query).get("form", [FORMS[0]])[0]

@@ -26,7 +26,7 @@ _UNREAD = 1000  # the most lines that wait for a program; one more ends its conn
 _UNREAD_BYTES = 16 * 1024**2  # the most bytes of these lines; a single line may be longer
 
 Advise = Callable[[int, str | None], None]
-"""Takes the number of an action, and a player or None, as `Choices.advise` does. Raises CommandRefused."""
+"""A function that gets an action's number and a player or None, like `Choices.advise`. It raises CommandRefused."""
 
 
 class Watchers:
@@ -36,7 +36,7 @@ class Watchers:
         self._waiting: dict[Lines, Callable[[], None]] = {}
 
     def tell(self, line: Line) -> None:
-        """Pass on a line. The trial never waits: the connection of a program that does not read its lines is cut."""
+        """Pass on a line without waiting: the connection of a program that does not read its lines is cut."""
         if not self._waiting:
             return
         text = text_of_line(line)
@@ -57,7 +57,7 @@ class Watchers:
 
 
 class Lines:
-    """Lines that wait for a program."""
+    """Holds the lines that wait for a program."""
 
     def __init__(self) -> None:
         self._waiting: asyncio.Queue[bytes] = asyncio.Queue()
@@ -82,7 +82,7 @@ class Lines:
 
 
 class Watching:
-    """The connection of one program that watches.
+    """Serves one program that watches.
 
     `actions` returns the names of a player's actions. `advise` is None if the project allows no advice.
     """

@@ -1,9 +1,9 @@
 """A store by presigned requests: the server has no rights in AWS, and gets a presigned request for each access to S3.
 
-It shows its credential to the function `sign_requests` (docs/functions.md), and gets one HTTP request for one document,
-which it sends to S3: a GET of a document of its own, or a PUT that creates one and overwrites nothing. It sends the
-request at once. If S3 says that the request has expired, for instance after the machine was suspended, the server gets
-a new one. The clock of this machine is never compared with another clock.
+The server shows its credential to the function `sign_requests` (docs/functions.md), and gets one HTTP request for one
+document, which it sends to S3: a GET of a document of its own, or a PUT that creates one and overwrites nothing. It
+sends the request at once. If S3 says that the request has expired, for instance after the machine was suspended, the
+server gets a new one. The clock of this machine is never compared with another clock.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class PresignedStore:
 
 
 class _UnexpectedStatus(StoreError):
-    """The answer has an unexpected status. `transient`: it may have another one if the request is sent again."""
+    """The answer has an unexpected status. `transient`: the same request may succeed later."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"the answer was HTTP {status}")

@@ -13,7 +13,7 @@ import numpy as np
 LISTED = 100
 """The most numbers of an array that the field `extra` has as a list. Larger arrays are packed."""
 MOST_VALUES = 2_000_000
-"""The most values in one value that are converted: containers that hold each other in many ways would have no end."""
+"""The most values that are converted in one value. Containers that hold each other in many ways would have no end."""
 CUT_OFF = "<cut off>"
 """Stands in a container for the values that were left out."""
 _DEPTH = 20  # the most levels of nesting
@@ -42,7 +42,7 @@ class Values:
         return self._left < 0 or self.left_out > 0
 
     def keep(self, value: Any, depth: int = 0) -> Any:
-        """Convert a value; to its type in `<>` if it is nested too deep, contains itself, or raises an error."""
+        """Convert a value. One that is nested too deep, contains itself or raises an error becomes its type in `<>`."""
         try:
             return self._converted(value, depth)
         except Exception:  # noqa: BLE001 - the researcher's objects may raise anything, and the game goes on
@@ -104,7 +104,7 @@ class Values:
     def _array(self, value: Any) -> Any:
         if value.dtype.kind not in "biuf":
             return text_of(value)
-        if self._listed is None and value.size > self._longest:  # each number has a byte or more
+        if self._listed is None and value.size > self._longest:  # too large already if each number has one byte
             self.left_out += value.nbytes
             return None
         if self._listed is None or not isinstance(value, np.ndarray) or value.size <= self._listed:

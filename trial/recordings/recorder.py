@@ -25,7 +25,7 @@ from trial.settings import TrialSettings
 log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
-"""Lines are written to the file within this time: play that is lost if the process is killed."""
+"""The time within which lines are written to the file: a process that is killed loses at most so much play."""
 
 
 class Recorder:
@@ -68,7 +68,7 @@ class Recorder:
         return None if body is None else answers_in(body) or {}
 
     async def recorded(self) -> RecordedTrial | None:
-        """Return what earlier servers have recorded of the step; None if they have not, or it cannot be read."""
+        """Return what earlier servers have recorded of the step; None if there is nothing or it cannot be read."""
         folder, _, server = self._settings.recordings_folder.rpartition("/")
         try:
             return await asyncio.to_thread(load_recorded, self._store, folder, server, self._step)
@@ -166,7 +166,7 @@ class Recorder:
     # ---- the end
 
     async def save(self, answers: Mapping[str, Any] | None) -> None:
-        """Wait until all recordings are stored, then store the answer: a reader of the answer finds the recordings too.
+        """Store the answer after all recordings, so that a reader who finds the answer finds the recordings, too.
 
         The answer waits for `recordings_first_seconds` at most, and not after `hurry`. An answer that exists is not
         changed. `answers` is None in a session, where each member's own answer follows (`save_member`), or if there is
@@ -178,7 +178,7 @@ class Recorder:
             await self._create(settings.user_id, Answer(self._step, GAME, settings.group, now, answers))
 
     def hurry(self) -> None:
-        """The server ends soon: let no answer wait for recordings any longer."""
+        """Let no answer wait for recordings any longer, because the server ends soon."""
         self._hurried.set()
 
     @property

@@ -17,7 +17,7 @@ class Store(Protocol):
         ...
 
     def look(self, key: str) -> bytes | None:
-        """Return the document as `get` does. For documents that are read every few seconds: errors are not retried."""
+        """Return the document as `get` does, without retries: for documents that are read every few seconds."""
         ...
 
     def create(self, key: str, data: bytes | Path) -> bool:
@@ -26,7 +26,7 @@ class Store(Protocol):
 
 
 def open_store(place: str, server: str = "", credential: str = "") -> Store:
-    """Return the store for STORE: the bucket behind the address that signs requests, or a folder.
+    """Open the store that the variable STORE names: a bucket, by the address that signs requests, or a folder.
 
     `server` and `credential` are shown to that address.
     """
@@ -36,7 +36,7 @@ def open_store(place: str, server: str = "", credential: str = "") -> Store:
 
 
 def short_error(error: BaseException) -> str:
-    """Describe a store's error for the log, without file names and keys, which contain participants' ids."""
+    """Describe a store's error for the log, without names of files and keys: these contain participants' ids."""
     kind = type(error).__name__
     return f"{kind}: {error.strerror}" if isinstance(error, OSError) else kind
 

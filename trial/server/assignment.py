@@ -28,7 +28,7 @@ AssignmentDocument = Handover | SessionDocument
 
 
 def with_handover(settings: TrialSettings, found: Handover) -> TrialSettings:
-    """Return the settings of a warm server after its handover: those of a participant's or a session's server."""
+    """Return the settings of a warm server with what its handover `found` says: who plays there, or which session."""
     if is_session_id(found.user_id):
         return replace(settings, warm_server=False, session=found.user_id, group=found.group, server=found.server)
     return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
@@ -42,9 +42,9 @@ def with_members(settings: TrialSettings, found: SessionDocument) -> TrialSettin
 
 
 def set_environment(environment: MutableMapping[str, str], found: AssignmentDocument | None) -> None:
-    """Set the variables that tell the researcher's code who plays. None: no one is known yet, so remove them.
+    """Set the environment variables that tell the researcher's code who plays; remove them if that is not `found` yet.
 
-    In a session they are the session's id and group; no variable holds a participant's id.
+    For a session they hold its id and group; no variable holds a participant's id.
     """
     for name in (*variables.PARTICIPANT, variables.SESSION):
         environment.pop(name, None)
@@ -67,9 +67,9 @@ class Search:
         self._logged = ""
 
     async def run(self, assign: Callable[[TrialSettings, AssignmentDocument], Awaitable[None]]) -> None:
-        """Look until the server is assigned. Call `assign` with each document and the settings that follow from it.
+        """Look until it is known who plays. Call `assign` with each document and the settings that follow from it.
 
-        `assign` has returned before a `look` returns that found the document.
+        If a call of `look` leads to a document, it returns only after `assign` has taken the document.
         """
         while not self._settings.assigned:
             looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next pass

@@ -51,7 +51,7 @@ class TrialCallbacks:
         return self._callbacks is not None and self._callbacks.busy
 
     def begin(self, callbacks: Callbacks) -> None:
-        """The agent has started. `callbacks` are those that it has."""
+        """Use `callbacks`, those of the agent that has started."""
         self._callbacks = callbacks
 
     def close(self) -> None:
@@ -75,24 +75,24 @@ class TrialCallbacks:
         self._worker.submit(lambda: (work(), self._recorded_now()), limit, finished)
 
     def write_lines(self) -> None:
-        """If a recording is open, write the lines that callbacks had recorded by the end of the last finished work."""
+        """Write the lines that callbacks had recorded by the end of the last finished work, if a recording is open."""
         if self._callbacks and self._is_open():
             for line in self._callbacks.take(self._recorded):
                 self._write(line)
 
     def late(self, recorded: int) -> None:
-        """A callback for which the game did not wait has returned: write its lines. Called on the callbacks' thread.
+        """Write the lines of a callback for which the game did not wait. Called on the callbacks' thread.
 
-        `recorded`: the number of lines that callbacks have recorded by then.
+        `recorded`: the number of lines that callbacks had recorded when it returned.
         """
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._write_late, recorded)
 
     def tell_moved(self, effect: TellMoved) -> None:
-        """Tell a callback of a move, on the agent's thread between two calls: no step is being taken meanwhile.
+        """Tell a callback of a move, on the agent's thread, between two calls of the agent.
 
-        The moves are told one by one, and calls of the agent come in between. If `_MOVES` wait, a participant who has
-        left and returned counts as not having moved.
+        The moves are told one by one. If `_MOVES` wait, a participant who has left and returned counts as not having
+        moved.
         """
         moves = self._moves
         if not self._callbacks:

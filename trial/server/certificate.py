@@ -16,7 +16,7 @@ RELOAD_SECONDS = 3600.0
 
 
 class CertificatePair(NamedTuple):
-    """A certificate chain and a key (PEM) that fit each other, and the two files from which they were taken."""
+    """A certificate chain and a key (PEM) that fit each other, and the contents of the two files that held them."""
 
     chain: bytes
     key: bytes
@@ -39,9 +39,9 @@ class Certificate:
         self.context.minimum_version = ssl.TLSVersion.TLSv1_2
 
     def load(self) -> bool:
-        """Fetch the certificate and use it, before there are connections. Return False if it is in use already. Blocks.
+        """Fetch the certificate and use it, before there are connections. Return False if it is in use already.
 
-        Raises as `fetch`.
+        It blocks, and raises as `fetch` does.
         """
         fetched = self.fetch()
         if fetched is not None:
@@ -49,7 +49,7 @@ class Certificate:
         return fetched is not None
 
     def fetch(self) -> CertificatePair | None:
-        """Fetch the files, and return the chain and key to use; None if they are in use already. Blocks.
+        """Fetch the files, and return the chain and key to use; None if they are in use already. It blocks.
 
         Raises SettingsError if a file is missing, ssl.SSLError if the files do not fit, and the store's errors.
         """

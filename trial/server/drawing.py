@@ -20,7 +20,7 @@ log = logging.getLogger("trial")
 
 
 class Drawing:
-    """The images of a project, and what reads and draws its pictures.
+    """Holds the images of a project, and reads and draws its pictures.
 
     Problems with images and objects are logged, each sentence once.
     """

@@ -41,7 +41,7 @@ REFUSED_MESSAGES_A_SECOND = 20
 def process_request(
     websocket: ServerConnection, request: Request, *, gym: str = "none", token: str = ""
 ) -> Response | None:
-    """Answer an HTTP request that opens no WebSocket; None: go on with the WebSocket's handshake.
+    """Return the answer to an HTTP request that opens no WebSocket; None: go on with the WebSocket's handshake.
 
     The path of programs, /gym, exists only if `gym` (in the section `trial`) is not `none`. A program that asks for
     environments must show the token here: later its protocol has no message for a refusal.
@@ -76,7 +76,7 @@ def select_subprotocol(
 
 
 async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
-    """Wait for the first message, and return it, with the address's token if it has none. Raises CloseConnection."""
+    """Wait for the first message. If it has no token, it gets the one in the address. Raises CloseConnection."""
     try:
         async with asyncio.timeout(seconds):
             data = await websocket.recv()
@@ -94,7 +94,7 @@ def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
 
     In a session each member has a token of their own (`protocol.session.member_token`), and the server's token does not
     count. So no one can play in another member's place with their own token and the other's id. A warm server may still
-    become a session's: with either token, it looks for its handover.
+    become a session's, so it takes either token, and then looks for its handover.
     """
     named = user_id is not None and NAME.fullmatch(user_id) is not None
     own = (member_token(settings.token, user_id),) if user_id is not None and named else ()
@@ -104,7 +104,7 @@ def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
 
 
 def check_member(websocket: ServerConnection, user_id: str | None, settings: TrialSettings) -> None:
-    """Check that the participant is a member of the session, and that their client has a subprotocol of ours.
+    """Check that the participant is a member of the session, and that their client has a subprotocol of SUBPROTOCOLS.
 
     Unknown fields of a client without a subprotocol are recorded, and could hold a member's id. Raises CloseConnection.
     """
@@ -115,10 +115,10 @@ def check_member(websocket: ServerConnection, user_id: str | None, settings: Tri
 
 
 def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str], origins: Collection[str]) -> None:
-    """Check that a client has one of the tokens, or needs none. Raises CloseConnection.
+    """Check that a client has one of the tokens, or needs no token. Raises CloseConnection.
 
-    It needs none if it has no subprotocol and its page is of one of `origins`: those of the project's front end, if
-    `plainClients` is on. The caller compares its id.
+    A client needs no token if it has no subprotocol and its page has one of `origins`: those of the project's front
+    end, if `plainClients` is on. The caller compares the client's id.
     """
     if hello.token is not None or websocket.subprotocol is not None:
         if not any(_matches(hello.token, token) for token in tokens):
@@ -136,7 +136,7 @@ def check_matches(shown: str | None, expected: str, words: str = _REFUSED) -> No
 
 
 def _matches(shown: str | None, expected: str) -> bool:
-    """Whether they are the same, in constant time."""
+    """Whether both texts are the same. Takes the same time wherever they differ."""
     return hmac.compare_digest((shown or "").encode("utf-8", "surrogatepass"), expected.encode())
 
 

@@ -16,7 +16,7 @@ _LOOK_AGAIN_SECONDS = 5.0  # until an idle server that still stores something is
 
 
 class Lifetime:
-    """Ends the server once, with a reason. `saving` returns whether the server still has something to store."""
+    """Decides when the server ends, and why. `saving` returns whether the server still has something to store."""
 
     def __init__(self, settings: TrialSettings, saving: Callable[[], bool]) -> None:
         self._loop = asyncio.get_running_loop()
@@ -49,22 +49,22 @@ class Lifetime:
         return reason
 
     def expect_participant(self) -> None:
-        """From now on the server waits for a participant."""
+        """Begin to wait for a participant."""
         self._watchdog.expected(self._loop.time())
         self.watch()
 
     def connected(self) -> None:
-        """A participant is connected."""
+        """Note that a participant is connected."""
         self._watchdog.came()
         self.watch()
 
     def disconnected(self) -> None:
-        """No participant is connected any more."""
+        """Note that no participant is connected any more."""
         self._watchdog.left(self._loop.time())
         self.watch()
 
     def watch(self) -> None:
-        """End the server if the watchdog says so; else look again at the next time at which it could."""
+        """End the server if the watchdog says so; else call this again when its verdict may change."""
         now = self._loop.time()
         if self._timer is not None:
             self._timer.cancel()
@@ -81,7 +81,7 @@ def exit_hard_after(seconds: float) -> None:
     """End the process after `seconds`, even if threads still run."""
 
     def end() -> None:
-        print("trial: had to be ended", file=sys.stderr, flush=True)
+        print("trial: the process is ended although threads still run", file=sys.stderr, flush=True)
         os._exit(1)
 
     timer = threading.Timer(seconds, end)

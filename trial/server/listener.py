@@ -75,7 +75,7 @@ class Listener:
         return port
 
     def authenticated(self, websocket: ServerConnection) -> None:
-        """This connection has authenticated, and no longer counts for the limits."""
+        """Take a connection that has authenticated out of the limits."""
         self._unauthenticated.pop(websocket, None)
         self._socket.authenticated(websocket.remote_address)
 

@@ -78,10 +78,10 @@ class TrialLoop:
             settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31), assets=assets
         )
         self.ready = asyncio.Event()
-        """Set once the first frame is there, or the trial is over."""
+        """An event that is set once there is a first frame, or the trial is over without one."""
         self._settings = settings
         self._hide = partial(without, settings.private) if settings.session else str
-        """Removes members' ids from a text, since the recording of a session is that of all members."""
+        """A function that removes members' ids from a text, since a session's recording belongs to all members."""
         self._worker = worker
         self._watchers = watchers
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
@@ -128,7 +128,9 @@ class TrialLoop:
         return self._places.busy or self._callbacks.busy
 
     def begin(self, agent_ready: Awaitable[StartedAgent | None]) -> asyncio.Future[None]:
-        """Begin the trial once the agent is ready. The future is done when the trial is; it fails if an error ends it.
+        """Begin the trial once the agent is ready.
+
+        The future is done when the trial is; it fails if an error ends the trial.
 
         If `agent_ready` returns None, the agent cannot be started.
         """
@@ -165,30 +167,30 @@ class TrialLoop:
     # ---- clients
 
     def connect(self, human: str, connection: Connection) -> None:
-        """The human's client has connected: show the trial to it from now on."""
+        """Show the trial to a human's client, which has connected, from now on."""
         connection.rate = self.core.progress.frame_rate
         self._apply(self.core.connect(human, connection, connection.window, self._loop.time()))
 
     def disconnect(self, connection: Connection) -> None:
-        """The connection is closed, or was never connected."""
+        """Forget a connection that is closed. It need not have been connected."""
         self._apply(self.core.disconnect(connection, self._loop.time()))
 
     def round_trip(self, human: str, seconds: float) -> None:
-        """The human's browser has answered a ping after `seconds`."""
+        """Report a human's round trip: their browser has answered a ping after `seconds`."""
         self._do(self.core.round_trip, human, seconds)
 
     def receive(self, connection: Connection, message: Message) -> None:
-        """The client has sent a message."""
+        """Carry out a message of a client."""
         self._apply(self.core.receive(connection, message, self._loop.time()))
 
     def acknowledges_again(self, connection: Connection, frame_id: int) -> None:
-        """The client, which had stopped acknowledging frames, has acknowledged this one."""
+        """Note that a client acknowledges frames again, after it had stopped: it has acknowledged this one."""
         self._do(self.core.receive, connection, Message(ack=frame_id))
 
     # ---- programs
 
     def advise(self, action: int, player: str | None) -> None:
-        """A program advises or chooses an action: see `Choices.advise`. Raises CommandRefused."""
+        """Take a program's advice, or the action that it chooses: see `Choices.advise`. Raises CommandRefused."""
         self._apply(self.core.advise(action, player, self._loop.time()))
 
     # ---- events
@@ -248,7 +250,7 @@ class TrialLoop:
         return AgentCalls(started.agent, stamp, record_observations=config.record_observations, views=views)
 
     def _acted(self, player: str, ask_id: int, action: int | None, error: Exception | None) -> None:
-        """A policy has answered with an action or an error."""
+        """Tell the core that a policy has answered, with an action or an error."""
         if error is not None:
             self._do(self.core.policy_failed, player, ask_id, error)
         else:

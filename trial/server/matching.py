@@ -30,7 +30,7 @@ LOOK_SECONDS = 2.0
 
 
 class Matching:
-    """Answers questions until the server has members."""
+    """Answers the lobby's questions until the server has members."""
 
     def __init__(self, store: Store, settings: Callable[[], TrialSettings], function: Callable[..., Any]) -> None:
         """`settings` returns the present settings. `function` is `match` of agent.py."""
@@ -42,7 +42,10 @@ class Matching:
         self._logged: set[str] = set()
 
     async def run(self) -> None:
-        """Answer questions until the members are known. If a call of `match` does not return, end at once."""
+        """Answer the lobby's questions until the members are known.
+
+        If a call of `match` does not return, end at once.
+        """
         while not self._settings().assigned:
             if self._settings().session:
                 try:

@@ -20,7 +20,7 @@ class PortNotPermitted(Exception):
 
 
 class PreauthLimitedSocket(socket.socket):
-    """A listening socket that shuts down the oldest unauthenticated connection when there are too many.
+    """A listening socket that shuts down the oldest unauthenticated connection if there are too many.
 
     Raises PortNotPermitted if the port is for privileged processes, and OSError.
     """
@@ -52,7 +52,7 @@ class PreauthLimitedSocket(socket.socket):
         return connection, address
 
     def authenticated(self, address: Any) -> None:
-        """The connection from this address has authenticated, and no longer counts."""
+        """Stop counting the connection from this address, since it has authenticated."""
         self._unauthenticated.pop(address, None)
 
     def _forget_closed(self) -> None:

@@ -9,7 +9,7 @@ from trial.agent.tracebacks import without
 
 
 class IdFilter(logging.Filter):
-    """Removes ids from what the logger `trial` writes. `ids` returns those of the participants who play now."""
+    """Removes participants' ids from the lines of the logger `trial`. `ids` returns the ids of those who play now."""
 
     def __init__(self, ids: Callable[[], Iterable[str]]) -> None:
         super().__init__()

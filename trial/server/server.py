@@ -55,7 +55,7 @@ STORE_MARGIN = 10.0
 EXIT_MARGIN = 4.0
 """The process ends, whatever still runs, this many seconds before it would be killed."""
 TELL_SECONDS = 5.0
-"""If a trial cannot begin, the server ends after so many seconds, and another one replaces it. Until then it tells the
+"""If a trial cannot begin, the server ends after so many seconds, and another server replaces it. Until then it tells
 clients that connect."""
 _TOLD_SECONDS = 0.3  # the same, after one client has been told
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
@@ -177,12 +177,12 @@ class TrialServer:
             return
         function = match.function_of(self._agent.agent_module)
         if function is None:
-            log.error("matching is match, and agent.py has no function match; nobody is matched")
+            log.error("config.yml has `matching: match`, but agent.py has no function match, so nobody is matched")
             return
         await Matching(self._store, lambda: self.settings, function).run()
 
     async def _assign(self, settings: TrialSettings, found: AssignmentDocument) -> None:
-        """Take over new settings, which follow from the document `found`: now it is known who plays here."""
+        """Use the new settings, which follow from the document `found` that says who plays here."""
         if self.settings.warm_server:
             self._in_background(self._store_files(await self._leftovers(settings)))
             log.info("this server is assigned to a %s now", "session" if settings.session else "participant")
@@ -269,7 +269,7 @@ class TrialServer:
         if not self.settings.assigned:
             raise CloseConnection(1013, NOT_ASSIGNED)
         if self._watching >= watch.MAX_PROGRAMS:
-            raise CloseConnection(1013, f"{watch.MAX_PROGRAMS} programs watch already")
+            raise CloseConnection(1013, f"{watch.MAX_PROGRAMS} programs watch already; try later")
         self._listener.authenticated(websocket)
         self._watching += 1
         try:
@@ -313,7 +313,7 @@ class TrialServer:
 
     @contextlib.asynccontextmanager
     async def _measured(self, trial: TrialLoop, human: str, connection: Connection) -> AsyncIterator[None]:
-        """In a session, measure the connection's round trips meanwhile, and report them to the trial."""
+        """In a session, measure the connection's round trips within the `with`, and report them to the trial."""
         if not self.settings.session:
             yield
             return
@@ -382,7 +382,7 @@ class TrialServer:
 
     def _trial_done(self, trial: TrialLoop, done: asyncio.Future[None]) -> None:
         if done.exception() is not None:
-            log.error("the trial broke", exc_info=done.exception())
+            log.error("an error of the server has ended the trial", exc_info=done.exception())
             self.end("error")
         elif trial.core.broken:
             self._lifetime.end_in(TELL_SECONDS, "error")
@@ -392,7 +392,7 @@ class TrialServer:
                 self._in_background(self._end_when_stored())
 
     async def _end_when_stored(self) -> None:
-        """The answers of the last game step are stored: end the server once all answers and recordings are."""
+        """End the server once all answers and recordings are stored. Those of the last game step are stored already."""
         for trial in self._trials:
             await trial.stored()
         self._lifetime.end_in(self.settings.linger_seconds, "done")

@@ -59,11 +59,11 @@ class StartedAgent:
         return started
 
     def _key(self, group: int | None) -> int | None:
-        """Return the group, or None if the same policies play in all groups."""
+        """Return the group under which the loaded policies are kept; None if the same policies play in all groups."""
         return group if self.settings.trial.groups() else None
 
     def players_of(self, settings: TrialSettings) -> TrialPlayers:
-        """Return who plays in one trial. The next trial gets other policy objects. Raises as `start`.
+        """Return who plays in one trial. Each trial gets policy objects of its own. Raises as `start`.
 
         `settings` are the present ones: since its start, a server may have been assigned to a group and a session.
         """

@@ -6,7 +6,7 @@ import math
 
 
 class Watchdog:
-    """Counts the time without a participant. All times are seconds of one clock.
+    """Counts the time without a participant, and says when the server must end. All times are seconds of one clock.
 
     `idle` is how long the server waits for a participant; `grace` is the least time for which it waits for one who was
     connected before; `deadline` is the time at which it ends in any case. The wait begins at `now`; if that is None, at
@@ -21,16 +21,16 @@ class Watchdog:
         self._visited = False
 
     def expected(self, now: float) -> None:
-        """From now on the server waits for a participant."""
+        """Begin to wait for a participant."""
         self._alone_since = now
 
     def came(self) -> None:
-        """A participant is connected."""
+        """Note that a participant is connected."""
         self._alone_since = None
         self._visited = True
 
     def left(self, now: float) -> None:
-        """No participant is connected any more."""
+        """Note that no participant is connected any more."""
         self._alone_since = now
 
     def expires(self) -> float:

@@ -43,7 +43,7 @@ _ASSET_TIMES = 3  # how often a connection may ask for the same image
 
 
 class Connection:
-    """The sending half of a connection. Other methods collect pictures and messages, and `run` sends them.
+    """Sends pictures and messages to a client. `run` sends what the other methods have collected.
 
     Only `send_now` may send a picture itself, if nothing has to be sent before it. Of pictures and states only the
     newest one waits, so nothing builds up for a slow client.
@@ -65,7 +65,8 @@ class Connection:
         self.window = Window()
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.acknowledges_again: Callable[[int], None] | None = None
-        """Called with the id of a frame that the client has acknowledged, if it had stopped acknowledging before."""
+        """A function that is called when a client that had stopped acknowledging frames acknowledges one, with its
+        id."""
         self.rate = 30
         """The game's present frame rate, per second."""
         self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
@@ -92,19 +93,19 @@ class Connection:
             self._wake.set()
 
     def send_state(self, text: str) -> None:
-        """Send the trial's state, instead of one that still waits."""
+        """Send the trial's state, which replaces a state that still waits."""
         self._state = text
         self._wake.set()
 
     def put_picture(self, picture: Picture, picture_id: int) -> None:
-        """Let a picture wait for `send_now` or the next message, instead of one that still waits.
+        """Let a picture wait for `send_now` or the next message. It replaces a picture that still waits.
 
         `picture` must not change afterwards.
         """
         self._picture = (picture_id, picture)
 
     def send_now(self) -> None:
-        """Send the picture that waits: at once if nothing else is to be sent or written before it, else by `run`."""
+        """Send the picture that waits at once, or let `run` send it if something else is sent or written before it."""
         if not self._send_at_once():
             self._wake.set()
 
@@ -144,7 +145,7 @@ class Connection:
         return True
 
     def acknowledged(self, frame_id: int, now: float) -> None:
-        """The client has shown this frame."""
+        """Note that the client has shown this frame."""
         had_stopped = self.acknowledges_again is not None and self.window.stalled(now)
         self.window.acknowledged(frame_id, now)
         if had_stopped and self.acknowledges_again is not None:
@@ -153,7 +154,7 @@ class Connection:
             self._wake.set()
 
     def hear_acknowledgements(self, inbound: Inbound) -> None:
-        """From now on, `inbound` reads each acknowledgement at its arrival. `recv` returns all other messages."""
+        """Let `inbound` read each acknowledgement as it arrives. `recv` returns all other messages."""
 
         def hear(data: bytes | bytearray | memoryview) -> bool:
             now = self._loop.time()
@@ -166,13 +167,16 @@ class Connection:
             self._direct.hear = hear
 
     def close(self, code: int, last_words: str) -> None:
-        """Close with this code, after the messages that wait and `last_words`, a message. The first call counts."""
+        """Close with this code, after the messages that wait and the message `last_words`.
+
+        Only the first call counts.
+        """
         if self._closing is None:
             self._closing = (code, last_words)
             self._wake.set()
 
     def close_done(self, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Say that the trial is over, then close. HIPPO's clients get the plain word `done` instead of JSON."""
+        """Tell the client that the trial is over, then close. HIPPO's clients get the word `done` instead of JSON."""
         self.close(_DONE, messages.done(episodes, score, outcome) if self.binary else "done")
 
     async def run(self) -> None:
@@ -240,7 +244,10 @@ class Connection:
         await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
 
     async def _end(self, loop: asyncio.AbstractEventLoop, code: int, last_words: str) -> None:
-        """Send the last message and close. If the trial is over, send a picture that waits before: it shows the end."""
+        """Send the last message and close.
+
+        If the trial is over, send a picture that waits first, since it shows the end.
+        """
         if code == _DONE and self._picture is not None:
             try:
                 await self._send_picture(loop)

@@ -16,7 +16,7 @@ _COLUMNS = 38  # letters in a line
 
 @lru_cache(maxsize=8)
 def frame_message(words: str) -> str:
-    """Return a message with a frame that shows the words, in the form for clients without a subprotocol."""
+    """Build a message with a frame that shows the words, in the form for clients without a subprotocol."""
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 - only for such clients
 
     picture = Image.new("RGB", _SIZE, "white")

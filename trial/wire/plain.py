@@ -15,7 +15,7 @@ from trial.core import messages
 from trial.core.messages import BadMessage, Message
 
 FIELDS_LENGTH = 3500
-"""The most characters of JSON that the unknown fields of one message may have. Otherwise they are not recorded."""
+"""The most characters of JSON in the unknown fields of one message. If there are more, the fields are not recorded."""
 
 FIELDS_DEPTH = 20
 """The most levels of nesting that recorded fields may have, since some readers of JSON take no more."""

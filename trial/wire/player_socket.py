@@ -23,7 +23,7 @@ class PlayerSocket(ServerConnection):
     """
 
     hear: Callable[[bytes | bytearray | memoryview], bool] | None = None
-    """Called with each text message at its arrival. If it returns True, `recv` does not return the message."""
+    """A function that is called with each text message as it arrives. If it returns True, `recv` does not return it."""
 
     @property
     def free(self) -> bool:
@@ -40,7 +40,7 @@ class PlayerSocket(ServerConnection):
         self.transport.write(framed(BINARY, data))
 
     def data_received(self, data: bytes) -> None:
-        """Called by asyncio with received bytes. Mostly they are one acknowledgement."""
+        """Take received bytes from asyncio. Mostly they are one acknowledgement."""
         if self.hear is not None and self._between_messages:
             text = short_text(data)
             if text is not None and self.hear(text):
@@ -60,7 +60,7 @@ class PlayerSocket(ServerConnection):
         return generator.gi_code is _FOR_A_FRAME and protocol.current_size is None and protocol.state is State.OPEN
 
     def process_event(self, event: Event) -> None:
-        """Called by `websockets` with each frame that `data_received` has left to it."""
+        """Take a frame from `websockets`, which reads those that `data_received` has left to it."""
         if not (isinstance(event, Frame) and self._heard(event)):
             super().process_event(event)
 

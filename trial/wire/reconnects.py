@@ -9,15 +9,15 @@ from __future__ import annotations
 AT_ONCE = 30
 """The number of connections that a member may make at once."""
 SECONDS_EACH = 2.0
-"""After these, the seconds until the member may connect once more."""
+"""After AT_ONCE connections, the seconds until the member may connect once more."""
 
 
 class Reconnects:
-    """Counts the connections of each member."""
+    """Counts the connections of each member, and says when there are too many."""
 
     def __init__(self) -> None:
         self._free_at: dict[str, float] = {}
-        """By member, when they may connect AT_ONCE times again."""
+        """By member, the time at which they may connect AT_ONCE times again."""
 
     def allowed(self, human: str, now: float) -> bool:
         """Return whether the member may connect now. A connection that is refused does not count."""

@@ -14,7 +14,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 LONGEST_SECONDS = 10.0
-"""The longest round trip that is reported: a ping without an answer counts as one of this length."""
+"""The longest round trip that is reported. A ping without an answer counts as one of this length."""
 EVERY_SECONDS = 5.0
 """The time from the answer to one ping to the next ping, after the first samples."""
 _BETWEEN_SAMPLES = 0.1

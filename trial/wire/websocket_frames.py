@@ -42,7 +42,7 @@ def extent(data: bytes) -> tuple[int, int]:
 
 
 def short_text(data: bytes) -> bytes | bytearray | None:
-    """Return the payload if the data are exactly one text message of a client with at most 125 bytes; else None."""
+    """Return the payload if the data are exactly one text message of a client, of at most 125 bytes; else None."""
     length = len(data) - _MASKED_HEADER
     if not 0 <= length <= 125 or data[0] != TEXT or data[1] != 0x80 | length:
         return None

@@ -38,7 +38,7 @@ class Env(gymnasium.Env[Any, Any]):
         raise NotImplementedError
 
     def compute_reward(self, *arguments: Any) -> Any:
-        """The reward for goals: GoalEnv's method."""
+        """Return the reward for an achieved and a desired goal, if the environment is a GoalEnv."""
         raise NotImplementedError
 
 
@@ -46,7 +46,7 @@ GoalEnv = Env
 
 
 class Wrapper(Env):
-    """Wraps another environment, and has its attributes too. `reset` and `step` return the results of that one."""
+    """Wraps another environment, and has its attributes, too. `reset` and `step` return that environment's results."""
 
     def __init__(self, env: Any, new_step_api: bool = False) -> None:
         self.env = env
@@ -78,7 +78,7 @@ class Wrapper(Env):
 
     @classmethod
     def class_name(cls) -> str:
-        """The name of the class."""
+        """Return the name of the class."""
         return cls.__name__
 
     def seed(self, seed: Any = None) -> Any:
@@ -121,7 +121,7 @@ class ObservationWrapper(Wrapper):
         return (self.observation(observation), *rest)
 
     def observation(self, observation: Any) -> Any:
-        """The observation to return."""
+        """Return the changed observation. Subclasses define it."""
         raise NotImplementedError
 
 
@@ -134,7 +134,7 @@ class RewardWrapper(Wrapper):
         return (observation, self.reward(reward), *rest)
 
     def reward(self, reward: Any) -> Any:
-        """The reward to return."""
+        """Return the changed reward. Subclasses define it."""
         raise NotImplementedError
 
 
@@ -146,11 +146,11 @@ class ActionWrapper(Wrapper):
         return self.env.step(self.action(action))
 
     def action(self, action: Any) -> Any:
-        """The action to take."""
+        """Return the action that the environment takes instead. Subclasses define it."""
         raise NotImplementedError
 
     def reverse_action(self, action: Any) -> Any:
-        """The action that this one was made from."""
+        """Return the action from which `action` made this one. Subclasses may define it."""
         raise NotImplementedError
 
 
@@ -160,7 +160,7 @@ def with_info(result: Any) -> bool:
 
 
 class FromGymnasium(Env):
-    """An environment of Gymnasium's with Gym's old interface. Its other attributes can be read and set here too."""
+    """Gives Gymnasium's environment Gym's old interface. Its other attributes can be read and set here, too."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         own = self.__dict__
@@ -237,7 +237,7 @@ class FromGymnasium(Env):
 
 
 class ToGymnasium(gymnasium.Env[Any, Any]):
-    """An environment with Gym's old interface as one of Gymnasium's, for Gymnasium's wrappers."""
+    """Gives an environment with Gym's old interface that of Gymnasium, for Gymnasium's wrappers."""
 
     def __init__(self, old: Any) -> None:
         self.old = old
@@ -267,7 +267,7 @@ class ToGymnasium(gymnasium.Env[Any, Any]):
         return observation, reward, bool(done and not truncated), truncated, info
 
     def render(self) -> Any:
-        """The picture."""
+        """Return the picture."""
         return self.old.render(mode="rgb_array")
 
     def close(self) -> None:

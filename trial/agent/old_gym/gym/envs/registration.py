@@ -37,7 +37,7 @@ class EnvSpec:
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     def make(self, **kwargs: Any) -> Any:
-        """A new environment."""
+        """Make a new environment."""
         return make(self, **kwargs)
 
 
@@ -50,19 +50,19 @@ class EnvRegistry(ChainMap[str, Any]):
         return self
 
     def all(self) -> Any:
-        """All specifications."""
+        """Return the specifications of all environments."""
         return self.values()
 
     def spec(self, id: str) -> Any:
-        """The specification of this id. Raises gym.error.Error if there is none."""
+        """Return the specification of this id. Raises gym.error.Error if there is none."""
         return spec(id)
 
     def make(self, id: str, **kwargs: Any) -> Any:
-        """A new environment."""
+        """Make a new environment."""
         return make(id, **kwargs)
 
     def register(self, id: str, **kwargs: Any) -> None:
-        """See `register`."""
+        """Register an environment: see the function `register`."""
         register(id, **kwargs)
 
 
@@ -76,7 +76,7 @@ def register(id: str, entry_point: Any = None, **kwargs: Any) -> None:
 
 
 def spec(id: str) -> Any:
-    """The specification of an id. Raises gym.error.Error if there is none."""
+    """Return the specification of an id. Raises gym.error.Error if there is none."""
     id = _imported(id)
     known = registry.maps[0].get(id)
     return gymnasium.spec(_newest(id)[0]) if known is None else known
@@ -92,7 +92,7 @@ def make(id: Any, **kwargs: Any) -> Any:
 
 
 def _imported(id: str) -> str:
-    """The id without its module. The module of `module:Env-v0` is imported, which registers the environment."""
+    """Import the module in an id such as `module:Env-v0`, which registers it. Return the id without the module."""
     module, colon, rest = id.partition(":")
     if colon:
         importlib.import_module(module)
@@ -135,14 +135,14 @@ def _make_of_gymnasium(id: str, kwargs: dict[str, Any]) -> Any:
 
 
 def _quietly(id: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Make an environment of Gymnasium's, without a limit of steps, and without a warning that the id is old."""
+    """Make an environment of Gymnasium's without a limit of steps, and without the warning that the id is old."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return gymnasium.make(id, max_episode_steps=-1, disable_env_checker=True, **kwargs)
 
 
 def _newest(id: str) -> tuple[str, dict[str, Any]]:
-    """The id under which Gymnasium or ALE has the environment now, and further arguments for `gymnasium.make`."""
+    """Return the environment's id in Gymnasium or ALE today, and further arguments for `gymnasium.make`."""
     atari = _OLD_ATARI.fullmatch(id)
     if (id.startswith("ALE/") or atari) and id not in gymnasium.registry:
         with contextlib.suppress(ImportError):

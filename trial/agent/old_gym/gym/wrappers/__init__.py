@@ -17,11 +17,11 @@ __all__ = ["Monitor", "OrderEnforcing", "TimeLimit", "Wrapper"]
 
 
 class OrderEnforcing(Wrapper):
-    """Stands for Gym's wrapper. It changes nothing."""
+    """Has the name of Gym's wrapper, and changes nothing."""
 
 
 class Monitor(Wrapper):
-    """Stands for Gym's Monitor, which wrote videos and results to a folder. This one warns that it writes nothing."""
+    """Has the name of Gym's Monitor, which wrote videos and results to a folder, and warns that it writes nothing."""
 
     def __init__(self, env: Any, *args: Any, **kwargs: Any) -> None:
         warnings.warn("gym.wrappers.Monitor writes nothing here: the trial records each step itself", stacklevel=2)
@@ -45,11 +45,11 @@ _NAMES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "TransformObservation": ("TransformObservation", {"f": "func"}),
     "TransformReward": ("TransformReward", {"f": "func"}),
 }
-"""By Gym's name of a wrapper: Gymnasium's name, and Gymnasium's names of the arguments by Gym's."""
+"""By Gym's name of a wrapper: Gymnasium's name, and by Gym's names of its arguments those of Gymnasium."""
 
 
 def _of_gymnasium(name: str, gymnasium_name: str, renamed: Mapping[str, str]) -> type[Wrapper]:
-    """A class for Gymnasium's wrapper that wraps environments with Gym's old interface."""
+    """Make a class by which Gymnasium's wrapper wraps environments with Gym's old interface."""
     wrap: Any = getattr(wrappers, gymnasium_name)
 
     def __init__(self: Any, env: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
@@ -66,7 +66,7 @@ def _of_gymnasium(name: str, gymnasium_name: str, renamed: Mapping[str, str]) ->
 
 
 def _new(env: Any) -> gymnasium.Env[Any, Any] | None:
-    """The environment of Gymnasium in the `Wrapper` that `make` returns if it gets a `render_mode`; else None."""
+    """Return Gymnasium's environment in the `Wrapper` that `make` returns with a `render_mode`; None in any other."""
     if type(env) is Wrapper and isinstance(env.env, gymnasium.Env) and not isinstance(env.env, Env):
         return env.env
     return None
