@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _app(names: Sequence[str]) -> typer.Typer:
-    """Return the typer application with these commands. It imports their modules, which takes time."""
+    """Make the typer application with these commands. This imports their modules, which takes time."""
     app = typer.Typer(
         help="Hippodrome on AWS: one installation for everybody's studies, and a server for each participant.",
         add_completion=False,

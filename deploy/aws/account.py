@@ -25,9 +25,11 @@ from hippodrome.ports import Settings
 
 STACK = "hippodrome"
 STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
-"""At most 30 characters: `<stack>-code-<account>-<region>` is a bucket, whose name may have 63."""
+"""The form of a stack's name. It has at most 30 characters: `<stack>-code-<account>-<region>` is a bucket's name,
+which may have 63."""
 RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
-"""Every account has a schedule group `default`, and may have a cluster `default`; S3 refuses the other prefixes.
+"""Names that no stack may have: an account has a schedule group and maybe a cluster `default`, and S3 refuses the
+other prefixes.
 
 (EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
 """
@@ -59,7 +61,10 @@ class Account:
         self._making = threading.Lock()  # making a client is not thread-safe, using one is
 
     def client(self, service: str, region: str | None = None) -> Any:
-        """The boto3 client of a service, made once. `region`: another region, for the few services that need one."""
+        """Return the boto3 client of a service, made once.
+
+        `region`: another region, for the few services that need one.
+        """
         key = (service, region or self.region)
         with self._making:
             if key not in self._clients:
@@ -67,17 +72,17 @@ class Account:
             return self._clients[key]
 
     def fail_fast_client(self, service: str) -> Any:
-        """A new client that tries once and gives up after a few seconds. For calls whose answer is only a hint."""
+        """Return a new client, which tries once and gives up after seconds: for calls whose answer is only a hint."""
         with self._making:
             return self._session.client(service, region_name=self.region, config=_FAIL_FAST)
 
     def platform(self, installation: Installation) -> AwsPlatform:
-        """The five ports in this installation, with this account's credentials (`--profile` included)."""
+        """Return the five ports in this installation, with this account's credentials (`--profile` included)."""
         return AwsPlatform(installation.env, self._core, self._making)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
-        """To whom the credentials belong: `Account`, `Arn`. Raises botocore's errors (`deploy.core.explain`)."""
+        """Ask AWS whose the credentials are: `Account`, `Arn`. Raises botocore's errors (`deploy.core.explain`)."""
         return dict(self.client("sts").get_caller_identity())
 
     @property
@@ -87,7 +92,7 @@ class Account:
 
 
 def open_account(profile: str | None = None, region: str | None = None) -> Account:
-    """The account to work in. Raises `Problem` when there are no credentials or no region."""
+    """Open the account to work in. Raises `Problem` if there are no credentials or no region."""
     try:
         core = botocore.session.Session(profile=profile)
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
@@ -109,7 +114,7 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
 
 
 def _of_aws_login(profile: str) -> Problem:
-    """The problem of a profile of `aws login`: its credentials cannot be read here, and how AWS's CLI provides them.
+    """Explain that only AWS's CLI can read the credentials of this profile of `aws login`, and how to use them here.
 
     botocore reads them only with a package in C (awscrt). AWS's command line prints them, and renews them: credentials
     are valid for 15 minutes, a login for 12 hours (AWS SDKs and Tools Reference Guide, "Login credentials
@@ -139,12 +144,12 @@ class Installation:
 
     @classmethod
     def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
-        """The installation of a stack from DescribeStacks, in whatever state the stack is."""
+        """Return the installation of a stack from DescribeStacks, in whatever state the stack is."""
         outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
         return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
     def __getitem__(self, output: str) -> str:
-        """An output of the stack. Raises `Problem` if the stack is older than that output."""
+        """Return an output of the stack. Raises `Problem` if the stack is older than that output."""
         try:
             return self.outputs[output]
         except KeyError:
@@ -161,7 +166,7 @@ class Installation:
 
     @property
     def certificate(self) -> Location:
-        """Where the servers' certificate lies."""
+        """The place of the servers' certificate in the bucket."""
         return location(self.servers_domain, self["RootDomain"].strip(".").lower())
 
     @property
@@ -185,9 +190,9 @@ class Installation:
 
 
 def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
-    """The stack of that name or id, as DescribeStacks returns it; None if there is none, or if it is deleted.
+    """Return the stack of that name or id, as DescribeStacks returns it; None if there is none or it is deleted.
 
-    Raises `Problem` if it is no installation of Hippodrome: no command may touch a stack of others.
+    Raises `Problem` if the stack is no installation of Hippodrome: no command may touch a stack of others.
     """
     try:
         found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
@@ -213,19 +218,19 @@ def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
 def is_ours(found: Mapping[str, Any]) -> bool:
     """Whether a described stack is an installation of Hippodrome, or still empty.
 
-    By the tag that `apply` gives it, or by its parameters if it was made by hand from our template.
+    The tag that `apply` gives it tells, or its parameters if it was made by hand from our template.
     """
     tagged = any(tag["Key"] == TAG for tag in found.get("Tags", ()))
     return tagged or found["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(found)) >= _OUR_PARAMETERS
 
 
 def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
-    """The parameters of a described stack."""
+    """Return the parameters of a described stack."""
     return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
 
 
 def other_installations(account: Account, stack: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """The other installations in the account and region: the name and the parameters of each stack that has our tag."""
+    """Yield the other installations in the account and region: name and parameters of each stack with our tag."""
     for page in account.client("cloudformation").get_paginator("describe_stacks").paginate():
         for other in page["Stacks"]:
             if other["StackName"] != stack and any(tag["Key"] == TAG for tag in other.get("Tags", ())):
@@ -233,7 +238,7 @@ def other_installations(account: Account, stack: str) -> Iterator[tuple[str, dic
 
 
 def elsewhere(account: Account, stack: str) -> str:
-    """A sentence on other regions that have a code bucket of that stack's name; "" if none has, or S3 does not answer.
+    """Return a sentence on other regions with a code bucket of that stack's name; "" if there are none or S3 fails.
 
     S3 lists an account's buckets in all regions.
     """
@@ -248,7 +253,7 @@ def elsewhere(account: Account, stack: str) -> str:
 
 
 def find_installation(account: Account, stack: str = STACK) -> Installation:
-    """The installation, if its stack can be used. Raises `Problem` if there is none, or if its state forbids that."""
+    """Find the installation. Raises `Problem` if there is none, or if its stack's state forbids using it."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         raise Problem(

@@ -19,7 +19,7 @@ PARAMETERS = ("ZoneA", "ZoneB")
 
 
 def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str] = ()) -> dict[str, str]:
-    """The template's parameters for zones: the stack's, else the zones of its subnets, else two that run Fargate.
+    """Choose the template's parameters for zones: the stack's, else its subnets' zones, else two that run Fargate.
 
     `previous` are the stack's parameters, `subnets` the ids of the subnets in its own VPC, if it has one. Raises
     `Problem` if the region has no two such zones.
@@ -36,7 +36,7 @@ def choose(account: Account, previous: Mapping[str, str], subnets: Sequence[str]
 
 
 def _zones_of(account: Account, subnets: Sequence[str]) -> list[str]:
-    """The zones of these subnets, in the subnets' order; empty if one of the subnets is gone."""
+    """Return the zones of these subnets, in the subnets' order; empty if one of the subnets is gone."""
     if not subnets:
         return []
     try:
@@ -50,7 +50,7 @@ def _zones_of(account: Account, subnets: Sequence[str]) -> list[str]:
 
 
 def _fargate_zones(account: Account) -> list[str]:
-    """The zones of the region that this account can use and that run Fargate, sorted by name. No local zones."""
+    """Return the region's zones that run Fargate and that this account can use, sorted, without local zones."""
     found = account.client("ec2").describe_availability_zones()["AvailabilityZones"]
     return sorted(
         str(zone["ZoneName"])

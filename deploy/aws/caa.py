@@ -10,23 +10,26 @@ from dataclasses import dataclass
 from deploy.aws import hosted_zone
 
 AMAZON = ("amazon.com", "amazontrust.com", "awstrust.com", "amazonaws.com")
-"""Any of them lets ACM issue (ACM's user guide, "(Optional) Configure a CAA record")."""
+"""Amazon's names in CAA records. Any of them lets ACM issue (ACM's user guide, "(Optional) Configure a CAA record")."""
 LETS_ENCRYPT = ("letsencrypt.org",)
-"""Let's Encrypt's page "Certificate Authority Authorization (CAA)"."""
+"""Let's Encrypt's name in CAA records (its page "Certificate Authority Authorization (CAA)")."""
 
 Record = tuple[str, str]  # tag and value
 
 
 @dataclass(frozen=True)
 class Caa:
-    """The CAA records that apply to a name. They stand at `where`: the name or the nearest domain above; "" if none."""
+    """The CAA records that apply to a name.
+
+    They stand at `where`: the name or the nearest domain above; "": none do.
+    """
 
     where: str = ""
     records: tuple[Record, ...] = ()
     certain: bool = True  # False: DNS could not be asked
 
     def forbidding(self, authorities: Sequence[str], *, wildcard: bool, acme: bool = False) -> list[Record]:
-        """The records that keep all these authorities from issuing; empty if one of them may issue.
+        """Return the records that keep all these authorities from issuing; empty if one of them may issue.
 
         For a wildcard, `issuewild` counts instead of `issue` if there is any (section 4.3). With `acme`, an authority
         may issue only if it may validate by DNS-01 (RFC 8657).
@@ -38,7 +41,7 @@ class Caa:
 
 
 def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
-    """The records that apply to a name (section 3: up the tree, to the first name that has some).
+    """Ask DNS for the records that apply to a name: its own, or those of the nearest domain above (section 3).
 
     `known` says whether a name exists. DNS is not asked for a name that does not (`deploy.aws.hosted_zone.exists` says
     why). Raises only what `known` raises.
@@ -63,7 +66,7 @@ def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
 
 
 def _allows(value: str, authority: str, acme: bool) -> bool:
-    """Whether the value of an issue or issuewild record names the authority; with `acme`, also allows DNS-01."""
+    """Whether the value of an issue or issuewild record allows the authority to issue; with `acme`, by DNS-01."""
     issuer, *parameters = (part.strip() for part in value.split(";"))
     if issuer.lower() != authority:
         return False

@@ -17,12 +17,12 @@ from deploy.aws.account import Account
 
 LEAST = 2  # the least that MaximumConcurrency takes
 USUAL = 20  # servers that start at once: ECS allows 20 RunTask a second, and a start takes about a second
-OTHERS = 2 * LEAST  # of task_changed and stop_server: Route 53 takes a zone's changes one after the other anyway
+OTHERS = 2 * LEAST  # task_changed and stop_server: more would wait, since Route 53 takes a zone's changes one by one
 PARAMETER = "StartConcurrency"
 
 
 def starts(limit: int) -> int:
-    """MaximumConcurrency of start_server in an account with `limit` executions. At least half of them stay for pages.
+    """Return MaximumConcurrency of start_server for an account's `limit` executions; at least half stay for pages.
 
     In a small account fewer stay, because each of the three mappings must have at least 2: of 10 executions, 4 stay.
     """
@@ -30,17 +30,17 @@ def starts(limit: int) -> int:
 
 
 def workers(limit: int) -> int:
-    """The executions that the functions behind queues take at most, in an account with `limit` executions."""
+    """Return the most executions that the functions behind queues take in an account with `limit` executions."""
     return starts(limit) + OTHERS
 
 
 def parameters(limit: int) -> dict[str, str]:
-    """The template's parameters for an account with `limit` executions (`unreserved`)."""
+    """Return the template's parameters for an account with `limit` executions, the number that `unreserved` returns."""
     return {PARAMETER: str(starts(limit))}
 
 
 def unreserved(account: Account) -> int:
-    """The concurrent executions that the account has in this Region and no function has reserved.
+    """Ask Lambda how many concurrent executions the account has in this Region that no function has reserved.
 
     Raises ClientError if Lambda refuses, KeyError if its answer has no limit.
     """
@@ -49,7 +49,7 @@ def unreserved(account: Account) -> int:
 
 
 def unreserved_or_none(account: Account) -> int | None:
-    """As `unreserved`, but None if Lambda does not say."""
+    """Return the same as `unreserved`; None if Lambda does not tell."""
     try:
         return unreserved(account)
     except (ClientError, KeyError):

@@ -22,7 +22,7 @@ _ID = re.compile(r"[A-Z0-9]{1,32}")
 
 @dataclass(frozen=True)
 class Zone:
-    """A public hosted zone: its id, its domain without the final dot, and the name servers Route 53 gave it."""
+    """A public hosted zone: its id, its domain without the final dot, and the name servers that Route 53 gave it."""
 
     id: str
     domain: str
@@ -34,7 +34,7 @@ class Zone:
 
 
 def clean_domain(domain: str) -> str:
-    """The domain in lower case without a final dot. Raises `Problem` if it is no domain."""
+    """Write the domain in lower case and without a final dot. Raises `Problem` if it is no domain."""
     found = domain.strip().rstrip(".").lower()
     if not _DOMAIN.fullmatch(found):
         raise Problem(f"{domain!r} is not a domain.", "Give one such as example.org.")
@@ -42,7 +42,7 @@ def clean_domain(domain: str) -> str:
 
 
 def find_zone(account: Account, domain: str) -> Zone:
-    """The public zone of the domain or, if it has none of its own, of the nearest domain above it.
+    """Find the public zone of the domain or, if it has none of its own, of the nearest domain above it.
 
     Raises `Problem` if there is none, or if several zones have that name.
     """
@@ -75,22 +75,27 @@ def find_zone(account: Account, domain: str) -> Zone:
 
 
 def read_zone(account: Account, zone_id: str) -> Zone:
-    """A zone by its id. Raises `Problem` if there is none with that id, or if it is private."""
+    """Read a zone by its id. Raises `Problem` if there is none with that id, or if it is private."""
     if not _ID.fullmatch(zone_id):
         raise Problem(f"{zone_id!r} is not the id of a hosted zone.", "They look like Z0123456789ABCDEFGHIJ.")
     client = account.client("route53")
     try:
         found = client.get_hosted_zone(Id=zone_id)
     except (client.exceptions.NoSuchHostedZone, client.exceptions.InvalidInput):
-        raise Problem(f"This account has no hosted zone {zone_id}.") from None
+        raise Problem(
+            f"This account has no hosted zone {zone_id}.", "`aws route53 list-hosted-zones` lists those that it has."
+        ) from None
     if found["HostedZone"].get("Config", {}).get("PrivateZone"):
-        raise Problem(f"The hosted zone {zone_id} is private: participants could not find anything in it.")
+        raise Problem(
+            f"The hosted zone {zone_id} is private: participants could not find anything in it.",
+            "Give the id of the domain's public zone.",
+        )
     servers = found.get("DelegationSet", {}).get("NameServers", [])
     return Zone(zone_id, found["HostedZone"]["Name"].rstrip("."), tuple(sorted(one.rstrip(".") for one in servers)))
 
 
 def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
-    """The zone's A, AAAA or CNAME record of `name`; None if there is none."""
+    """Return the zone's A, AAAA or CNAME record of `name`; None if there is none."""
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="10"
     )
@@ -115,7 +120,10 @@ def exists(account: Account, zone: Zone, name: str) -> bool:
 
 
 def _has_records(account: Account, zone: Zone, name: str) -> bool:
-    """Whether the zone has a record of this name or of a name below it, which comes next in Route 53's order."""
+    """Whether the zone has a record of this name or of a name below it.
+
+    One record tells: in Route 53's order, the names below a name come next after it.
+    """
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="1"
     )
@@ -154,7 +162,7 @@ def delegation(zone: Zone) -> Delegation:
 
 
 def resolver() -> dns.resolver.Resolver:
-    """A resolver with this machine's configuration, which gives up after `DNS_TIMEOUT`."""
+    """Make a resolver with this machine's configuration, which gives up after `DNS_TIMEOUT`."""
     import dns.resolver
 
     made = dns.resolver.Resolver(configure=True)
@@ -163,7 +171,7 @@ def resolver() -> dns.resolver.Resolver:
 
 
 def _answers(asked: dns.resolver.Resolver, domain: str) -> bool:
-    """Whether the resolver answers for `domain`. If not, its failure with a domain below says nothing of that one."""
+    """Whether the resolver answers for `domain`. If it does not, its failure for a domain below proves nothing."""
     import dns.exception
     import dns.resolver
 

@@ -31,7 +31,10 @@ VPCS = Quota("vpc", "L-F678F1CE")
 
 
 def applied(account: Account, quota: Quota) -> float | None:
-    """The quota's value for this account, else AWS's default; None if AWS tells neither. Raises botocore's errors."""
+    """Ask for the quota's value in this account, else for AWS's default. Return None if AWS tells neither.
+
+    Raises botocore's errors.
+    """
     client: Any = account.client("service-quotas")
     for ask in (client.get_service_quota, client.get_aws_default_service_quota):
         try:
@@ -45,7 +48,7 @@ def applied(account: Account, quota: Quota) -> float | None:
 
 
 def request(account: Account, quota: Quota, wanted: float) -> str:
-    """The AWS CLI command that asks for a higher value, as the Service Quotas console does. AWS takes hours to days."""
+    """Return the AWS CLI command that asks for a higher value, which AWS grants after hours or days."""
     return (
         f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
         f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"

@@ -28,17 +28,17 @@ SUPPORTED: Mapping[str, str] = {
     "us-west-1": "N. California",
     "us-west-2": "Oregon",
 }
-"""Region → its place. Each has every resource type of the template and every service that the commands use."""
+"""By region, its place. Each region has every resource type of the template and every service of the commands."""
 
 FARGATE_ZONES: Mapping[str, frozenset[str]] = {
     "ap-northeast-1": frozenset({"apne1-az1", "apne1-az2", "apne1-az4"}),
     "ca-central-1": frozenset({"cac1-az1", "cac1-az2"}),
     "us-west-1": frozenset({"usw1-az1", "usw1-az3"}),
 }
-"""Region → the ids of its zones that run Fargate. Regions in which all zones do are left out.
+"""By region, the ids of its zones that run Fargate. Regions in which all zones do are left out.
 
 Source: "Supported Regions for Amazon ECS on AWS Fargate", ECS's developer guide. Earlier editions restricted
-ca-central-1 to these two zones, those of 2026 do not: the two zones are right either way.
+ca-central-1 to these two zones, and editions of 2026 do not. These two zones run Fargate in either case.
 """
 
 

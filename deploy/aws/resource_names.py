@@ -16,46 +16,46 @@ _VENDED = "/aws/vendedlogs/hippodrome/{}/"
 
 
 def prefix(stack: str) -> str:
-    """The prefix of the stack's task definitions, functions and queues. Another stack's name may begin with it, too."""
+    """Return the prefix of the stack's task definitions, functions and queues. Another stack's may begin with it."""
     return f"{stack}-"
 
 
 def function(stack: str, name: str) -> str:
-    """The name of the function that runs the handler `name` in `lambdas/`."""
+    """Return the name of the function that runs the handler `name` in `lambdas/`."""
     return f"{stack}-{name}"
 
 
 def family(stack: str, project_id: str) -> str:
-    """The task definition family of a project, which all its revisions share."""
+    """Return the name of a project's task definition family, which all its revisions share."""
     return f"{stack}-{project_id}"
 
 
 def bucket_prefix(stack: str) -> str:
-    """The prefix of the names of the stack's buckets."""
+    """Return the prefix of the names of the stack's buckets."""
     return prefix(stack).lower()
 
 
 def code_bucket(stack: str, account_id: str, region: str) -> str:
-    """The bucket for the zips of the stack's functions and for its templates."""
+    """Return the name of the bucket for the zips of the stack's functions and for its templates."""
     return f"{stack}-code-{account_id}-{region}".lower()
 
 
 def code_bucket_region(stack: str, bucket: str) -> str | None:
-    """The region of a bucket of that name; None if it is not the code bucket of a stack of that name."""
+    """Return the region of a bucket of that name; None if it is not the code bucket of a stack of that name."""
     found = re.fullmatch(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)", bucket)
     return found[1] if found else None
 
 
 def log_prefixes(stack: str) -> tuple[str, ...]:
-    """The prefixes of the names of the stack's log groups."""
+    """Return the prefixes of the names of the stack's log groups."""
     return _OURS.format(stack), _VENDED.format(stack)
 
 
 def log_group(stack: str, source: str) -> str:
-    """The log group of a source: a function's name, `trial`, `image` or `api`."""
+    """Return the name of the log group of a source, which is a function's name, `trial`, `image` or `api`."""
     return (_VENDED if source == API else _OURS).format(stack) + source
 
 
 def log_source(stack: str, group: str) -> str:
-    """The source of a log group, by the group's name: a function's name, `trial`, `image` or `api`."""
+    """Return the source of the log group of this name: a function's name, `trial`, `image` or `api`."""
     return group.removeprefix(_OURS.format(stack)).removeprefix(_VENDED.format(stack))

@@ -24,9 +24,9 @@ _PIECE = 256 * 1024  # bytes
 
 
 class Version(NamedTuple):
-    """One version or delete marker of an object, or an unfinished upload (`upload` is its id).
+    """A version or delete marker of an object, or an unfinished upload (`upload` is its id).
 
-    `latest`: it is the version that GetObject returns.
+    `latest`: whether it is the version that GetObject returns.
     """
 
     key: str
@@ -46,7 +46,7 @@ class VersionedBucket:
         self._bucket = {"Bucket": name, "ExpectedBucketOwner": account.id}
 
     def versions(self, prefix: str = "") -> Iterator[Version]:
-        """Every version and delete marker whose key has this prefix, 1,000 a request."""
+        """Yield every version and delete marker whose key has this prefix. A request lists 1,000 of them."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Prefix=prefix, **self._bucket):
             for line in page.get("Versions", ()):
                 yield Version(line["Key"], line["VersionId"], line["Size"], latest=line["IsLatest"])
@@ -54,22 +54,22 @@ class VersionedBucket:
                 yield Version(line["Key"], line["VersionId"], marker=True, latest=line["IsLatest"])
 
     def versions_of(self, key: str) -> Iterator[Version]:
-        """Every version and delete marker of one object."""
+        """Return every version and delete marker of one object."""
         return (version for version in self.versions(key) if version.key == key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """Every unfinished upload whose key has this prefix."""
+        """Yield every unfinished upload whose key has this prefix."""
         for page in self._s3.get_paginator("list_multipart_uploads").paginate(Prefix=prefix, **self._bucket):
             for line in page.get("Uploads", ()):
                 yield Version(line["Key"], "", upload=line["UploadId"])
 
     def folders(self) -> Iterator[str]:
-        """The top-level folders of all keys that have a version, without the slash."""
+        """Yield the top-level folders of all keys that have a version, without the slash."""
         for page in self._s3.get_paginator("list_object_versions").paginate(Delimiter="/", **self._bucket):
             yield from (line["Prefix"].removesuffix("/") for line in page.get("CommonPrefixes", ()))
 
     def read(self, version: Version) -> bytes:
-        """The content of a version; empty if the version is gone or is a delete marker."""
+        """Return the content of a version; empty if the version is gone or is a delete marker."""
         try:
             return bytes(self._get(version)["Body"].read())
         except ClientError as error:
@@ -89,7 +89,10 @@ class VersionedBucket:
             self._s3.put_object(Key=key, Body=body, **self._bucket)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Store a new version of a small object if its newest version is still `before`; return whether it was so."""
+        """Store a new version of a small object if its newest version is still `before`.
+
+        Return whether it was stored.
+        """
         try:
             found = self._s3.get_object(Key=key, **self._bucket)
             if found["Body"].read() != before:
@@ -105,7 +108,7 @@ class VersionedBucket:
         return self._s3.get_object(Key=version.key, VersionId=version.id, **self._bucket)
 
     def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None] = lambda _: None) -> int:
-        """Delete these versions for good; return how many. `note` gets the deleted versions after each request.
+        """Delete these versions for good, and return how many. `note` gets the deleted versions after each request.
 
         Raises `Problem` if S3 refuses some of them.
         """

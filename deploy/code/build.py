@@ -58,7 +58,7 @@ class Function:
         return f"{self.name}-{self.digest[:16]}.zip"
 
     def pack(self) -> bytes:
-        """The zip: its files, and their bytecode where this machine has the Python that will run them.
+        """Make the zip of its files, with their bytecode if this machine has the Python that will run them.
 
         The bytecode follows from the files, so it is no part of the digest.
         """
@@ -78,7 +78,7 @@ class Function:
 
 
 def functions(target: Target, root: Path = ROOT, wheels: WheelCache | None = None) -> list[Function]:
-    """Every function in `lambdas/` (each module with a `handler`), for this target.
+    """Find the functions in `lambdas/` (each module with a `handler`), and collect their files for this target.
 
     Raises `Problem` if an imported package is not pinned or cannot be downloaded.
     """
@@ -107,7 +107,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
 
 
 def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
-    """The wheel's Python files that the imports `wanted` reach without passing through the modules `ends`."""
+    """Return the wheel's Python files that the imports `wanted` reach without the modules `ends` and their imports."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
     def source(module: str) -> SourceModule | None:
@@ -154,7 +154,7 @@ class _Tree:
         return self._sources[module]
 
     def files(self, module: str) -> Iterator[ZipMember]:
-        """The module's own file, and the files that it reads at run time."""
+        """Yield the module's own file, and the files that it reads at run time."""
         path = self._path(module)
         if path:
             yield self._member(path)
@@ -184,7 +184,7 @@ class _Tree:
 
 @dataclass(frozen=True)
 class Closure:
-    """All modules that some modules import, directly or not: `inside` those that are followed, `outside` the others."""
+    """All modules that some modules import, directly or not. Those `inside` have a source here, whose imports count."""
 
     inside: frozenset[str]
     outside: frozenset[str]
@@ -215,7 +215,10 @@ def _with_parents(name: str) -> Iterator[str]:
 
 @cache
 def imported(source: SourceModule, module: str) -> set[str]:
-    """Every name that the module imports, anywhere in it. `from a import b` gives `a` and `a.b`: b may be a module."""
+    """Return every name that the module imports, anywhere in it.
+
+    `from a import b` gives `a` and `a.b`: b may be a module.
+    """
     found: set[str] = set()
     for node in _statements(_parse(source.text, module)):
         if isinstance(node, ast.Import):
@@ -235,7 +238,10 @@ def _base(node: ast.ImportFrom, module: str, package: bool) -> str:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """All statements of the tree but the bodies of `if TYPE_CHECKING:`. Expressions, which hold none, are skipped."""
+    """Yield all statements of the tree, except those in `if TYPE_CHECKING:`.
+
+    Expressions, which hold none, are skipped.
+    """
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.expr):
             continue

@@ -26,7 +26,7 @@ compileall.compile_dir(folder, quiet=2, stripdir=folder, prependdir=where, inval
 
 @functools.cache
 def compiler(version: str) -> str | None:
-    """The path of a Python of that version ("3.13") on this machine, or None."""
+    """Find a Python of that version ("3.13") on this machine. Return its path, or None."""
     if version == f"{sys.version_info.major}.{sys.version_info.minor}":
         return sys.executable
     managed = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
@@ -57,7 +57,7 @@ def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
 
 
 def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, bytes]]:
-    """The bytecode file of each module, under the module's name."""
+    """Compile each module. Return, by the modules' names, the bytecode file of each."""
     with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
         root = Path(folder)
         for name, body in sources.items():
@@ -70,5 +70,5 @@ def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, b
 
 
 def _source(bytecode: Path) -> str:
-    """The source file of a bytecode file: `a/b.py` for `a/__pycache__/b.cpython-313.pyc`."""
+    """Return the source file of a bytecode file: `a/b.py` for `a/__pycache__/b.cpython-313.pyc`."""
     return bytecode.parent.parent.joinpath(bytecode.name.rsplit(".", 2)[0] + ".py").as_posix()

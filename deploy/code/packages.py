@@ -50,7 +50,7 @@ _LEAVE_OUT = re.compile(  # not needed to run: stubs, C sources, tests, metadata
 
 @dataclass(frozen=True)
 class Target:
-    """What the zips must run on: a CPython version ("3.13") and a machine ("aarch64"), with glibc; or this machine."""
+    """The platform that runs the zips: a CPython version ("3.13") and a machine ("aarch64") with glibc, or this one."""
 
     python: str = "3.13"
     machine: str = "aarch64"
@@ -58,12 +58,12 @@ class Target:
 
     @classmethod
     def here(cls) -> Target:
-        """The running interpreter as the target."""
+        """Return the running interpreter as the target."""
         return cls(f"{sys.version_info.major}.{sys.version_info.minor}", platform.machine().lower(), local=True)
 
     @classmethod
     def from_env(cls) -> Target:
-        """Lambda's platform; this machine if HIPPODROME_TARGET is `here`. Raises `Problem` for an unknown value."""
+        """Return Lambda's platform; this machine if HIPPODROME_TARGET is `here`. Raises `Problem` for another value."""
         wanted = os.environ.get("HIPPODROME_TARGET", "")
         if wanted not in {"", "here", "lambda"}:
             raise Problem(f"HIPPODROME_TARGET is {wanted!r}.", "It may be `here`, `lambda` or unset.")
@@ -106,7 +106,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Pin:
-    """A distribution's one version, and the sha256 of its wheel for Lambda ("" if not known)."""
+    """The version of a distribution, and the sha256 of its wheel for Lambda ("" if not known)."""
 
     name: str
     version: str
@@ -125,7 +125,7 @@ class ZipMember:
     load: Callable[[], bytes]
 
     def read(self) -> bytes:
-        """The file's bytes. Raises `Problem` if their hash is not `sha256`."""
+        """Return the file's bytes. Raises `Problem` if their hash is not `sha256`."""
         body = self.load()
         if hashlib.sha256(body).hexdigest() != self.sha256:
             raise Problem(f"{self.name} changed while it was packed.", "Run the same command again.")
@@ -155,7 +155,7 @@ class Wheel:
         return {top.split(".")[0] for top in tops if "." not in top or top.endswith((".py", ".so", ".pyd"))}
 
     def needs(self, target: Target) -> set[str]:
-        """The normalized names of the distributions that it needs on this target. Extras are not followed."""
+        """Return the normalized names of the distributions that the wheel needs on this target, without extras."""
         from packaging.utils import canonicalize_name
 
         wanted = self._requirements
@@ -198,7 +198,7 @@ class Wheel:
 
     @cached_property
     def _record(self) -> dict[str, str]:
-        """RECORD: file → sha256 in hexadecimal; "" for RECORD itself."""
+        """Read RECORD: by file, the sha256 in hexadecimal; "" for RECORD itself."""
         found = {}
         for row in csv.reader(io.StringIO(self._text("RECORD"))):
             if row:
@@ -208,7 +208,7 @@ class Wheel:
 
 
 def _place(name: str) -> str:
-    """Where a wheel's file is installed, as a path below site-packages; "" for scripts, headers and data (PEP 427)."""
+    """Return where a wheel's file is installed below site-packages; "" for scripts, headers and data (PEP 427)."""
     folder, _, rest = name.partition("/")
     if folder.endswith(".data"):
         kind, _, rest = rest.partition("/")
@@ -217,7 +217,7 @@ def _place(name: str) -> str:
 
 
 def read_pins(path: Path = PINS) -> dict[str, Pin]:
-    """The pins of a requirements file, by normalized name; lines that are not `name==version` are left out."""
+    """Return the pins of a requirements file, by normalized name; lines that are not `name==version` are left out."""
     from packaging.utils import canonicalize_name
 
     found: dict[str, Pin] = {}
@@ -238,14 +238,17 @@ class WheelCache:
         self._wheels: dict[str, Wheel] = {}
 
     def wheels(self, names: Iterable[str]) -> dict[str, Wheel]:
-        """The wheels of these distributions. Raises `Problem` if one is not pinned, or cannot be downloaded."""
+        """Return the wheels of these distributions, by name.
+
+        Raises `Problem` if one is not pinned or not downloaded.
+        """
         pins = [self._pin(name) for name in sorted(names)]
         if missing := [pin for pin in pins if not self._find(pin)]:
             self._download(missing)
         return {pin.name: self._wheels[pin.name] for pin in pins}
 
     def closure(self, names: Iterable[str]) -> set[str]:
-        """These distributions and all that they need, without those that Lambda's runtime has."""
+        """Return these distributions and all that they need, except those that Lambda's runtime has."""
         found: set[str] = set()
         wanted = set(names) - IN_RUNTIME
         while new := wanted - found:
@@ -255,7 +258,7 @@ class WheelCache:
 
     @cached_property
     def owners(self) -> dict[str, str]:
-        """Top-level module → its distribution, for all pinned distributions."""
+        """Return, by top-level module, its distribution, for all pinned distributions."""
         return {module: name for name, wheel in self.wheels(self.pins).items() for module in wheel.modules}
 
     def _pin(self, name: str) -> Pin:
@@ -343,7 +346,7 @@ class WheelCache:
 
 
 def cache_folder() -> Path:
-    """Hippodrome's folder below the user's caches on this platform. It may be deleted at any time."""
+    """Return Hippodrome's folder below the user's caches on this platform. It may be deleted at any time."""
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
@@ -364,7 +367,7 @@ ALSO = ("acme", "cryptography", "josepy")  # distributions of deploy.txt that fu
 
 
 def lock() -> str:
-    """The text of `packages.txt`: direct requirements as they are pinned, all others in the versions installed here."""
+    """Write the text of `packages.txt`: direct requirements as pinned, all others in the versions installed here."""
     direct = read_pins(ROOT / "requirements" / "lambdas.txt")
     deploy = read_pins(ROOT / "requirements" / "deploy.txt")
     pins = direct | {name: deploy[name] for name in ALSO if name in deploy}

@@ -27,14 +27,17 @@ class Template:
 
     @classmethod
     def read(cls, path: Path = PATH) -> Template:
-        """The template in the project. Raises `Problem` if it cannot be read."""
+        """Read the project's template. Raises `Problem` if it cannot be read."""
         try:
             return cls(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise Problem(f"{path.name} cannot be read: {error.strerror}.") from None
 
     def with_code(self, functions: Iterable[Function]) -> Template:
-        """The template with each `<function>.zip` replaced by its zip's key. Raises `Problem` if one is missing."""
+        """Replace each `<function>.zip` in the template by the key of its zip, and return the result.
+
+        Raises `Problem` if one is missing.
+        """
         keys = {function.name: function.key for function in functions}
         missing: set[str] = set()
 
@@ -73,7 +76,10 @@ class Template:
         }
 
     def refused(self, parameters: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-        """The parameters whose values CloudFormation would refuse, each with what it must be. Ignores unknown names."""
+        """Yield the parameters whose values CloudFormation would refuse, each with what it must be.
+
+        Ignores unknown names.
+        """
         for name, spec in self.body.get("Parameters", {}).items():
             value = parameters.get(name, "")
             allowed = [str(one) for one in spec.get("AllowedValues", ())]
@@ -85,7 +91,7 @@ class Template:
                 yield name, f"must not be longer than {spec['MaxLength']}"
 
     def resources(self, parameters: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
-        """The resources that exist with these parameters, by logical id."""
+        """Return the resources that exist with these parameters, by logical id."""
         conditions = self.body.get("Conditions", {})
         return {
             name: resource
@@ -95,7 +101,7 @@ class Template:
         }
 
     def function_names(self) -> dict[str, str]:
-        """Logical id → file name in `lambdas/`, from the handlers."""
+        """Return, by logical id, the function's file name in `lambdas/`, which its handler names."""
         found = {}
         for name, resource in self.body["Resources"].items():
             handler = resource.get("Properties", {}).get("Handler")
@@ -105,7 +111,7 @@ class Template:
 
 
 def _evaluate(expression: Any, conditions: Mapping[str, Any], parameters: Mapping[str, str]) -> Any:
-    """The value of an expression of the section Conditions."""
+    """Evaluate an expression of the section Conditions."""
     if not isinstance(expression, dict) or len(expression) != 1:
         return expression
     ((name, value),) = expression.items()

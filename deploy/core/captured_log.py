@@ -23,7 +23,7 @@ class Failures(logging.Handler):
 
 @contextmanager
 def functions_log() -> Iterator[Failures]:
-    """Within the block, collect the errors that `hippodrome` logs in `Failures`, and print none of its log lines."""
+    """Collect, within the block, the errors that `hippodrome` logs, and print none of its log lines."""
     from hippodrome.log import logger  # noqa: PLC0415 - Powertools, which most commands do without
 
     handler = logger.registered_handler

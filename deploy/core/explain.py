@@ -25,7 +25,8 @@ DENIED = {
     "403",
 }
 _NOT_ACTIVE = {"OptInRequired", "SubscriptionRequiredException", "NotSignedUp"}
-"""Error codes of an account whose sign-up is not complete or not known everywhere (re:Post, "error-access-service")."""
+"""The error codes for an account whose sign-up is not complete or not known everywhere (re:Post,
+"error-access-service")."""
 NOT_ACTIVE = (
     "AWS has not activated this account yet.",
     "Finish the sign-up in AWS's console (credit card, telephone), and wait for AWS's mail, which takes minutes, or "
@@ -35,7 +36,7 @@ _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "
 
 
 def problem_from(error: BaseException) -> Problem | None:
-    """The problem that explains an error of AWS, of the network or of a missing package; None for other errors."""
+    """Explain an error of AWS, the network or a missing package by a problem with advice; None for other errors."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, boto.ClientError):
@@ -85,5 +86,5 @@ def _refusal(error: boto.ClientError) -> Problem:
 
 
 def _words(operation: str) -> str:
-    """The name of an API operation in words: `PutObject` → `put object`."""
+    """Write the name of an API operation in words: `PutObject` becomes `put object`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", operation).lower()

@@ -26,6 +26,7 @@ class Mark(StrEnum):
 
     @property
     def sign(self) -> str:
+        """The sign that is printed before the finding."""
         return {"good": "✓", "look": "!", "bad": "✗"}[self.value]
 
 
@@ -43,19 +44,22 @@ class Finding:
 
 
 def good(check: str, text: str) -> Finding:
+    """Make a finding that all is well."""
     return Finding(check, Mark.GOOD, text)
 
 
 def look(check: str, text: str, advice: str = "") -> Finding:
+    """Make a finding that is worth a look, with advice."""
     return Finding(check, Mark.LOOK, text, advice)
 
 
 def bad(check: str, text: str, advice: str = "") -> Finding:
+    """Make a finding that affects participants, with advice."""
     return Finding(check, Mark.BAD, text, advice)
 
 
 def show(findings: Iterable[Finding], console: Console) -> None:
-    """Print the findings, a line for each."""
+    """Print each finding on a line."""
     for finding in findings:
         mark = Text(f"{finding.mark.sign} ", style=STYLES[finding.mark])
         console.print(mark + Text(f"{finding.check}: {finding.text}"))
@@ -67,7 +71,7 @@ Subject = TypeVar("Subject")
 
 
 def examine(subject: Subject, checks: Mapping[str, Callable[[Subject], Iterable[Finding]]]) -> list[Finding]:
-    """Run all checks at the same time; return their findings in the order of `checks`.
+    """Run all checks at the same time, and return their findings in the order of `checks`.
 
     A check that raises becomes a finding that says why. With HIPPODROME_DEBUG set, an unexpected error is raised.
     """

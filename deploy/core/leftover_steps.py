@@ -12,7 +12,7 @@ STOP_REASON = f"{messages.STOP_REASON_PREFIX} {Reason.STOPPED}"
 
 
 def removal_steps(platform: Platform, left: Resources) -> list[PlanStep]:
-    """The steps that stop the tasks, delete the DNS records with one change, and cancel the timers."""
+    """Return the steps that stop the tasks, delete the DNS records with one change, and cancel the timers."""
     from hippodrome.servers.dns import delete_dns_records  # noqa: PLC0415 - imports Powertools, which other commands do without
 
     steps = [step(platform.tasks.stop, task.task, task.cluster, STOP_REASON) for task in left.tasks]
@@ -21,5 +21,5 @@ def removal_steps(platform: Platform, left: Resources) -> list[PlanStep]:
 
 
 def cluster_steps(platform: Platform, left: Resources) -> list[PlanStep]:
-    """The steps that delete the clusters. ECS refuses to delete a cluster while a task in it is ending."""
+    """Return the steps that delete the clusters. ECS refuses that while a task in the cluster is ending."""
     return [step(platform.tasks.delete_cluster, cluster) for cluster in left.clusters]

@@ -19,7 +19,7 @@ def is_folder(given: str) -> bool:
 
 
 def project_id(given: str | None) -> str | None:
-    """The id that `--project` gives, or that of the folder that it names. Raises `Problem` if the folder has none."""
+    """Return the id in `--project`, or the id of the folder that it names. Raises `Problem` if that has none."""
     if given is None or not is_folder(given):
         return given
     from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is named
@@ -31,7 +31,7 @@ def project_id(given: str | None) -> str | None:
 
 
 def stack_name(given: str) -> str:
-    """The name of an installation. Raises `Problem` if no stack can have this name."""
+    """Check and return the name of an installation. Raises `Problem` if no stack can have this name."""
     if not STACK_NAME.fullmatch(given):
         raise Problem(
             f"{given!r} cannot be the name of an installation.",
@@ -46,7 +46,7 @@ def stack_name(given: str) -> str:
 
 
 def same_place(region: str, profile: str | None) -> str:
-    """The options that make another command use the same account and region, to be added to its line."""
+    """Return the options with which another command uses the same account and region, to be added to its line."""
     return f"--region {region}" + (f" --profile {shlex.quote(profile)}" if profile else "")
 
 

@@ -23,7 +23,7 @@ MEND = "Register it again, or put an older version of that document in its place
 
 @dataclass
 class ParticipantCounts:
-    """How many participants of a project are at which step. Counts, never ids."""
+    """The numbers of a project's participants, in all and by step. It holds no ids."""
 
     participants: int = 0
     by_step: dict[str, int] = field(default_factory=dict)  # step → how many are there; in the order of the study
@@ -33,7 +33,7 @@ class ParticipantCounts:
 
 
 def registered_projects(documents: Documents, unread: list[UnreadableEntry] | None = None) -> list[Project]:
-    """Every registered project, live or not, sorted by id. Raises `Problem` if the list cannot be read.
+    """Read the registered projects, live or not, sorted by id. Raises `Problem` if their list cannot be read.
 
     Entries that cannot be read are added to `unread`; without `unread`, a warning is printed for each of them.
     """
@@ -56,13 +56,13 @@ def registered_projects(documents: Documents, unread: list[UnreadableEntry] | No
 
 
 def unreadable(entry: UnreadableEntry) -> str:
-    """The sentence about an entry in the list of projects that cannot be read."""
+    """Write the sentence about an entry in the list of projects that cannot be read."""
     whose = f"the project {entry.id}" if entry.id else "a project without a well-formed id"
     return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
 
 
 def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
-    """All these projects, or the one with the id `wanted`. Raises `Problem` if it is not among them."""
+    """Return the project with the id `wanted`; None: all. Raises `Problem` if no project has this id."""
     projects = list(projects)
     if wanted is None:
         return projects
@@ -76,7 +76,7 @@ def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
 def count_participants(
     documents: Documents, project: Project, today: datetime, advance: Callable[[int], None] | None = None
 ) -> ParticipantCounts:
-    """Count the participants of a project; `today` is when the day began. Lists the folder, 1,000 keys a request.
+    """Count a project's participants, by a listing of its folder, 1,000 keys a request. `today`: when the day began.
 
     Folders without a participant's record, and ids that are not well formed, are not counted.
     """
@@ -103,7 +103,7 @@ def count_participants(
 
 
 def folders(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:
-    """The well-formed ids of a project's participants, each with the entries of its folder, lazily and in key order."""
+    """Yield the well-formed ids of a project's participants, in key order, each with the entries of its folder."""
     prefix = f"{project_id}/users/"
     for user_id, entries in itertools.groupby(
         documents.list(prefix), key=lambda entry: entry.key.removeprefix(prefix).partition("/")[0]

@@ -62,7 +62,7 @@ def read(folder: Path, installation: Installation | None = None) -> ProjectFolde
 
 
 def id_in(folder: Path) -> str | None:
-    """The project's id, even if config.yml has mistakes elsewhere; None if it cannot be read."""
+    """Return the project's id, even if config.yml has mistakes elsewhere; None if it cannot be read."""
     found = _value_of(folder, "id")
     return None if found is None else str(getattr(found, "text", found))
 
@@ -74,7 +74,7 @@ def uses_aws(folder: Path) -> bool:
 
 
 def may_use_aws(folder: Path) -> bool:
-    """Whether config.yml leaves open if the study is on AWS: it has awsSetup, but no useAWS."""
+    """Whether config.yml does not say if the study is on AWS: it has awsSetup, but no useAWS."""
     return _value_of(folder, "useAWS") is None and _value_of(folder, "awsSetup") is not None
 
 
@@ -84,7 +84,7 @@ def keeps_off_aws(config: Config) -> bool:
 
 
 def _value_of(folder: Path, key: str) -> Any:
-    """The value of this key in the section `project` of config.yml; None if the key is missing."""
+    """Return the value of this key in the section `project` of config.yml; None if the key is missing."""
     try:
         return read_source(folder).adapted.at(("project", key))
     except ConfigErrors:
@@ -92,7 +92,7 @@ def _value_of(folder: Path, key: str) -> Any:
 
 
 def registration_of(project: Project, live: bool) -> dict[str, Any]:
-    """What `update_project_master_list` takes to register a registered project again, with this value of `live`."""
+    """Return the registration with which `update_project_master_list` sets `live` of a registered project."""
     known = msgspec.to_builtins(project)
     ours = {"salt", "secret", "version"}
     kept = {key: value for key, value in known.items() if value is not None and key not in ours}
@@ -102,7 +102,7 @@ def registration_of(project: Project, live: bool) -> dict[str, Any]:
 
 
 def _aws_setup_of(installation: Installation) -> dict[str, str]:
-    """The values of `awsSetup` that the installation decides."""
+    """Return the values of `awsSetup` that the installation decides."""
     return {
         "bucket": installation["Bucket"],
         "region": installation.region,
@@ -111,7 +111,7 @@ def _aws_setup_of(installation: Installation) -> dict[str, str]:
 
 
 def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
-    """A mistake if the id is empty. On one machine an empty id stands for the folder's name."""
+    """Yield a mistake if the id is empty. On one machine an empty id stands for the folder's name."""
     given: Any = read_source(folder).parsed.values.get("project")
     if isinstance(given, dict) and given.get("id") in (None, ""):
         yield (
@@ -121,7 +121,7 @@ def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
 
 
 def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
-    """The keys that a study needs on AWS alone. With `useAWS: true` its size has been checked already."""
+    """Yield the missing keys that only AWS needs. With `useAWS: true` the servers' size has been checked already."""
     setup = config.project.aws_setup
     missing = [key for key in ("cpu", "memory") if not setup.given(key)]
     if keeps_off_aws(config):
@@ -135,7 +135,7 @@ def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
 
 
 def _contradictions(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
-    """Values of the project that this installation does not allow."""
+    """Yield the project's values that this installation does not allow."""
     project = config.project
     given = project.aws_setup.model_dump(by_alias=True)
     for key, here in _aws_setup_of(installation).items():
@@ -161,7 +161,7 @@ def _contradictions(config: Config, installation: Installation) -> Iterator[tupl
 
 
 def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
-    """Values of the project that have no effect here: the bucket's name, and a time longer than servers may run."""
+    """Yield the project's values without effect here: the bucket's name, and a time longer than servers may run."""
     most = int(installation["MaxRuntime"])
     if config.project.max_runtime > most:
         yield (
@@ -178,13 +178,13 @@ def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Key
 
 
 def _with_lines(folder: Path, found: list[tuple[Keys, str]], remark: bool = False) -> list[str]:
-    """The texts, each with its line in config.yml before it."""
+    """Put before each text its line in config.yml."""
     source = read_source(folder) if found else None
     return [str(source.diagnostic(path, text, remark=remark)) for path, text in found] if source else []
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:
-    """A mistake if Python cannot parse agent.py. `make check` runs it, too."""
+    """Yield a mistake if Python cannot parse agent.py. `make check` runs it, too."""
     found = layout.find(folder)
     if found.agent is None or not config.game_steps:
         return

@@ -26,7 +26,7 @@ class Records:
 
     @property
     def unreadable(self) -> int:
-        """How many records cannot be read."""
+        """The number of records that cannot be read."""
         return len(self.unreadable_labels)
 
     @property
@@ -36,7 +36,7 @@ class Records:
         return [key.removeprefix(RECORDS).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
-        """The records written at `moment` (aware) or later, or all. `advance` gets how many of how many are read."""
+        """Read the records written at `moment` (aware) or later, or all. `advance` gets the numbers read and in all."""
         wanted = [
             entry
             for entry in self._documents.list(RECORDS)
@@ -57,7 +57,7 @@ class Records:
         return [record for record in found if record is not None]
 
     def open(self, max_runtime: int, now: datetime) -> list[Server]:
-        """The records of servers that are not closed. `max_runtime` is the installation's, in minutes.
+        """Read the records of servers that are not closed. `max_runtime` is the installation's, in minutes.
 
         An open record was written last when its server became ready, so no longer ago than a server may live.
         """
@@ -65,16 +65,16 @@ class Records:
         return [record for record in recent if not record.is_closed]
 
     def read(self, labels: Iterable[str]) -> dict[str, Server]:
-        """The records of these labels, as they are now, by label. Labels without a readable record are left out."""
+        """Read the records of these labels as they are now. Return them by label, without those that cannot be read."""
         keys = sorted({server.key(label) for label in labels})
         with ThreadPoolExecutor(READERS) as pool:
             found = pool.map(self._load, keys)
             return {record.label: record for record in found if record is not None}
 
     def owners(self, names: Iterable[str]) -> dict[str, Server]:
-        """The records that own these resource names, by the rule of `Repository.owner`. Names without one are left out.
+        """Find the records that own these resource names, by the rule of `Repository.owner`. Other names are left out.
 
-        Two rounds of reads for all of them: an assigned warm server leads from its own record to the participant's.
+        It takes two rounds of reads: an assigned warm server leads from its own record to the participant's.
         """
         names = [*names]
         records = self.read(parsed[0] for name in names if (parsed := ids.parse_server_name(name)))
@@ -102,16 +102,16 @@ def _is_record(key: str) -> bool:
 
 
 def attempts_of(record: Server) -> list[PastAttempt]:
-    """Every attempt of a record, oldest first; the last one is the present attempt."""
+    """Return all attempts of a record, oldest first; the last is the present one."""
     return [*record.earlier, past_attempt(record)]
 
 
 def warm_servers_of(record: Server | None) -> list[str]:
-    """The names of the warm servers that were assigned to the owner of a record, in all attempts."""
+    """Return the names of the warm servers that a record's owner was given, in all attempts."""
     return [one.warm_server_name for one in attempts_of(record) if one.warm_server_name] if record else []
 
 
 def keys_of_warm_servers(project_id: str, names: Collection[str]) -> list[str]:
-    """The keys of the handover documents and the records of these warm servers, sorted."""
+    """Return the keys of these warm servers' handover documents and records, sorted."""
     labels = [parsed[0] for name in names if (parsed := ids.parse_server_name(name))]
     return sorted([*(handover_key(project_id, name) for name in names), *(server.key(label) for label in labels)])

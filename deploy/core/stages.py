@@ -32,7 +32,7 @@ class PlanStep:
 
 
 def step(operation: Callable[..., object], *arguments: Any) -> PlanStep:
-    """The instruction to call `operation` with these arguments."""
+    """Make the instruction to call `operation` with these arguments."""
     return PlanStep(operation, arguments)
 
 
@@ -108,10 +108,10 @@ class Executor:
         return found
 
     def retry(self, act: Callable[[], R], recover: Callable[[Exception], bool], tries: int) -> R:
-        """Call `act` until it succeeds, `tries` times at most; return what it returns.
+        """Call `act` until it succeeds, `tries` times at most, and return its result.
 
         `recover` gets the exception of a try that failed. It removes the cause and returns True; if it cannot, it
-        returns False, and the exception is raised. The exception of the last try is raised too.
+        returns False, and the exception is raised. The exception of the last try is raised, too.
         """
         for _ in range(tries - 1):
             try:
@@ -126,7 +126,7 @@ class Executor:
 
 
 class _Timer:
-    """Measures seconds: those on the clock, or the sum of all sleeps if it is more, as with a test's `sleep`."""
+    """Measures seconds: by the clock, or by the sum of all sleeps if that is more, as with a test's `sleep`."""
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
         self._clock = clock

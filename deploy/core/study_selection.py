@@ -24,12 +24,12 @@ class StudySelection:
 
 
 def project_id(given: str | None) -> str:
-    """The id of the study that `selected` finds. Raises `Problem` as `selected` does."""
+    """Find the study as `selected` does, and return its id. Raises `Problem` as `selected` does."""
     return selected(given).id
 
 
 def selected(given: str | None) -> StudySelection:
-    """The study that `--project` names by its id or its folder; without it, the one in this folder's config.yml.
+    """Find the study that `--project` names by its id or folder; without it, the study of this folder's config.yml.
 
     Raises `Problem` if there is none, or if its id is not well formed.
     """
@@ -50,7 +50,7 @@ def selected(given: str | None) -> StudySelection:
 
 
 def local_data(study: StudySelection) -> Path | None:
-    """The data folder of a study on this machine; None if its data are on AWS.
+    """Return the data folder of a study on this machine; None if its data are on AWS.
 
     Where config.yml leaves that open (it has awsSetup and no useAWS), the data are here if the folder `data` exists.
     Raises `Problem` if it runs on this machine, and the folder does not exist.
@@ -68,7 +68,7 @@ def local_data(study: StudySelection) -> Path | None:
 
 
 def none_here(study: str, folder: Path, on_aws: str) -> Problem:
-    """The problem of a study without data on this machine. `on_aws` is the advice for data that are on AWS."""
+    """Explain that a study has no data on this machine. `on_aws` is the advice for data that are on AWS."""
     tried = sorted((folder / TRIED).glob("try-*"))
     return Problem(
         f"There are no data of {study} on this machine: there is no folder {folder / DATA}.",
@@ -78,7 +78,7 @@ def none_here(study: str, folder: Path, on_aws: str) -> Problem:
 
 
 def folder_for(study: str, source: Path | None) -> Path:
-    """The default folder for converted data: `data-<project>` in the current folder.
+    """Return the default folder for converted data: `data-<project>` in the current folder.
 
     The data of a `source` that is not called `data`, such as a rehearsal's, get `data-<project>-<name of the source>`.
     """

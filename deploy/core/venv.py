@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def go_on(root: Path = ROOT) -> NoReturn:
-    """Run the same command with the Python in `.venv`; if it is not there, say what to do and exit with 1."""
+    """Run the same command with the Python in `.venv`. If there is none, print what to do and exit with 1."""
     made = root / ".venv"
     if (made / "deploy").exists() and Path(sys.prefix).resolve() != made.resolve():
         python = str(made / "bin" / "python")

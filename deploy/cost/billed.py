@@ -33,7 +33,7 @@ class Billed:
 
     @property
     def asking(self) -> float:
-        """What the requests to Cost Explorer have cost, in US dollars."""
+        """The price of the requests to Cost Explorer, in US dollars."""
         return self.requests * Prices().explorer_request.usd
 
 
@@ -65,7 +65,7 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
 
 
 def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:
-    """The bill and ""; or None and the reason with advice, so that a command can show the rest of its answer."""
+    """Ask as `billed` does. Return the bill and ""; if there is none, None and the reason, with advice."""
     try:
         return billed(account, stack, start, end), ""
     except Exception as error:

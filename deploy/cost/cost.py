@@ -84,7 +84,7 @@ def command(
 
 
 def _read(folder: Path) -> Config:
-    """The config.yml in a folder. Raises `Problem` with every mistake in it."""
+    """Read the config.yml in a folder. Raises `Problem` with every mistake in it."""
     from hippodrome.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
 
     try:
@@ -180,7 +180,7 @@ def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
 
 
 def _show_warm(waiting: Sequence[WarmCost]) -> None:
-    """Print what warm servers cost in an hour and a day. For how long their studies are live is not known."""
+    """Print what warm servers cost in an hour and in a day, since nobody knows how long their studies are live."""
     rows: list[Sequence[object]] = []
     for one in waiting:
         size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
@@ -281,7 +281,10 @@ def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
 
 
 def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
-    """The bill from the first server's day, or from the first of this month, on; or None, and why there is none."""
+    """Ask for the bill since the first server's day or the first of this month.
+
+    Return None and why if there is none.
+    """
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
     # Cost Explorer remembers about a year.
     start: date = max(first.date(), (now - timedelta(days=364)).date())

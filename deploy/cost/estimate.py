@@ -80,7 +80,7 @@ class StudyToEstimate:
 
     @property
     def lobby_polls(self) -> Range:
-        """Requests of all participants while they wait in the lobby."""
+        """The number of requests that the pages of all participants make while they wait in the lobby."""
         if not self.games or not self.has_sessions:
             return Range()
         most = self.patience / 2
@@ -93,7 +93,7 @@ class StudyToEstimate:
 
     @property
     def server_minutes(self) -> Range:
-        """Minutes of one server, from its start message to its end."""
+        """The minutes of one server, from its start message to its end."""
         if not self.games:
             return Range()
         if self.minutes is not None:
@@ -102,7 +102,7 @@ class StudyToEstimate:
 
 
 def study_lines(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
-    """The lines of what participants cost."""
+    """Estimate what participants cost, a line for each thing."""
     return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
 
 
@@ -123,7 +123,7 @@ def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 
 class WarmCost(NamedTuple):
-    """What all warm servers of a project together cost in an hour while they wait: on Spot, and on demand."""
+    """The cost of all warm servers of a project together in an hour while they wait, on Spot and on demand."""
 
     project_id: str
     servers: int
@@ -134,7 +134,10 @@ class WarmCost(NamedTuple):
 
 
 def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> WarmCost:
-    """What a project's warm servers cost. A server that waits costs as much as one on which a participant plays."""
+    """Compute what a project's warm servers cost in an hour.
+
+    A server that waits costs as much as one on which a participant plays.
+    """
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
     return WarmCost(project_id, servers, cpu, memory, spot, on_demand)
 
@@ -193,7 +196,7 @@ def _data(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 
 def _page_requests(study: StudyToEstimate) -> Range:
-    """Requests to `next_step`: a GET and a POST for each step, no POST for the last one; the polls."""
+    """Return the requests to `next_step`: a GET and a POST for each step, except a POST for the last one; and polls."""
     return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
 
 
@@ -209,7 +212,7 @@ class FixedResources:
 
     @classmethod
     def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> FixedResources:
-        """The resources of a template, counted."""
+        """Count the resources of a template."""
         kinds = [str(resource.get("Type")) for resource in resources.values()]
         return cls(
             queues=kinds.count("AWS::Lambda::EventSourceMapping"),
@@ -219,7 +222,7 @@ class FixedResources:
 
 
 def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
-    """The lines of what a month costs without participants. The high figure is without free tiers."""
+    """Estimate what a month costs without participants. The high figures are without free tiers."""
     # Five pollers of Lambda ask each queue; a request to an empty queue takes 20 seconds. Lambda reduces five to two
     # only for mappings without a maximum concurrency (Developer Guide, "Configuring scaling behavior for SQS").
     polls = fixed.queues * 5 * HOURS * 180.0
@@ -244,13 +247,13 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
 
 
 def _fixed(what: str, count: int, price: float, free: float) -> CostLine:
-    """A line for `count` resources: likely within the free tier, which the account may have used up otherwise."""
+    """Return a line for `count` resources, likely within the free tier, which other use may have exhausted."""
     least = max(0.0, count - free) * price
     return CostLine(what, f"{count}", Usd(least, least, count * price))
 
 
 def assumptions(study: StudyToEstimate) -> list[str]:
-    """The assumptions of the estimate, in sentences."""
+    """Write the assumptions of the estimate, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
     found = [
@@ -289,5 +292,5 @@ def assumptions(study: StudyToEstimate) -> list[str]:
 
 
 def total(lines: list[CostLine]) -> Usd:
-    """The sum of the lines."""
+    """Return the sum of the lines."""
     return sum((line.usd for line in lines), Usd())

@@ -30,6 +30,7 @@ class Range:
 
     @classmethod
     def exactly(cls, amount: float) -> Range:
+        """Make a range whose three figures are this amount."""
         return cls(amount, amount, amount)
 
     def __iter__(self) -> Iterator[float]:
@@ -44,7 +45,7 @@ class Range:
         return Range(self.low * by.low, self.likely * by.likely, self.high * by.high)
 
     def as_json(self) -> dict[str, float]:
-        """The three figures, rounded to a hundredth of a cent."""
+        """Return the three figures, rounded to a hundredth of a cent."""
         return {"low": round(self.low, 4), "likely": round(self.likely, 4), "high": round(self.high, 4)}
 
 
@@ -102,14 +103,14 @@ class Prices(NamedTuple):
     spot_high: float = 0.50
 
     def server_hour(self, cpu: float, memory: float, *, spot: bool) -> Usd:
-        """What a server with its public address costs in an hour. `cpu` in vCPU, `memory` in GB."""
+        """Compute what a server with its public address costs in an hour. `cpu` in vCPU, `memory` in GB."""
         machine = cpu * self.vcpu_hour.usd + memory * self.gb_hour.usd
         shares = (self.spot_low, self.spot_likely, self.spot_high) if spot else (1.0, 1.0, 1.0)
         low, likely, high = (machine * share + self.ipv4_hour.usd for share in shares)
         return Usd(low, likely, high)
 
     def note(self, region: str) -> str:
-        """A sentence that says how well these prices fit an installation in `region`."""
+        """Write a sentence on how well these prices fit an installation in `region`."""
         if self.region == region:
             return f"List prices of {self.region}, {self.date}, without taxes and credits."
         return (
@@ -119,7 +120,7 @@ class Prices(NamedTuple):
 
 
 def current(client: Any, region: str, today: str) -> Prices:
-    """The table with today's prices of Fargate in `region`, as AWS gives them; the other prices stay.
+    """Ask AWS for today's prices of Fargate in `region`. Return the table with them; the other prices stay.
 
     `client` is the boto3 client `pricing` (the Price List API, which is in us-east-1 and free). Raises LookupError if
     the answer has no such prices.
@@ -152,7 +153,7 @@ def current(client: Any, region: str, today: str) -> Prices:
 
 
 def _on_demand(product: Mapping[str, Any]) -> float | None:
-    """The product's first on-demand price above zero; None if there is none."""
+    """Return the product's first on-demand price above zero; None if there is none."""
     for term in product.get("terms", {}).get("OnDemand", {}).values():
         for dimension in term.get("priceDimensions", {}).values():
             amount = float(dimension.get("pricePerUnit", {}).get("USD", 0))

@@ -24,6 +24,7 @@ class Spent:
     guessed: int = 0  # attempts whose record has no size
 
     def add(self, other: Spent) -> None:
+        """Add the figures of another sum to this one."""
         self.usd += other.usd
         self.hours += other.hours
         self.attempts += other.attempts
@@ -34,7 +35,7 @@ class Spent:
 def spent(
     records: Iterable[Server], prices: Prices, now: datetime, sizes: dict[str, Size], since: datetime | None = None
 ) -> Spent:
-    """What these servers have cost until now, from the beginning or from `since` on.
+    """Compute what these servers have cost until now, from their start or from `since` on.
 
     Fargate bills from the download of the image on. That begins seconds after the request and is not in the record, so
     the time counts from the request. A warm server has two records: its own says how long it waited, and the record of
@@ -65,5 +66,5 @@ def _cost_of(attempt: PastAttempt, prices: Prices, now: datetime, usual: Size, s
 
 
 def _is_part(attempt: PastAttempt) -> bool:
-    """Whether the attempt is one of two parts of a warm server's task: the billed minimum is that of both together."""
+    """Whether the attempt is one of the two parts of a warm server's task, which have one billed minimum together."""
     return attempt.reason is Reason.ASSIGNED or attempt.warm_server_name is not None

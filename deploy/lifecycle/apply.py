@@ -34,7 +34,7 @@ ROLE_TRIES = 3  # at making the stack
 
 
 def _suggest_python(python: str | None) -> None:
-    """Suggest to install `python`, the functions' version, if it is missing: it makes the zips' bytecode."""
+    """Suggest installing `python`, the functions' version, which compiles the zips' bytecode, if it is missing."""
     if python and bytecode.compiler(python) is None:
         screen.info(
             f"With Python {python} on this machine, functions would start about a fifth faster. It is not needed."
@@ -53,7 +53,7 @@ class ApplyOutcome:
 
 @dataclass(frozen=True)
 class ApplyRequest:
-    """For which `study` to apply, findings that are known to be `wrong`, and the administrator's answers.
+    """The input of an apply: the `study` that follows, findings that are `wrong` already, the administrator's answers.
 
     `yes` agrees to the loss of something. With `anyway`, bad findings do not stop the apply.
     """
@@ -100,7 +100,7 @@ def apply(
 
 
 def _prepare(account: Account, stack: str, settings: StackSettings, request: ApplyRequest) -> Prepared:
-    """`prepare`. If it fails before a first installation, show the other findings on the account, too."""
+    """Call `prepare`. If it fails before a first installation, show the other findings on the account, too."""
     try:
         return prepare(account, stack, settings)
     except Problem as problem:
@@ -111,7 +111,7 @@ def _prepare(account: Account, stack: str, settings: StackSettings, request: App
 
 
 def _without_remains(prepared: Prepared) -> Prepared:
-    """Delete the stack if its creation failed; return `prepared` without it."""
+    """Delete the stack if its creation failed. Return `prepared`, in which that stack does not exist any more."""
     if not states.never_complete(prepared.status):
         return prepared
     _delete_failed(prepared)

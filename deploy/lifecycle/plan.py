@@ -85,7 +85,7 @@ class Change:
 
     @property
     def danger(self) -> str:
-        """A sentence on what this change loses or leaves behind; "" if nothing."""
+        """A sentence on what this change loses or leaves behind; "" if it does neither."""
         if self.type not in STATEFUL or self.action not in {"replace", "may replace", "remove"}:
             return ""
         holds = STATEFUL[self.type]
@@ -96,7 +96,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Plan:
-    """What `apply` would do. `kind` is `create`, `update` or `nothing`."""
+    """The changes that `apply` would make. `kind` is `create`, `update` or `nothing`."""
 
     stack: str
     region: str
@@ -113,7 +113,7 @@ class Plan:
         return [change.danger for change in self.changes if change.danger]
 
     def as_json(self) -> dict[str, Any]:
-        """The plan as JSON data, for scripts."""
+        """Return the plan as JSON data, for scripts."""
         return {
             "stack": self.stack,
             "region": self.region,
@@ -128,7 +128,7 @@ class Plan:
 
 
 def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> list[Change]:
-    """The changes in `answer`, the list `Changes` of DescribeChangeSet."""
+    """Read the changes in `answer`, the list `Changes` of DescribeChangeSet."""
     files = template.function_names()
     found = []
     for one in answer:
@@ -151,7 +151,7 @@ def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> li
 
 
 def of_creation(template: Template, parameters: Mapping[str, str]) -> list[Change]:
-    """The changes that a new stack of this template makes."""
+    """List the changes that a new stack of this template makes."""
     files = template.function_names()
     return [
         Change("create", files.get(name, name), resource["Type"], name)
@@ -173,7 +173,7 @@ def _properties(change: Mapping[str, Any]) -> Iterator[str]:
 
 
 def lines(plan: Plan) -> Iterator[tuple[str, str]]:
-    """The plan as lines of text, each with its style of rich."""
+    """Write the plan as lines of text, each with its style for the package rich."""
     if plan.kind == "nothing":
         yield f"The stack {plan.stack} in {plan.region} is as it should be: nothing to do.", ""
         return
@@ -235,9 +235,9 @@ def show(plan: Plan, answer: bool = False) -> None:
 
 
 def plan(account: Account, stack: str, settings: StackSettings, *, study: ProjectFolder | None = None) -> Plan:
-    """The plan of what `apply` would do now. The stack is not changed; an update needs a change set, which is deleted.
+    """Make the plan of what `apply` would do now. Raises `Problem` if `apply` could not begin.
 
-    Raises `Problem` if `apply` could not begin.
+    The stack is not changed. For an update, a change set is made and deleted.
     """
     began = time.monotonic()
     prepared = prepare(account, stack, settings)
@@ -271,7 +271,7 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
 
 
 def new_site(prepared: Prepared) -> str:
-    """The host name that participants will open, if it changes; else ""."""
+    """Return the new host name of the site, which participants open; "" if it does not change."""
     hosts = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
     return hosts[1] if hosts[0] != hosts[1] else ""
 

@@ -60,12 +60,12 @@ def check_account(account: Account, wrong: Sequence[Finding], study: ProjectFold
 
 
 def of_problem(name: str, problem: Problem) -> Finding:
-    """A problem as a bad finding."""
+    """Make a bad finding of a problem."""
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
 def look_at(checked: InstallationCheck) -> list[Finding]:
-    """Make all checks that apply; return the findings that are not good, the bad ones last. Changes nothing."""
+    """Make all checks that apply, and return the findings that are not good, bad ones last. Changes nothing."""
     before, after = checked.prepared.before, checked.prepared.parameters
     found: list[Finding] = []
     checks: dict[str, Callable[[InstallationCheck], Iterable[Finding]]] = {}
@@ -85,7 +85,7 @@ def look_at(checked: InstallationCheck) -> list[Finding]:
 
 
 def _bad_last(found: Iterable[Finding]) -> list[Finding]:
-    """The findings with the bad ones at the end, so that long remarks do not scroll them off the screen."""
+    """Return the findings with the bad ones at the end, so that long remarks do not scroll them off the screen."""
     return sorted(found, key=lambda one: one.mark is Mark.BAD)
 
 
@@ -117,7 +117,7 @@ def _root(newcomer: Newcomer) -> Iterator[Finding]:
 
 
 def _executions(newcomer: Newcomer) -> Iterator[Finding]:
-    """Lambda's concurrent executions, which pages and the functions behind queues share (`deploy.aws.concurrency`)."""
+    """Check Lambda's concurrent executions, which pages and the functions behind queues share (`aws.concurrency`)."""
     account, _ = newcomer
     free = concurrency.unreserved(account)
     if concurrency.starts(free) < concurrency.USUAL:
@@ -149,7 +149,7 @@ def _servers(newcomer: Newcomer) -> Iterator[Finding]:
 
 
 def _builds(newcomer: Newcomer) -> Iterator[Finding]:
-    """Whether the image of a study with a game can be built: by Docker here, or by CodeBuild."""
+    """Check whether the image of a study with a game can be built, by Docker here or by CodeBuild."""
     from deploy.study.image import docker  # noqa: PLC0415 - pydantic, needed only before a first installation
 
     account, study = newcomer
@@ -183,7 +183,7 @@ _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
 
 
 def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
-    """The zone's delegation. Without it the stack waits for ACM, which asks DNS, for up to twelve hours, then fails.
+    """Check the zone's delegation. Without it the stack waits up to twelve hours for ACM, which asks DNS, and fails.
 
     (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
@@ -202,7 +202,7 @@ def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
-    """The CAA records: Amazon must be allowed for the site, Let's Encrypt for the servers' names."""
+    """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
     after = checked.prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
     servers = names_of(domain_change.servers_domain(after))
@@ -248,7 +248,7 @@ def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
-    """Running servers, which use the present address of the site and the present network."""
+    """Check that no running server uses an address of the site, or a network, that is to be replaced."""
     for check in (domain_change.check_site, domain_change.check_network):
         try:
             check(checked.prepared)
@@ -257,7 +257,7 @@ def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
-    """Two installations may share a domain if they never have the same study: its servers would have the same names."""
+    """Check for other stacks with this domain: if both had the same study, its servers would have the same names."""
     name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
     for other, parameters in other_installations(checked.account, name):
         if parameters.get("RootDomain") == root:
@@ -306,7 +306,7 @@ def _subnets(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _vpcs(checked: InstallationCheck) -> Iterator[Finding]:
-    """The quota of VPCs, for an installation with a VPC of its own. It is 5 in a Region at first."""
+    """Check the quota of VPCs, which is 5 in a Region at first, for an installation with a VPC of its own."""
     if checked.prepared.parameters["VpcId"]:
         return
     pages = checked.account.client("ec2").get_paginator("describe_vpcs").paginate()
@@ -322,7 +322,7 @@ def _vpcs(checked: InstallationCheck) -> Iterator[Finding]:
 
 
 def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
-    """Log groups that an unfinished `destroy` has left: the stack could not make groups of the same names."""
+    """Check for log groups that an unfinished `destroy` has left: the stack cannot make groups of the same names."""
     if checked.prepared.found is not None:
         return
     name = checked.prepared.stack.name

@@ -19,8 +19,9 @@ from deploy.stack.inventory import ListedResource
 from deploy.stack.listings import KINDS
 
 LISTED = 180
-"""Seconds for which AWS may still list deleted resources: a queue up to 60 (SQS API reference, DeleteQueue), a schedule
-group until its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings a while."""
+"""The seconds for which AWS may still list deleted resources: a queue for up to 60 (SQS API reference, DeleteQueue), a
+schedule group until its schedules are deleted (EventBridge Scheduler user guide), buckets and event source mappings
+for a while."""
 PAUSE = 20  # seconds between two looks
 OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not current (the template's lifecycle rule)
 
@@ -28,7 +29,7 @@ OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not curre
 def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Remains:
     """List what exists after a removal. Waits up to `LISTED` seconds while AWS still lists deleted resources.
 
-    `remembered`: the resources that the installation had, by CloudFormation.
+    `remembered`: the resources that the installation had, as CloudFormation lists them.
     """
 
     def look() -> Remains:
@@ -44,7 +45,7 @@ def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Re
 
 @dataclass
 class Remains:
-    """What the last listing found. The resources in `left` should be gone; all others stay on purpose."""
+    """The results of the last listing. The resources in `left` should be gone; all others stay on purpose."""
 
     removal: Removal
     remembered: Sequence[inventory.Resource]
@@ -60,7 +61,7 @@ class Remains:
 
     @cached_property
     def stored(self) -> Mapping[str, int]:
-        """Data bucket that stays → its size in bytes."""
+        """By data bucket that stays, its size in bytes."""
         return {bucket: inventory.stored(self._account, bucket) for bucket in self.after.data}
 
     @cached_property
@@ -76,7 +77,7 @@ class Remains:
 
     @cached_property
     def records(self) -> Sequence[tuple[Validation, str, str]]:
-        """Validation records that stay, each with the reason and the command that deletes it."""
+        """The validation records that stay, each with the reason and the command that deletes it."""
         found = [(one, f"it renews {users} as well") for one, users in self.removal.kept]
         known = {one for one, _ in found}
         for addresses in self.after.addresses if not self.after.stack else ():
@@ -92,6 +93,7 @@ class Remains:
         ]
 
     def as_json(self) -> dict[str, Any]:
+        """Return what is left and what is kept as JSON data, for scripts."""
         return {
             "left": [
                 {

@@ -35,7 +35,7 @@ _GONE = re.compile(r"NotFound|not found|does not exist|NoSuch|inactive")
 
 @dataclass(frozen=True)
 class FoundInstallation:
-    """What exists of an installation."""
+    """The parts of an installation that exist."""
 
     stack: Mapping[str, Any] | None  # as CloudFormation describes it, if it is still there
     things: Sequence[ListedResource]  # resources outside of the stack, made by the commands or left by the stack
@@ -62,7 +62,7 @@ class Removal:
         self.kept: list[tuple[Validation, str]] = []  # records that stay, and what uses them
 
     def look(self) -> FoundInstallation:
-        """Return what exists; change nothing."""
+        """Find what exists. Changes nothing."""
         described = self._stack.describe()
         things = [
             ListedResource("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)
@@ -85,7 +85,7 @@ class Removal:
         )
 
     def plan(self, found: FoundInstallation, data: bool) -> list[PlanStep]:
-        """The steps in their order: the stack, the resources outside of it, and last, only with `data`, the data."""
+        """Plan the steps in their order: the stack, the resources outside of it, and with `data` also the data."""
         steps: list[PlanStep] = [step(self._prepare_stack, found.stack)] if found.stack else []
         steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
         steps += [step(self._remember, found), step(self._delete_stack, found)]
@@ -95,7 +95,7 @@ class Removal:
         return steps + ([step(self._data_buckets)] if data else [])
 
     def run(self, found: FoundInstallation, data: bool) -> None:
-        """Remove everything; the data only with `data`. Raises `Problem` if AWS or another resource prevents it."""
+        """Remove everything, the data only with `data`. Raises `Problem` if AWS or another resource prevents it."""
         self.executor.execute(self.plan(found, data))
 
     def _data(self) -> list[str]:
@@ -105,7 +105,7 @@ class Removal:
     # -- steps
 
     def _prepare_stack(self, described: Mapping[str, Any]) -> None:
-        """Wait for the stack's present operation. Raises `Problem` if it is protected, or its policy is a boundary."""
+        """Wait for the stack's present operation. Raises `Problem` if it is protected or its policy is a boundary."""
         self._stack.must_not_be_protected(described)
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
             policies.must_be_no_boundary(self.account, arn)
@@ -222,7 +222,7 @@ class Removal:
         screen.success(f"The {kind} bucket {name} is deleted.")
 
     def _remove(self, call: Callable[..., Any], **arguments: Any) -> None:
-        """Make the call; ignore that the resource is gone already."""
+        """Make the call, and ignore an error that says that the resource is gone already."""
         try:
             call(**arguments)
         except ClientError as error:
@@ -231,13 +231,13 @@ class Removal:
 
 
 def _zone(found: FoundInstallation) -> str:
-    """The hosted zone of the present stack; without one, of the stack of its name that was deleted last."""
+    """Return the hosted zone of the present stack; without one, of the stack of its name that was deleted last."""
     standing = inventory.addresses([found.stack] if found.stack else [])
     return (standing or found.addresses)[0].zone
 
 
 def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:
-    """The installation of a stack in any state; None if outputs are missing, since it was never complete."""
+    """Return the installation of a stack in any state; None if outputs are missing, since it was never complete."""
     installation = Installation.of(account, found) if found else None
     whole = installation and {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(installation.outputs)
     return installation if whole else None

@@ -27,7 +27,7 @@ from hippodrome.config import ConfigErrors, layout, read_project
 
 
 def may_apply(account: Account, stack: str) -> bool:
-    """Whether these are an administrator's credentials. Without an installation, all credentials count as such."""
+    """Whether these are an administrator's credentials. If there is no installation, they count as such."""
     found = describe_stack(account, stack)
     if found is None or found["StackStatus"] == "REVIEW_IN_PROGRESS":
         return True
@@ -41,7 +41,10 @@ def may_apply(account: Account, stack: str) -> bool:
 
 
 def study_in(folder: Path) -> project_folder.ProjectFolder | None:
-    """The project in the folder; None if there is none, or it says `useAWS: false`. Raises `Problem` with mistakes."""
+    """Read the project in the folder. Return None without one, or with `useAWS: false`.
+
+    Raises `Problem` on mistakes.
+    """
     if folder.is_dir() and not layout.has_config(folder):
         screen.info(f"{folder} has no config.yml, so no study is registered.")
         return None
@@ -124,7 +127,10 @@ def command(
 
 
 def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Problem]]:
-    """The study; or None and its problem, which is shown with other findings before a first installation."""
+    """Return the study in the folder (None if there is none for AWS), and no problem.
+
+    After a mistake return None and the problem, which a first installation shows together with its other problems.
+    """
     try:
         return study_in(folder), []
     except Problem as problem:
@@ -132,7 +138,7 @@ def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Prob
 
 
 def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> Account:
-    """The account, after its credentials were tried. If they fail, show the problems in `wrong` first, then raise."""
+    """Open the account and try its credentials. If they fail, show the problems in `wrong` first, then raise."""
     try:
         account = open_account(profile, region)
         user = account.identity["Arn"].rpartition(":")[2]

@@ -138,7 +138,7 @@ def _packages(formats: frozenset[str]) -> None:
 
 
 def _local(study: StudySelection) -> Path | None:
-    """The study's data folder on this machine, if no option says where the data are; None: they are on AWS.
+    """Find the study's data folder on this machine, if no option says where the data are; None: they are on AWS.
 
     Prints the choice if this machine has data, and how to choose AWS or the folder. Raises `Problem` as `local_data`.
     """
@@ -157,7 +157,7 @@ def _local(study: StudySelection) -> Path | None:
 
 
 def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:
-    """The account to fetch from. Raises `Problem` if it cannot be opened.
+    """Open the account to fetch from. Raises `Problem` if it cannot be opened.
 
     `undecided` is a study whose data may be on this machine instead. Then the problem is first about this machine: a
     researcher who has never used AWS looks for a folder.
@@ -175,7 +175,7 @@ def _account(profile: str | None, region: str | None, undecided: StudySelection 
 
 
 def _bucket(aws_account: account.Account, stack: str, kept: str | None, project: str) -> Source:
-    """The installation's bucket, or the bucket `kept` that `destroy` has kept."""
+    """Open the installation's bucket, or the bucket `kept` that `destroy` has kept."""
     from deploy.stack.retained_bucket import open_bucket
     from export.source import Bucket
 
@@ -228,7 +228,7 @@ def _dry_run(tally: Tally, target: Path, as_json: bool) -> int:
 
 
 def _tell_moved(moved: list[dict[str, Any]]) -> None:
-    """Warn of steps that have answers from another page than their present one."""
+    """Warn about steps whose answers come from another page than the present one."""
     for step in moved:
         name, page = step["step"], step["page"]
         for other, count in step["others"].items():

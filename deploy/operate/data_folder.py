@@ -1,4 +1,4 @@
-"""A data folder of this machine as a `Storage`: its files are the documents, and each has one version."""
+"""Gives a data folder of this machine the interface `Storage`: each file is a document with one version."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DataFolder:
         self.root = root.resolve()
 
     def versions(self, prefix: str) -> Iterator[Version]:
-        """Every file whose key has this prefix."""
+        """Yield every file whose key has this prefix."""
         for top, _, names in os.walk(self.root / prefix.rpartition("/")[0]):
             for name in sorted(names):
                 key = Path(top, name).relative_to(self.root).as_posix()
@@ -32,16 +32,16 @@ class DataFolder:
                     yield self._version(key)
 
     def versions_of(self, key: str) -> Iterator[Version]:
-        """The file with this key, if there is one."""
+        """Yield the file with this key, if there is one."""
         if (self.root / key).is_file():
             yield self._version(key)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """None: on one machine a file appears whole."""
+        """Yield nothing: on one machine a file appears whole, so there are no unfinished uploads."""
         return iter(())
 
     def read(self, version: Version) -> bytes:
-        """The file's content; empty if it is gone."""
+        """Read the file's content; empty if the file is gone."""
         with contextlib.suppress(FileNotFoundError):
             return (self.root / version.key).read_bytes()
         return b""
@@ -55,7 +55,7 @@ class DataFolder:
         self._put(key, file)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Write a small document if it is still `before`; return whether it was so."""
+        """Write a small document if it is still `before`. Return whether it was written."""
         if (self.root / key).read_bytes() != before:
             return False
         self._put(key, after)

@@ -96,7 +96,7 @@ def command(
 
 
 def _new_receipt(began: datetime) -> Path:
-    """A file name that is free in this folder, since a script may erase several participants in one second."""
+    """Choose a file name that is free in this folder, since a script may erase several participants in a second."""
     name = f"erased-{began:%Y%m%dT%H%M%SZ}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
     return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
@@ -137,7 +137,7 @@ def _from_folder(data: Path, project: str, user: str, *, dry_run: bool, yes: boo
 
 
 def _projects(account: Account, installation: Installation) -> list[str]:
-    """The ids of all projects that are registered or have documents in the bucket."""
+    """Return the ids of all projects that are registered or have documents in the bucket."""
     names = {project.id for project in participants.registered_projects(account.platform(installation).documents)}
     names.update(VersionedBucket(account, installation["Bucket"]).folders())
     return sorted(name for name in names if ids.is_project_id(name))
@@ -190,7 +190,7 @@ def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) ->
 
 
 def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
-    """Warn that the server of a running session will be stopped, on which other participants play, too."""
+    """Warn that a running session's server will be stopped, on which other participants play, too."""
     playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
     if playing:
         screen.warning(

@@ -52,7 +52,7 @@ SIGNING = 30  # seconds that `sign_requests` may take from reading a server's re
 
 @dataclass
 class FoundOfParticipant:
-    """What one look found of a participant in one project."""
+    """The results of one look for a participant in one project."""
 
     documents: int = 0  # versions, delete markers and unfinished uploads
     record: Server | None = None
@@ -76,6 +76,7 @@ class FoundOfParticipant:
         return [*([self.record] if self.record else []), *self.of_sessions]
 
     def counts(self) -> dict[str, int]:
+        """Return how many documents and resources were found, by kind."""
         counts = {"documents": self.documents, **self.resources.counts(), "places": self.slots}
         counts |= {"tasks": counts["tasks"] + len(self.draining)}
         return counts | ({"sessions": len(self.sessions)} if self.sessions else {})
@@ -115,14 +116,14 @@ class Eraser:
         self._lobby = LobbyEraser(self._bucket, project, user)
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> FoundOfParticipant:
-        """Erase until a look finds nothing, in `ROUNDS` rounds at most; return what the last look found.
+        """Erase until a look finds nothing, in `ROUNDS` rounds at most. Return what the last look found.
 
         Raises `Problem` if a server does not end.
         """
         return self._executor.converge(self.look, lambda found: self.plan(found, advance), rounds=ROUNDS, pause=0)
 
     def look(self) -> FoundOfParticipant:
-        """Find everything about this participant; change nothing."""
+        """Find everything about this participant. Changes nothing."""
         record = self._record(self._record_key)
         sessions = self._sessions.sessions()
         labels = {each.id: ids.server_label(self.project, each.id) for each in sessions}
@@ -147,7 +148,7 @@ class Eraser:
         return found
 
     def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
-        """The steps of one round: server, documents, and last the slot, so that no newcomer takes it too early."""
+        """Plan one round's steps: server, documents, and last the slot, so that no newcomer takes it too early."""
         steps: list[PlanStep] = [step(self._begin_round)]
         if found.runs:
             steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
@@ -165,7 +166,7 @@ class Eraser:
         return steps
 
     def unreadable(self) -> list[str]:
-        """The keys of documents that may name this participant, but cannot be read."""
+        """Return the keys of documents that may name this participant, but cannot be read."""
         return [*self._slots().unreadable(self.project), *self._sessions.unreadable, *self._lobby.unreadable]
 
     # -- looking
@@ -176,7 +177,7 @@ class Eraser:
         return Slots(self._platform)
 
     def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
-        """The tasks of the participant and their sessions: those that run, and those that are stopping."""
+        """Return the tasks of the participant and their sessions: those that run, and those that are stopping."""
         tasks = [task for task in self._platform.tasks.list() if self._scope.erases(task.name)]
         return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
 
@@ -192,7 +193,7 @@ class Eraser:
             return None
 
     def _is_in_zone(self, record: DnsRecord) -> bool:
-        """Whether the zone has this record. The listing of servers' names has none that `subdomain: userId` makes."""
+        """Whether the zone has this record. Listings of servers' names lack those that `subdomain: userId` makes."""
         answer = self._account.client("route53").list_resource_record_sets(
             HostedZoneId=self._installation["HostedZoneId"],
             StartRecordName=record.name,
@@ -207,7 +208,7 @@ class Eraser:
         )
 
     def _documents(self) -> tuple[Iterator[Version], ...]:
-        """Every version of the participant's own documents, in the order in which they must be deleted.
+        """Return every version of the participant's own documents, in the order in which they must be deleted.
 
         The record leads to the documents of warm servers, so it comes last.
         """
@@ -220,7 +221,7 @@ class Eraser:
         )
 
     def _warm_server_keys(self) -> list[str]:
-        """The keys of the handover documents and records of the participant's warm servers."""
+        """Return the keys of the handover documents and records of the participant's warm servers."""
         return keys_of_warm_servers(self.project, self._warm_servers)
 
     # -- steps
@@ -262,11 +263,11 @@ class Eraser:
         return is_young and record.task is None and bool(record.cluster)
 
     def _settle(self) -> None:
-        """Wait until ECS lists the task, for `SETTLED` at most: after that there is none."""
+        """Wait until ECS lists the task. If it has not after `SETTLED`, there is none."""
         self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
 
     def _leave_session(self, found: FoundSession, advance: Callable[[int], None]) -> None:
-        """Take the participant out of a session. If its server runs again, the next round stops it first."""
+        """Take the participant out of a session. If its server runs again, finish in the next round, which stops it."""
         note = self._noting(advance)
         key = server.key(ids.server_label(self.project, found.id))
         if not found.others:

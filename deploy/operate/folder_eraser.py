@@ -34,7 +34,7 @@ STATE = ".hippodrome"
 
 @dataclass
 class Erased:
-    """How many files were deleted, and how many recordings were written anew."""
+    """The numbers of files that were deleted, and of recordings that were written anew."""
 
     files: int = 0
     rewritten: int = 0
@@ -54,7 +54,7 @@ class FolderEraser:
         self._lobby = LobbyEraser(self._folder, project, user)
 
     def look(self) -> tuple[list[Version], list[FoundSession]]:
-        """The participant's own files and those of the lobby that name them; and their sessions."""
+        """Find the participant's own files, the lobby's files that name them, and their sessions."""
         return [*self._own(), *self._lobby.look()], self._sessions.sessions()
 
     def run(self) -> Erased:
@@ -82,7 +82,7 @@ class FolderEraser:
 
     @property
     def unreadable(self) -> list[str]:
-        """Documents that may name the participant and cannot be read."""
+        """Return the documents that may name the participant and cannot be read."""
         return [*self._sessions.unreadable, *self._lobby.unreadable]
 
     def _own(self) -> list[Version]:
@@ -92,7 +92,7 @@ class FolderEraser:
         ]
 
     def _of_server(self, label: str) -> list[Version]:
-        """The documents of warm servers that were assigned to this server, then its record, which leads to them."""
+        """Return the documents of this record's warm servers, then the record itself, which leads to them."""
         key = server.key(label)
         try:
             record = from_json((self._folder.root / key).read_bytes(), Server)
@@ -146,7 +146,7 @@ class FolderEraser:
             )
 
     def _mentioned(self) -> list[str]:
-        """The files of `.hippodrome/` that name the participant: messages and tasks."""
+        """Return the files of `.hippodrome/` that name the participant: messages and tasks."""
         state = self._state / self._folder.root.name
         names = [self._label.encode(), f'"{self._user}"'.encode(), f"/users/{self._user}".encode()]
         return [

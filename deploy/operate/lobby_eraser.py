@@ -21,10 +21,10 @@ class LobbyEraser:
         self._label = ids.server_label(project, user)
         self._decisions = decisions.key(project)
         self.unreadable: list[str] = []
-        """Documents that name the participant and cannot be read."""
+        """The keys of documents that name the participant and cannot be read."""
 
     def look(self) -> list[Version]:
-        """The participant's entries, and the documents of decisions and of `match` that name them."""
+        """Find the participant's entries, and the documents of decisions and of `match` that name them."""
         last = newest(self._storage, self._decisions)
         decided = [last] if last is not None and self._names(self._storage.read(last)) else []
         return [*self._entries(), *self._questions(), *decided]
@@ -41,7 +41,7 @@ class LobbyEraser:
         self._storage.delete(self._questions(), note)  # the lobby asks again, without the participant
 
     def _take_out(self, body: bytes) -> bool:
-        """Write these decisions without the participant; return False if other decisions were written meanwhile."""
+        """Write these decisions without the participant. Return False if other decisions were written meanwhile."""
         if not self._names(body):
             return True
         try:
@@ -56,7 +56,7 @@ class LobbyEraser:
         return [*self._storage.versions(entries.prefix_of(self._project, self._label))]
 
     def _questions(self) -> list[Version]:
-        """All versions of the questions to the function `match`, and of its answers, that name the participant."""
+        """Return all versions of questions to the function `match`, and of its answers, that name the participant."""
         folders = (questions_folder(self._project), groups_folder(self._project))
         found = [each for folder in folders for each in self._storage.versions(folder) if not each.marker]
         bodies = read_all(self._storage, found)

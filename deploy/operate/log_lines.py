@@ -66,14 +66,14 @@ class LogLine:
         return None
 
     def as_text(self) -> str:
-        """The line for a terminal, in local time."""
+        """Write the line for a terminal, in local time."""
         more = _printable(" ".join(f"{name}={_short(value)}" for name, value in self.fields.items()))
         level = f"{self.level:<7} " if self.level else ""
         message = _printable(self.message.rstrip("\n")).replace("\n", "\n    ")
         return f"{self.time.astimezone():%m-%d %H:%M:%S} {self.source:<14} {level}{message}{'  ' if more else ''}{more}"
 
     def as_json(self) -> dict[str, Any]:
-        """The line for scripts."""
+        """Return the line as JSON data, for scripts."""
         return {
             "time": self.time.isoformat(),
             "source": self.source,
@@ -84,7 +84,7 @@ class LogLine:
 
 
 def read(event: Mapping[str, Any], source: str) -> LogLine:
-    """The line of an event from FilterLogEvents, in any format that Hippodrome's log groups contain."""
+    """Read an event from FilterLogEvents, in any format that Hippodrome's log groups contain."""
     time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
     text = str(event.get("message", ""))
     stream = str(event.get("logStreamName", ""))
@@ -139,7 +139,7 @@ def _of_text(text: str, time: datetime, source: str, stream: str) -> LogLine:
 
 
 def moment(text: str, now: datetime) -> datetime:
-    """The time that `--since` means: `90m` ago, or an ISO date or time, in UTC if it has no zone. Raises ValueError."""
+    """Read `--since`: `90m` ago, or an ISO date or time, in UTC if it has no zone. Raises ValueError."""
     ago = _AGO.fullmatch(text.strip())
     if ago:
         try:
@@ -151,7 +151,7 @@ def moment(text: str, now: datetime) -> datetime:
 
 
 def _printable(text: str) -> str:
-    """The text with � in place of control characters."""
+    """Replace control characters in the text by �."""
     return _CONTROL.sub("�", text)
 
 

@@ -37,7 +37,7 @@ class Reader:
         self._stack = stack
 
     def sources(self) -> list[str]:
-        """The sources of all log groups: functions, `trial`, and other parts of the stack.
+        """Return the sources of all log groups: functions, `trial`, and other parts of the stack.
 
         Credentials that may not list groups (a researcher's) get the functions in the template, and `trial`.
         """
@@ -56,21 +56,21 @@ class Reader:
         return sorted(found)
 
     def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[LogLine]:
-        """Every line since this time, in the order of time. Reads the groups page by page."""
+        """Yield every line since this time, in the order of time. Reads the groups page by page."""
         for event, source in self._merged(sources, since, project_id):
             yield read(event, source)
 
     def events(
         self, sources: Iterable[str], since: datetime, project_id: str | None = None
     ) -> list[tuple[str, LogLine]]:
-        """The same lines, each with an id of its event, by which `follow` recognises new events."""
+        """Return the same lines as `lines`, each with its event's id, by which `follow` recognises new events."""
         merged = self._merged(sources, since, project_id)
         return [(f"{source}/{_id_of(event)}", read(event, source)) for event, source in merged]
 
     def _merged(
         self, sources: Iterable[str], since: datetime, project_id: str | None
     ) -> Iterator[tuple[Mapping[str, Any], str]]:
-        """The events of all sources, each with its source. FilterLogEvents sorts those of one source."""
+        """Yield the events of all sources in the order of time, each with its source."""
         streams = [self._events(source, since, project_id) for source in sources]
         for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
             yield event, source
@@ -97,7 +97,7 @@ class Reader:
 
 
 def _id_of(event: Mapping[str, Any]) -> str:
-    """An id of the event: AWS's own, or its time, stream and message, since emulators give no ids."""
+    """Return the event's id: AWS's own, or its time, stream and message, since emulators give no ids."""
     return str(event.get("eventId") or [event.get(key) for key in ("timestamp", "logStreamName", "message")])
 
 
@@ -138,7 +138,7 @@ def follow(
     sleep: Callable[[float], None] = time.sleep,
     rounds: int | None = None,
 ) -> None:
-    """Call `show` with new lines until Ctrl-C, or for `rounds` looks: once for each event, also for late ones."""
+    """Call `show` with each new line once, also with late ones, until Ctrl-C or for `rounds` looks."""
     seen: dict[str, datetime] = {}
     latest = since
     while rounds is None or rounds > 0:

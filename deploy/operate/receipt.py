@@ -29,7 +29,7 @@ NOT_COVERED = (
 
 @dataclass
 class ProjectReceipt:
-    """One project's part of a receipt: counts of what was deleted and removed, and of what the last look found."""
+    """One project's part of a receipt: the numbers of what was deleted and removed, and of what the last look found."""
 
     project: str
     user: str
@@ -52,6 +52,7 @@ class ProjectReceipt:
             self.keys[shown] = self.keys.get(shown, 0) + 1
 
     def as_json(self) -> dict[str, Any]:
+        """Return this part of the receipt as JSON data, without the participant's id."""
         return {
             "project": self.project,
             "deleted": self.deleted,
@@ -77,7 +78,7 @@ class ProjectReceipt:
         return kinds.get(rest.partition("/")[0], "other")
 
     def _nameless(self, key: str) -> str:
-        """The key without the participant's id and without the server's label, which can be computed from the id."""
+        """Remove the participant's id from the key, and the server's label, which is computed from the id."""
         rest = key.removeprefix(participant_folder(self.project, self.user))
         if key.startswith(sessions_folder(self.project)):  # a session's id does not depend on its members
             return "/".join("{userId}" if self.user in part else part for part in key.split("/"))
@@ -102,7 +103,10 @@ def receipt(
     whole: bool,
     with_id: bool,
 ) -> dict[str, Any]:
-    """The receipt as JSON data. `whole`: whether the last look found nothing. `with_id`: include the id itself."""
+    """Make the receipt, as JSON data. `whole`: whether the last look found nothing.
+
+    `with_id`: include the id itself.
+    """
     salt = secrets.token_hex(16)
     person = {
         "salt": salt,

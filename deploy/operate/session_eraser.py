@@ -26,7 +26,7 @@ _RECORDING = ".jsonl.gz"
 
 @dataclass(frozen=True)
 class FoundSession:
-    """A session whose document names the participant, in any version. `others`: whether it keeps other members."""
+    """A session whose document names the participant, in any version. `others`: whether other members stay in it."""
 
     id: str
     seat: int
@@ -41,14 +41,14 @@ class SessionEraser:
         self._project = project
         self._user = user
         self.rewritten = 0
-        """Recordings that were written anew."""
+        """The number of recordings that were written anew."""
         self.unreadable: list[str] = []
-        """Documents that may name the participant and cannot be read."""
+        """The keys of documents that may name the participant and cannot be read."""
 
     # -- looking
 
     def sessions(self) -> list[FoundSession]:
-        """The sessions whose documents name the participant."""
+        """Find the sessions whose documents name the participant."""
         documents: dict[str, list[Version]] = {}
         existing = set()
         folder = sessions_folder(self._project)
@@ -83,7 +83,7 @@ class SessionEraser:
             found[session] = FoundSession(session, member.seat, others and (before is None or before.others))
 
     def _membership(self) -> FoundSession | None:
-        """The session in the participant's membership document, for a session whose own document is lost."""
+        """Find the session by the participant's membership document, if the session's own document is lost."""
         try:
             for version in self._storage.versions_of(membership_key(self._project, self._user)):
                 if not version.marker:

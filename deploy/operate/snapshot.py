@@ -58,7 +58,7 @@ class CertificateState:
     staging: bool  # from an authority for tests, which browsers do not trust
 
     def overdue(self, now: datetime) -> bool:
-        """Whether the next one should be there by now."""
+        """Whether the next certificate should be there by now."""
         return now > self.renewal + DAILY
 
     def urgent(self, now: datetime) -> bool:
@@ -75,7 +75,7 @@ class WarmServers(NamedTuple):
 
 
 class ServerFailure(NamedTuple):
-    """Servers of a project that failed for one cause in the last 24 hours: how many, and the last one's time, name."""
+    """Servers of a project that failed for one cause in the last 24 hours: how many; the last one's time and name."""
 
     project: str
     cause: Cause
@@ -85,13 +85,13 @@ class ServerFailure(NamedTuple):
 
     @property
     def matters(self) -> bool:
-        """Whether the researcher or administrator can do something about it."""
+        """Whether the researcher or administrator can prevent such failures."""
         return self.cause.category is not FailureCategory.AWS
 
 
 @dataclass
 class Snapshot:
-    """What one look at an installation found. `problems`: part → why it is missing."""
+    """The results of one look at an installation. `problems`: by part, why the part is missing."""
 
     at: datetime
     projects: list[tuple[Project, ParticipantCounts]] = field(default_factory=list)
@@ -107,12 +107,12 @@ class Snapshot:
 
     @property
     def closed_today(self) -> Counter[str]:
-        """How many servers were closed today, by reason. Warm servers that were assigned do not count."""
+        """Count the servers that were closed today, by reason. Warm servers that were assigned do not count."""
         return Counter(str(r.reason) for r in self._closed_today() if r.reason is not Reason.ASSIGNED)
 
     @property
     def failures(self) -> list[ServerFailure]:
-        """Why servers failed in the last 24 hours: causes that can be prevented first, then by number of servers."""
+        """Return why servers failed in the last 24 hours: preventable causes first, then by number of servers."""
         found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
             for one in attempts_of(record):
@@ -124,7 +124,7 @@ class Snapshot:
         return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
 
     def warm(self, project_id: str) -> WarmServers:
-        """The warm servers of a project."""
+        """Count the warm servers of a project."""
         mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
         taken = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
         return WarmServers(sum(r.state is ServerState.READY for r in mine), len(mine), len(taken))
@@ -204,7 +204,10 @@ class InstallationMonitor:
         look.members = dict(self._members([server for server in look.servers if server.is_sessions]))
 
     def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
-        """The names of sessions' servers, each with the number of members. Reads each formed session only once."""
+        """Yield the names of sessions' servers, each with the number of members.
+
+        Reads each formed session only once.
+        """
         for server in servers:
             known = self._formed.get(server.user_id)
             if known is None:
@@ -228,12 +231,12 @@ class InstallationMonitor:
 
 
 def midnight(now: datetime) -> datetime:
-    """The beginning of the day in UTC, by which AWS bills."""
+    """Return the beginning of the day in UTC, by which AWS bills."""
     return now.astimezone(UTC).replace(hour=0, minute=0, second=0, microsecond=0)
 
 
 def queues(account: Account, stack: str) -> list[StackQueue]:
-    """The stack's queues. A queue that another one names in its RedrivePolicy is a dead-letter queue."""
+    """Read the stack's queues. A queue that another one names in its RedrivePolicy is a dead-letter queue."""
     client = account.client("sqs")
     found: dict[str, Mapping[str, str]] = {}
     for url in Stack(account, stack).ids_of("AWS::SQS::Queue"):
@@ -252,7 +255,7 @@ def queues(account: Account, stack: str) -> list[StackQueue]:
 
 
 def certificate(installation: Installation, documents: Documents, now: datetime) -> CertificateState | None:
-    """The certificate that servers fetch; None if there is none. Does not read the private key.
+    """Read the certificate that servers fetch, but not its private key. Return None if there is none.
 
     Raises `Problem` if the document is no certificate.
     """
@@ -283,7 +286,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
 
 
 def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
-    """The installation's alarms, which are those that send to its topic."""
+    """Yield the installation's alarms, which are those that send to its topic."""
     pages = account.client("cloudwatch").get_paginator("describe_alarms")
     for page in pages.paginate(ActionPrefix=installation["Alarms"]):
         yield from page.get("MetricAlarms", ())

@@ -93,7 +93,7 @@ def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
 
 
 def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
-    """This month's bill; None if Cost Explorer gives none. Then the reason is added to the look's problems."""
+    """Ask for this month's bill. If there is none, return None, and add the reason to the look's problems."""
     today = datetime.now(UTC).date()
     bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
     if why:
@@ -105,7 +105,7 @@ def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
 
 
 def as_data(look: Snapshot, installation: Installation, bill: Billed | None = None) -> dict[str, Any]:
-    """The snapshot as JSON data."""
+    """Return the snapshot as JSON data."""
     certificate = look.certificate
     return {
         "stack": installation.stack,
@@ -192,7 +192,7 @@ def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
 
 
 def picture(look: Snapshot, installation: Installation) -> RenderableType:
-    """The snapshot as tables and lines."""
+    """Draw the snapshot as tables and lines."""
     parts: list[RenderableType] = [
         Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
     ]
@@ -274,7 +274,7 @@ def _servers(look: Snapshot) -> list[RenderableType]:
 
 
 def _failures(look: Snapshot) -> list[RenderableType]:
-    """Why servers have failed in the last 24 hours. All failures that only AWS can prevent are in one line."""
+    """Tell why servers have failed in the last 24 hours. Failures that only AWS can prevent share a line."""
     lines: list[RenderableType] = []
     of_aws = [failure for failure in look.failures if not failure.matters]
     for failure in look.failures:
@@ -289,7 +289,7 @@ def _failures(look: Snapshot) -> list[RenderableType]:
 
 
 def _warm_lines(look: Snapshot) -> list[RenderableType]:
-    """How many warm servers are ready, for each project that keeps warm servers or still has some."""
+    """Tell how many warm servers are ready, for each project that keeps warm servers or still has some."""
     lines: list[RenderableType] = []
     for project, _ in look.projects:
         warm = _warm(look, project)
@@ -311,7 +311,7 @@ def _kind(server: Server, members: int | None) -> str:
 
 
 def _parts(look: Snapshot) -> list[RenderableType]:
-    """Queues, certificate and alarms."""
+    """Draw the parts on queues, certificate and alarms."""
     parts: list[RenderableType] = []
     dead = sum(queue.waiting for queue in look.queues if queue.dead)
     waiting = [f"{q.name} {q.waiting + q.in_flight:,}" for q in look.queues if not q.dead and q.waiting + q.in_flight]

@@ -35,7 +35,7 @@ AT_ONCE = 4  # such calls at the same time; Route 53 takes 10 requests a second
 
 @dataclass
 class FoundServers:
-    """What one look found: open servers, resources that no open server owns, and tasks that are stopping."""
+    """The results of one look: open servers, resources that no open server owns, and tasks that are stopping."""
 
     servers: list[Server] = field(default_factory=list)
     leftovers: Resources = field(default_factory=Resources)
@@ -50,6 +50,7 @@ class FoundServers:
         return self.to_do or bool(self.draining)
 
     def counts(self) -> dict[str, int]:
+        """Return how many servers, resources and stopping tasks were found, by kind."""
         return {"servers": len(self.servers), **self.leftovers.counts(), "leaving": len(self.draining)}
 
 
@@ -74,17 +75,23 @@ class Stopper:
 
     @property
     def unreadable(self) -> int:
-        """How many records of servers cannot be read. The resources of these servers count as owned by no server."""
+        """The number of servers' records that cannot be read.
+
+        Resources of these servers count as owned by no server.
+        """
         return self._records.unreadable
 
     def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> FoundServers:
-        """Stop servers until a look finds nothing, or `wait` seconds are over; return what the last look found."""
+        """Stop servers until a look finds nothing, or `wait` seconds are over. Return what the last look found."""
         return self._executor.converge(
             self.look, lambda found: self.plan(found, advance), note=self._note, seconds=wait
         )
 
     def look(self) -> FoundServers:
-        """Find servers and resources; change nothing. Read resources first and then the records, as the sweep does."""
+        """Find servers and resources. Changes nothing.
+
+        Reads resources first and then the records, as the sweep does.
+        """
         platform = self._platform
         found = resources.list_resources(platform)
         draining = list(platform.tasks.draining(found.cluster))
@@ -102,7 +109,7 @@ class Stopper:
         )
 
     def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
-        """The steps that stop and remove what was found; empty if only stopping tasks are left."""
+        """Plan the steps that stop and remove what was found; empty if only tasks that are stopping are left."""
         steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
         steps += removal_steps(self._platform, found.leftovers)
         return steps + cluster_steps(self._platform, found.leftovers)
@@ -122,7 +129,7 @@ class Stopper:
             self.errors.update(failures.lines)
 
     def _stop_chunk(self, servers: Sequence[Server]) -> list[str]:
-        """Stop servers with one call; return the names of those that are stopped."""
+        """Stop servers with one call, and return the names of those that are stopped."""
         stops = {StopServer(one.project_id, one.user_id, one.attempt, Reason.STOPPED): one.name for one in servers}
         again = self._termination.stop([*stops])
         return [name for stop, name in stops.items() if stop not in again]
@@ -190,7 +197,7 @@ def command(
 
 
 def _again(live: Sequence[Project]) -> str:
-    """A sentence on live projects, whose servers can start again after a stop."""
+    """Write a sentence on live projects, whose servers can start again after a stop."""
     warm = [project.id for project in live if project.warm_servers]
     text = f"Live: {', '.join(project.id for project in live)}. Participants can start a server again"
     return text + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")

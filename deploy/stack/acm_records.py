@@ -44,12 +44,12 @@ class Validation(NamedTuple):
 
 
 def of_certificate(account: Account, arn: str, zone: str) -> list[Validation]:
-    """The validation records of a certificate; empty if it is gone."""
+    """Ask ACM for the validation records of a certificate; empty if it is gone."""
     return [Validation(zone, name, value) for name, value in _records(_describe(account, arn, account.region))]
 
 
 def in_use_by(account: Account, arn: str) -> list[str]:
-    """The ARNs of the resources that use a certificate; empty if it is gone."""
+    """Ask ACM for the ARNs of the resources that use a certificate; empty if it is gone."""
     return list(_describe(account, arn, account.region).get("InUseBy", ()))
 
 
@@ -62,13 +62,13 @@ def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
 
 
 def remembered(bucket: CodeBucket) -> list[Validation]:
-    """The records that `remember` has written."""
+    """Read the records that `remember` has written."""
     body = bucket.get(NOTE)
     return [Validation(**one) for one in json.loads(body)] if body else []
 
 
 def present(account: Account, one: Validation) -> dict[str, Any] | None:
-    """The record in the zone; None if it is gone or has changed."""
+    """Return the record in the zone; None if it is gone or has changed."""
     client = account.client("route53")
     try:
         answer = client.list_resource_record_sets(
@@ -86,7 +86,7 @@ def present(account: Account, one: Validation) -> dict[str, Any] | None:
 
 
 def of_domain(account: Account, zone: str, domain: str) -> list[Validation]:
-    """All records in a zone that prove this domain to ACM, for any account."""
+    """Return all records in a zone that prove this domain to ACM, for any account."""
     if not domain:
         return []
     found: list[Validation] = []
@@ -107,18 +107,18 @@ def of_domain(account: Account, zone: str, domain: str) -> list[Validation]:
 
 
 def removal(zone: str, record: Mapping[str, Any]) -> str:
-    """The AWS CLI command that deletes a record."""
+    """Return the AWS CLI command that deletes a record."""
     batch = json.dumps(deletion(record))
     return f"aws route53 change-resource-record-sets --hosted-zone-id {zone} --change-batch {shlex.quote(batch)}"
 
 
 def deletion(record: Mapping[str, Any]) -> dict[str, Any]:
-    """The ChangeBatch that deletes a record."""
+    """Return the ChangeBatch that deletes a record."""
     return {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
 
 
 def remove(account: Account, one: Validation) -> bool:
-    """Delete the record; return False if there was none."""
+    """Delete the record. Return False if there was none."""
     record = present(account, one)
     if record is None:
         return False
@@ -131,7 +131,7 @@ def remove(account: Account, one: Validation) -> bool:
 
 
 def users(account: Account, one: Validation) -> list[str]:
-    """What needs the record: the ARNs of this account's certificates; in words, regions that could not be asked."""
+    """Find what needs the record: ARNs of this account's certificates; in words, regions that were not asked."""
     try:
         regions = _regions(account)
     except ClientError:
@@ -142,7 +142,7 @@ def users(account: Account, one: Validation) -> list[str]:
 
 
 def _regions(account: Account) -> Sequence[str]:
-    """The regions that are enabled for this account."""
+    """Return the regions that are enabled for this account."""
     return sorted(one["RegionName"] for one in account.client("ec2").describe_regions()["Regions"])
 
 

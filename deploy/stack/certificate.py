@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
 CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
-"""ACME directory → the names by which CAA records allow its authority to issue."""
+"""By ACME directory, the names by which CAA records allow its authority to issue."""
 _UNKNOWN_AUTHORITY = ("<the authority>",)
 
 REAL = "python -m deploy certificate --production"
@@ -46,7 +46,10 @@ _LONGEST_BUNDLE = 1_000_000  # bytes
 
 @dataclass(frozen=True)
 class Choice:
-    """What to order. Without `directory`: from the present certificate's authority, or from Let's Encrypt's staging."""
+    """The order that the administrator wants.
+
+    Without `directory`, the present certificate's authority gets it, or Let's Encrypt's staging environment.
+    """
 
     directory: str = ""
     email: str = ""
@@ -68,10 +71,12 @@ class Report:
 
     @property
     def ordered(self) -> bool:
+        """Whether a certificate is due, so that one was or would be ordered."""
         return self.decision.verdict is Verdict.ORDER
 
     @property
     def days_left(self) -> int | None:
+        """The days for which the present certificate is valid; None if there is none."""
         return self.stored.days_left(self.now) if self.stored else None
 
     @property
@@ -80,7 +85,7 @@ class Report:
         return bool(self.stored) and self.directory == STAGING
 
     def as_json(self) -> dict[str, Any]:
-        """The report as JSON data, for scripts."""
+        """Return the report as JSON data, for scripts."""
         return {
             "domain": self.domain,
             "names": list(self.stored.names) if self.stored else [],
@@ -171,7 +176,7 @@ def obtain(
 
 
 def obtain_visibly(account: Account, installation: Installation, choice: Choice) -> Report:
-    """`obtain`, with a progress bar."""
+    """Call `obtain`, and show a progress bar."""
     with screen.progress() as bar:
         which = {STAGING: "test ", PRODUCTION: "real "}.get(choice.directory, "")
         task = bar.add_task(f"Looking at the {which}certificate", total=len(OrderStage))
@@ -187,7 +192,7 @@ def obtain_visibly(account: Account, installation: Installation, choice: Choice)
 def renewal_of(
     account: Account, installation: Installation, choice: Choice, tell: Callable[[OrderStage], None]
 ) -> tuple[Renewal, RenewalRequest]:
-    """The service that renews the installation's certificate, and the request to it for this choice."""
+    """Make the service that renews the installation's certificate, and the request to it for this choice."""
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
 
     domain = installation.servers_domain
@@ -209,7 +214,9 @@ def renewal_of(
 
 
 def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
-    """Check that the domain is in the zone, the zone is delegated, and no CAA record forbids. Raises `Problem`.
+    """Check that the domain is in the zone, the zone is delegated, and no CAA record forbids the order.
+
+    Raises `Problem`.
 
     With `own`, the directory is a CA of one's own, which may use another DNS: then only the domain's zone is checked.
     """
@@ -237,7 +244,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
 
 
 def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str], bool]) -> None:
-    """Raise `Problem` if a CAA record forbids: Let's Encrypt would refuse, and count it as a failure."""
+    """Raise `Problem` if a CAA record forbids the order: Let's Encrypt would refuse it, and count a failure."""
     for name in names_of(domain):
         found = caa.find(name.removeprefix("*."), known)
         if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
@@ -299,7 +306,7 @@ def _show(report: Report, dry_run: bool) -> None:
 
 
 def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:
-    """The problem of a certificate that is needed and was not ordered."""
+    """Explain why a certificate that is needed was not ordered."""
     if decision.verdict is Verdict.FOREIGN:
         until = f", valid until {_day(stored.not_after)}" if stored and stored.not_after > datetime.now(UTC) else ""
         return Problem(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def take_over(account: Account, installation: Installation) -> StoredCertificate | None:
-    """Copy a certificate of an earlier installation, if this one has none; return the copied one, or None.
+    """Copy a certificate of an earlier installation, if this one has none. Return the copied certificate, or None.
 
     `Renewal.obtain` writes the rest (`fullchain.pem`, `certificate.json`) from it.
     """
@@ -55,7 +55,7 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
 
 
 def _kept(account: Account, installation: Installation) -> Iterator[str]:
-    """The data buckets of earlier installations with this name in this region."""
+    """Yield the names of the data buckets of earlier installations with this name in this region."""
     code = CodeBucket(account, installation.stack).name
     for bucket in inventory.data_buckets(account, installation.stack, code):
         if bucket != installation["Bucket"]:
@@ -63,7 +63,7 @@ def _kept(account: Account, installation: Installation) -> Iterator[str]:
 
 
 def _read(account: Account, bucket: str, key: str) -> bytes:
-    """A document; empty if there is none, or if S3 refuses: then a new certificate is ordered."""
+    """Read a document. Return empty if there is none, or S3 refuses: then a new certificate is ordered."""
     try:
         answer = account.client("s3").get_object(Bucket=bucket, ExpectedBucketOwner=account.id, Key=key)
     except ClientError:
@@ -72,7 +72,7 @@ def _read(account: Account, bucket: str, key: str) -> bytes:
 
 
 def _write(documents: Documents, key: str, body: bytes) -> bool:
-    """Create a document; return False if it exists by now, or `body` is empty."""
+    """Create a document. Return False if it exists by now, or `body` is empty."""
     try:
         if body:
             documents.create(key, body)

@@ -32,7 +32,7 @@ _NO_CHANGES = ("didn't contain changes", "No updates are to be performed")
 
 @dataclass(frozen=True)
 class Prepared:
-    """The input of `plan` and `apply`: the stack, and the template and parameters that it is to have."""
+    """The input of `plan` and `apply`: the stack, and the template and parameters that it shall have."""
 
     account: Account
     stack: Stack
@@ -44,6 +44,7 @@ class Prepared:
 
     @property
     def status(self) -> str:
+        """The stack's state; empty if there is no stack."""
         return str(self.found["StackStatus"]) if self.found else ""
 
     @property
@@ -58,7 +59,7 @@ class Prepared:
         return parameters_of(self.existing)
 
     def changed_parameters(self) -> dict[str, tuple[str, str]]:
-        """The parameters that will change: name → (present value, new value)."""
+        """Return the parameters that will change, by name: the present value and the new one."""
         names = sorted(set(self.before) | set(self.parameters))
         pairs = {name: (self.before.get(name, ""), self.parameters.get(name, "")) for name in names}
         return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
@@ -98,7 +99,7 @@ def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
 
 
 def _subnets(found: Mapping[str, Any] | None) -> list[str]:
-    """The ids in the output `Subnets` of a described stack; empty if it has none."""
+    """Return the ids in the output `Subnets` of a described stack; empty if it has none."""
     outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
     return [name for name in outputs.get("Subnets", "").split(",") if name]
 
@@ -115,10 +116,12 @@ class ChangeSet:
 
 @contextlib.contextmanager
 def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = time.sleep) -> Iterator[ChangeSet]:
-    """Upload the template and make a change set. After the block, delete it and the empty stack that a first one makes.
+    """Upload the template and make a change set.
 
-    With `keep`, for a block that executes it, it stays if it has changes and the block raises nothing. Raises `Problem`
-    if CloudFormation refuses it.
+    After the block, delete the change set, and the empty stack that a first change set makes.
+
+    With `keep`, for a block that executes the change set, it stays if it has changes and the block raises nothing.
+    Raises `Problem` if CloudFormation refuses it.
     """
     client = prepared.account.client("cloudformation")
     url = prepared.bucket.put_template(prepared.template.text)
@@ -177,7 +180,7 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
 
 
 def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
-    """The findings of CloudFormation's validation of a change set, five at most; empty if they cannot be read.
+    """Read the first five findings of CloudFormation's validation of a change set; empty if they cannot be read.
 
     `mode`: FAIL for those that made the change set fail, WARN for those that did not, such as a quota that is used up
     (CloudFormation User Guide, "Validate stack deployments"; API Reference, OperationEvent).

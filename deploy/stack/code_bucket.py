@@ -24,11 +24,12 @@ from hippodrome.aws import errors
 _AT_ONCE = 4
 PAUSE = 10  # seconds between two tries to make the bucket
 LONGEST_DELETION = 600
-"""Seconds. CreateBucket answers OperationAborted while S3 deletes a bucket of that name: minutes, in rare cases up to
-an hour (aws/aws-cli issues 2411 and 2593)."""
+"""The most seconds to wait while CreateBucket answers OperationAborted, since S3 deletes a bucket of that name: this
+takes minutes, in rare cases up to an hour (aws/aws-cli issues 2411 and 2593)."""
 SETTLING = 180
-"""Seconds. A new bucket may answer OperationAborted to any change of its settings, although no other is under way;
-mostly for less than a minute (hashicorp/terraform-provider-aws issue 7628, ansible/ansible pull request 66778)."""
+"""The most seconds to wait while a new bucket answers OperationAborted to changes of its settings, although no other
+is under way: mostly less than a minute (hashicorp/terraform-provider-aws issue 7628, ansible/ansible pull request
+66778)."""
 SETTLING_PAUSE = 5  # seconds
 
 
@@ -52,7 +53,7 @@ class CodeBucket:
             raise
 
     def make(self) -> bool:
-        """Make the bucket, or finish what a run has begun; return whether anything was done. The tag is set last."""
+        """Make the bucket, or finish what a run has begun. Return whether anything was done. The tag is set last."""
         exists = self.exists()
         if exists and self._tagged():
             return False
@@ -76,7 +77,7 @@ class CodeBucket:
         return True
 
     def upload(self, functions: Sequence[Function]) -> int:
-        """Upload the zips that the bucket does not have; return how many."""
+        """Upload the zips that the bucket does not have, and return how many."""
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             present = list(pool.map(lambda function: self._has(function.key), functions))
         missing = [function for function, found in zip(functions, present, strict=True) if not found]
@@ -91,13 +92,13 @@ class CodeBucket:
         return len(missing)
 
     def put(self, key: str, body: bytes) -> str:
-        """Store an object, and let S3 check its sha256; return its URL."""
+        """Store an object, let S3 check its sha256, and return its URL."""
         checksum = base64.b64encode(hashlib.sha256(body).digest()).decode()
         self._s3.put_object(**self._owner, Key=key, Body=body, ChecksumSHA256=checksum)
         return self.url(key)
 
     def get(self, key: str) -> bytes:
-        """An object's content; empty if there is no object or no bucket."""
+        """Read an object's content; empty if there is no object or no bucket."""
         try:
             answer = self._s3.get_object(**self._owner, Key=key)
         except ClientError as error:
@@ -107,13 +108,13 @@ class CodeBucket:
         return bytes(answer["Body"].read())
 
     def put_template(self, text: str) -> str:
-        """Store a template under its hash, unless the bucket has it; return its URL for CloudFormation."""
+        """Store a template under its hash, unless the bucket has it, and return its URL for CloudFormation."""
         body = text.encode()
         key = f"templates/{hashlib.sha256(body).hexdigest()[:16]}.yml"
         return self.url(key) if self._has(key) else self.put(key, body)
 
     def url(self, key: str) -> str:
-        """The URL of an object, in the form that CloudFormation takes."""
+        """Return the URL of an object, in the form that CloudFormation takes."""
         return f"{self._s3.meta.endpoint_url.rstrip('/')}/{self.name}/{key}"
 
     def _has(self, key: str) -> bool:
@@ -151,14 +152,19 @@ class CodeBucket:
                 if code != "OperationAborted":
                     raise
             if not waited:
-                screen.info(f"S3 is still deleting the bucket {self.name} of before: waiting for that …")
+                screen.info(f"S3 is still deleting the bucket {self.name} of an earlier stack: waiting for that …")
             time.sleep(PAUSE)
         else:
-            raise Problem(f"S3 is still deleting the bucket {self.name} of before.", "Run the same command later.")
+            raise Problem(
+                f"S3 is still deleting the bucket {self.name} of an earlier stack.", "Run the same command later."
+            )
         self._s3.get_waiter("bucket_exists").wait(**self._owner, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
 
     def _set(self, call: Callable[..., Any], **setting: Any) -> None:
-        """Make a setting; try again while S3 answers OperationAborted. Raises `Problem` after `SETTLING` seconds."""
+        """Set a property of the bucket. Try again while S3 answers OperationAborted.
+
+        Raises `Problem` after `SETTLING`.
+        """
         for waited in range(0, SETTLING, SETTLING_PAUSE):
             try:
                 call(**self._owner, **setting)

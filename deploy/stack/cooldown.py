@@ -33,7 +33,7 @@ _STACKS = 3  # stacks of one name whose events are read, the newest first
 
 
 def remaining(account: Account, stack: str) -> float:
-    """Seconds until all names of deleted resources of the stack are free again; 0 if they are free."""
+    """Return the seconds until the names of the stack's deleted resources are all free again; 0 if they are."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     answers = list(pages)
@@ -50,7 +50,7 @@ def remaining(account: Account, stack: str) -> float:
 def wait(account: Account, stack: str, executor: Executor | None = None) -> None:
     """Wait until the names are free, with a progress bar."""
     executor = executor or Executor()
-    title = "EventBridge is still deleting the timers of before: waiting for that"
+    title = "EventBridge is still deleting the timers of an earlier stack: waiting for that"
     executor.wait(lambda: _group_is_deleting(account, stack), LONGEST, pause=PAUSE, title=title)
     left = round(remaining(account, stack))
     if left <= 0:
@@ -71,7 +71,7 @@ def _group_is_deleting(account: Account, group: str) -> bool:
 
 
 def _deleted(client: Any, stack_id: str, now: datetime) -> Iterator[tuple[str, datetime]]:
-    """The types of resources in `KEPT` that were deleted in this stack lately, each with the time."""
+    """Yield the type and time of each resource in `KEPT` that was deleted in this stack lately."""
     longest = max(KEPT.values()) + MARGIN
     for page in client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
         for event in page["StackEvents"]:  # newest first
@@ -88,7 +88,7 @@ def _last_change(summary: Mapping[str, Any]) -> datetime:
 
 
 def _now(answer: Mapping[str, Any]) -> datetime:
-    """The time by AWS's clock, from the answer's header `date`; without the header, by this machine's clock."""
+    """Return the time by AWS's clock, from the answer's header `date`; without the header, by this machine's clock."""
     date = answer.get("ResponseMetadata", {}).get("HTTPHeaders", {}).get("date", "")
     try:
         return parsedate_to_datetime(date)

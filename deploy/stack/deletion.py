@@ -16,11 +16,11 @@ from deploy.stack.stack import FailedResource, NotDeleted, Stack
 TRIES = 8  # at deleting the stack
 PAUSE = 20  # seconds between two looks at what blocks the deletion
 IN_USE = 75 * 60
-"""Seconds that a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
+"""The seconds for which a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
 (aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
 DISAGREEING = 5 * 60  # seconds to wait if CloudFormation says that the certificate is in use, and ACM lists no use
 NETWORK_IN_USE = 25 * 60
-"""Seconds that the network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
+"""The seconds for which network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
 (alchemy-run/alchemy pull request 1125)."""
 
 
@@ -46,7 +46,7 @@ class StackDeletion:
         self._stack.delete(title, self._without)
 
     def _recover(self, error: Exception) -> bool:
-        """Wait for, or remove, what blocks the deletion; return False if that is not possible."""
+        """Wait for what blocks the deletion, or remove it. Return False if neither is possible."""
         needed = recoveries(error.failures) if isinstance(error, NotDeleted) else []
         if not isinstance(error, NotDeleted) or not needed:
             return False
@@ -127,9 +127,10 @@ class StackDeletion:
     def _until_none(
         self, look: Callable[[], Sequence[str]], title: str, seconds: float, disagreeing: float
     ) -> Sequence[str]:
-        """Wait until a look finds nothing; return what the last look found.
+        """Wait until a look finds nothing, for `seconds` at most. Return what the last look found.
 
-        If the first look finds nothing, AWS's lists disagree with its refusal: wait `disagreeing` seconds.
+        AWS has refused a deletion because something is in use. If the first look finds nothing, AWS's lists are not up
+        to date, so no look can tell: wait `disagreeing` seconds.
         """
         if not look():
             self._executor.sleep(disagreeing)
@@ -138,6 +139,6 @@ class StackDeletion:
 
 
 def _is_other_use(account: Account, arn: str) -> bool:
-    """Whether this is a use by a resource of the account outside of API Gateway. API Gateway's own uses end alone."""
+    """Whether a resource outside of API Gateway uses the certificate. API Gateway's own uses end by themselves."""
     _, _, service, _, owner, *_ = arn.split(":")
     return owner == account.id and service != "apigateway"

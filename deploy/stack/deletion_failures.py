@@ -16,7 +16,7 @@ from deploy.stack.stack import FailedResource
 
 
 class Recovery(Enum):
-    """What must happen before the deletion is tried again. The value follows "This has to wait until"."""
+    """An event that must come before the deletion is tried again. Its value follows "This has to wait until"."""
 
     SERVERS = "servers are stopped"
     NETWORK = "the addresses of servers that have ended are given back"
@@ -109,7 +109,7 @@ _DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECA
 
 
 def recovery_from(failure: FailedResource) -> Recovery | None:
-    """What helps against this failure; None if it does not pass and no command can mend it."""
+    """Find what helps against this failure; None if it does not pass and no command can mend it."""
     if _DENIED.search(failure.reason):
         return None
     for known in TABLE:
@@ -121,6 +121,6 @@ def recovery_from(failure: FailedResource) -> Recovery | None:
 
 
 def recoveries(failures: Iterable[FailedResource]) -> list[Recovery]:
-    """What helps against these failures, each once; empty if nothing helps against one of them."""
+    """Find what helps against these failures, each once; empty if nothing helps against one of them."""
     found = [recovery_from(failure) for failure in failures]
     return [] if None in found else list(dict.fromkeys(recovery for recovery in found if recovery))

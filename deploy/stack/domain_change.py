@@ -30,7 +30,7 @@ _WAIT_FOR_WARM_TOO = (
 
 
 def moves(prepared: Prepared) -> bool:
-    """Whether this apply moves servers' names to another domain. True also if there is no installation yet."""
+    """Whether this apply moves servers' names to another domain. It is True, too, if there is no installation yet."""
     before = _before(prepared)
     return before is None or before.servers_domain != servers_domain(prepared.parameters)
 
@@ -120,7 +120,7 @@ def certify(prepared: Prepared) -> None:
 
 
 def _must_be_uploaded(account: Account, after: Installation) -> None:
-    """Raise `Problem` unless the administrator has uploaded, as before, a certificate for the new names by hand."""
+    """Raise `Problem` unless the administrator, who uploads certificates by hand, has one for the new names."""
     if account.platform(after).documents.get(after.certificate.privkey) is None:
         raise Problem(
             f"The servers' certificate was put there by hand, and there is none for *.{after.servers_domain}.",
@@ -130,7 +130,7 @@ def _must_be_uploaded(account: Account, after: Installation) -> None:
 
 
 def _before(prepared: Prepared) -> Installation | None:
-    """The present installation; None if there is none, or if its version is too old to name its resources."""
+    """Return the present installation; None if there is none, or its version is too old to name its resources."""
     if prepared.existing is None:
         return None
     found = Installation.of(prepared.account, prepared.existing)
@@ -141,7 +141,7 @@ def _before(prepared: Prepared) -> Installation | None:
 
 
 def servers_domain(parameters: Mapping[str, str]) -> str:
-    """The domain directly above servers' names in an installation with these parameters."""
+    """Return the domain directly above servers' names in an installation with these parameters."""
     settings = Settings(root_domain=parameters["RootDomain"], servers_host=parameters.get("ServersHost", ""))
     return settings.servers_domain
 
@@ -158,7 +158,7 @@ def _stays(server: Server, prepared: Prepared) -> bool:
 
 
 def _must_not_be_delegated(account: Account, zone: str, domain: str) -> None:
-    """Raise `Problem` if the zone delegates this domain: then its records are not used."""
+    """Raise `Problem` if the zone delegates this domain, since the zone's records for it are not used then."""
     found = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone, StartRecordName=f"{domain}.", StartRecordType="NS", MaxItems="1"
     )

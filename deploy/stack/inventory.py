@@ -37,12 +37,12 @@ REMEMBERED = 10  # stacks of one name, deleted ones included, whose resources ar
 
 
 def cost_of(kind: str) -> str:
-    """What one unused resource of this kind costs a month, in words."""
+    """Say in words what one unused resource of this kind costs a month."""
     return BY_KIND[kind].cost if kind in BY_KIND else "nothing"
 
 
 def removal_of(thing: ListedResource, account: Account) -> str:
-    """The AWS CLI command that removes a resource; "" if there is only the service's console."""
+    """Return the AWS CLI command that removes a resource; "" if there is only the service's console."""
     listing = BY_KIND.get(thing.kind)
     if listing is None:
         return ""
@@ -51,7 +51,7 @@ def removal_of(thing: ListedResource, account: Account) -> str:
 
 
 def resources(account: Account, stack: str) -> list[Resource]:
-    """The resources of all installations of that name, also of deleted ones (CloudFormation lists them for 90 days)."""
+    """List the resources of all installations of that name, also of those deleted in the last 90 days."""
     found = [
         Resource(one["ResourceType"], one["PhysicalResourceId"])
         for known in stacks(account, stack)
@@ -62,7 +62,7 @@ def resources(account: Account, stack: str) -> list[Resource]:
 
 
 def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
-    """The installations of that name from DescribeStacks: the present one, then those that were deleted last."""
+    """Describe the installations of that name: the present one, then those that were deleted last."""
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
@@ -72,7 +72,7 @@ def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
 
 
 def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
-    """A stack, also a deleted one; None if CloudFormation does not know it any more."""
+    """Describe a stack, also a deleted one; None if CloudFormation does not know it any more."""
     try:
         found: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
     except ClientError as error:
@@ -92,7 +92,7 @@ class Addresses(NamedTuple):
 
 
 def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
-    """The domains of these installations, each once."""
+    """Return the domains of these installations, each once."""
     found = []
     for parameters in map(parameters_of, described):
         zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
@@ -103,7 +103,10 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
 
 
 def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedResource]:
-    """The resources of `wanted` that exist, by one listing for each type. Skips types that are not in `LISTINGS`."""
+    """Find which resources of `wanted` exist, by one listing for each type.
+
+    Skips types that are not in `LISTINGS`.
+    """
     by_type: dict[str, set[str]] = {}
     for resource in wanted:
         by_type.setdefault(resource.type, set()).add(resource.physical_id)
@@ -157,7 +160,7 @@ def _last(arn: str) -> str:
 
 
 def task_definitions(account: Account, stack: str) -> list[str]:
-    """The revisions of this stack's task definitions, deregistered ones too.
+    """Return the revisions of this stack's task definitions, deregistered ones too.
 
     They are recognised by their tag, since `hippodrome-lab` is another installation than `hippodrome`.
     """
@@ -181,7 +184,7 @@ def _is_ours(ecs: Any, arn: str, stack: str) -> bool:
 
 
 def log_groups(account: Account, stack: str) -> list[str]:
-    """The log groups whose names contain the stack's name, made by the stack or by a service."""
+    """Return the log groups whose names contain the stack's name, made by the stack or by a service."""
     pages = account.client("logs").get_paginator("describe_log_groups")
     return [
         group["logGroupName"]
@@ -192,7 +195,7 @@ def log_groups(account: Account, stack: str) -> list[str]:
 
 
 def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:
-    """The existing data buckets of the stack, and of earlier stacks of that name in this region.
+    """Return the existing data buckets of the stack, and of earlier stacks of that name in this region.
 
     They are found among the `known` resources of CloudFormation, and by their tag, which stays longer.
     """
@@ -209,7 +212,7 @@ def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable
 
 
 def server_names(account: Account, where: Addresses) -> list[str]:
-    """The DNS names of servers in the zone, those of another installation with the same domains included."""
+    """List the DNS names of servers in the zone, also those of another installation with the same domains."""
     settings = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
     host = where.servers.removesuffix(where.root).rstrip(".")
     try:
@@ -221,11 +224,12 @@ def server_names(account: Account, where: Addresses) -> list[str]:
 
 
 SERVICE_ROLES = ("AWSServiceRoleForECS", "AWSServiceRoleForAPIGateway")
-"""Roles that AWS makes once in an account: `apply` asks for ECS's; API Gateway makes its own with a domain name."""
+"""The roles that AWS makes once in an account: `apply` asks for ECS's, and API Gateway makes its own with a domain
+name."""
 
 
 def service_roles(account: Account) -> list[str]:
-    """The names of the roles that AWS makes for the whole account (`SERVICE_ROLES`), if they exist."""
+    """Return the names of the roles that AWS makes for the whole account (`SERVICE_ROLES`), if they exist."""
     iam = account.client("iam")
     found = []
     for name in SERVICE_ROLES:
@@ -240,7 +244,7 @@ def service_roles(account: Account) -> list[str]:
 
 
 def stored(account: Account, bucket: str, most: int = 200_000) -> int:
-    """Bytes of all versions in a bucket; only of the first `most` versions if there are more."""
+    """Return the bytes of all versions in a bucket; only of the first `most` versions if there are more."""
     found = VersionedBucket(account, bucket).versions()
     return sum(version.size for version in itertools.islice(found, most))
 
@@ -299,7 +303,7 @@ _TAGGED = {  # services, as in ARNs, whose resources no listing above finds; the
 
 
 def tagged(account: Account, stack: str) -> list[ListedResource]:
-    """Resources with the stack's tag that no listing finds. The tagging API is late, so it is asked for no others."""
+    """Find resources with the stack's tag that no listing finds, by the tagging API, which learns of changes late."""
     client = account.client("resourcegroupstaggingapi")
     found = []
     try:

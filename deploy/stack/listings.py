@@ -19,7 +19,7 @@ class Listing(NamedTuple):
     cost: str = "nothing"  # of one unused resource, a month
 
     def removal(self, name: str, region: str) -> str:
-        """The AWS CLI command that removes the resource of this name."""
+        """Return the AWS CLI command that removes the resource of this name."""
         return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
 
 
@@ -104,4 +104,4 @@ BY_KIND = {listing.kind: listing for listing in _ALL.values()}
 LISTINGS = {type_: one for type_, one in _ALL.items() if type_ != "AWS::ECS::TaskDefinition"}  # which `register` makes
 KINDS = {type_: listing.kind for type_, listing in LISTINGS.items()}
 KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
-"""Without them ListCertificates names RSA_1024 and RSA_2048 only (ACM API reference)."""
+"""The key types for ListCertificates, which lists only RSA_1024 and RSA_2048 without them (ACM API reference)."""

@@ -37,7 +37,7 @@ class PolicyAttachments(NamedTuple):
 
 
 def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
-    """To whom the policy is attached; with `usage` PermissionsBoundary, whose boundary it is. Empty if it is gone."""
+    """Ask IAM who has the policy; with `usage` PermissionsBoundary, whose boundary it is. Empty if it is gone."""
     found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
     try:
@@ -69,7 +69,7 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
 
 
 def detach(account: Account, arn: str) -> PolicyAttachments:
-    """Detach the policy and delete its other versions; return who had it. Raises `Problem` if it is a boundary."""
+    """Detach the policy, delete its other versions, and return who had it. Raises `Problem` if it is a boundary."""
     must_be_no_boundary(account, arn)
     found = attached(account, arn)
     iam = account.client("iam")
@@ -118,7 +118,7 @@ def _other_versions(iam: Any, arn: str) -> Iterator[str]:
 
 
 def _quietly(call: Any, **arguments: Any) -> None:
-    """Make the call; ignore that the entity is gone already."""
+    """Make the call, and ignore an error that says that the entity is gone already."""
     try:
         call(**arguments)
     except ClientError as error:

@@ -23,7 +23,7 @@ _WHICH = "`python -m deploy destroy --dry-run` names those that it has kept (wit
 
 
 def open_bucket(account: Account, name: str, project: str) -> Bucket:
-    """The bucket, if it is the account's own and holds data of this project's participants. Raises `Problem`.
+    """Open a bucket that is the account's own and holds data of this project's participants. Raises `Problem`.
 
     If the list of projects is missing, this only warns: the answers can be read without it.
     """
@@ -48,7 +48,7 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
 
 
 def projects(account: Account, name: str) -> list[str]:
-    """The projects, registered or not, that have documents of participants in this bucket."""
+    """Return the projects, registered or not, that have documents of participants in this bucket."""
     return [project for project in _folders(account, name) if _holds(account, name, keys.prefix(project))]
 
 

@@ -16,7 +16,7 @@ from deploy.aws.account import Account
 from deploy.aws.hosted_zone import clean_domain, find_zone, read_zone
 
 SITE_LENGTH = 64
-"""Characters that the site's name may have. ACM's limit for a certificate's first name (RequestCertificate)."""
+"""The most characters of the site's name: ACM's limit for a certificate's first name (RequestCertificate)."""
 
 _PARAMETERS = {  # setting → the template's parameter that gets its value unchanged
     "site": "SiteHost",
@@ -35,7 +35,7 @@ _PARAMETERS = {  # setting → the template's parameter that gets its value unch
 
 
 def option(parameter: str) -> str:
-    """The option that sets a parameter of the template; the parameter's name if there is no such option."""
+    """Return the option that sets a parameter of the template; the parameter's name if there is no such option."""
     return next((f"--{name.replace('_', '-')}" for name, one in _PARAMETERS.items() if one == parameter), parameter)
 
 
@@ -92,7 +92,7 @@ class StackSettings:
         code_bucket: str,
         subnets: Sequence[str] = (),
     ) -> dict[str, str]:
-        """The template's parameters: the option, else the stack's present value, else the default.
+        """Make the template's parameters: of each the option, else the stack's present value, else the default.
 
         `subnets` are the present installation's. Raises `Problem` if a value is missing, or values do not fit together.
         """
@@ -155,7 +155,7 @@ def _check_site(site: str) -> None:
 def _zones(
     account: Account, found: Mapping[str, str], previous: Mapping[str, str], subnets: Sequence[str]
 ) -> dict[str, str]:
-    """The parameters for zones. With a VPC of the administrator's they are kept, unused, for a later VPC of its own."""
+    """Return the parameters for zones. With a VPC of the administrator's they stay, unused, for a later own VPC."""
     if found.get("VpcId"):
         return {name: previous.get(name, "") for name in availability_zones.PARAMETERS}
     return availability_zones.choose(account, previous, () if previous.get("VpcId") else subnets)

@@ -32,7 +32,7 @@ _ROLE_IS_NEW = (
     r"Unable to assume the service linked role|cannot be assumed by Lambda|"
     r"CodeBuild is not authorized to perform: sts:AssumeRole|execution role does not have permissions to call"
 )
-"""The messages of services while IAM does not know a new role or its policy everywhere: of CreateCluster
+"""The services' error messages while IAM does not know a new role or its policy everywhere: of CreateCluster
 (1Password/scim-examples, issue 356), CreateFunction (pulumi/pulumi-aws-native 148), CodeBuild's CreateProject
 (terraform-provider-aws 4233), and CreateEventSourceMapping (milliHQ/terraform-aws-next-js 138)."""
 
@@ -64,10 +64,12 @@ class Operation:
 
     @property
     def done(self) -> int:
+        """The number of resources that the operation has finished."""
         return sum(state.endswith(("_COMPLETE", "_SKIPPED")) for state in self.states.values())
 
     @property
     def under_way(self) -> list[str]:
+        """The logical ids of the resources that are being changed."""
         return [name for name, state in self.states.items() if state.endswith("_IN_PROGRESS")]
 
 
@@ -81,7 +83,7 @@ class Stack:
         self._sleep = sleep
 
     def describe(self) -> Mapping[str, Any] | None:
-        """The stack as CloudFormation describes it; None if there is none.
+        """Describe the stack, as CloudFormation does; None if there is none.
 
         Raises `Problem` if the stack of that name is not an installation of Hippodrome.
         """
@@ -94,17 +96,17 @@ class Stack:
         return str(found["StackStatus"]) if found else ""
 
     def template(self) -> str:
-        """The text of the stack's template; "" if it is JSON, so not Hippodrome's."""
+        """Return the text of the stack's template; "" if it is JSON, so not Hippodrome's."""
         found = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
         return found if isinstance(found, str) else ""
 
     def resources(self, stack_id: str = "") -> list[dict[str, Any]]:
-        """The stack's resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
+        """Return the stack's resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
         pages = self._client.get_paginator("list_stack_resources").paginate(StackName=stack_id or self.name)
         return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
 
     def ids_of(self, kind: str) -> list[str]:
-        """The physical ids of the stack's existing resources of a type; empty if there is no stack."""
+        """Return the physical ids of the stack's existing resources of a type; empty if there is no stack."""
         try:
             return ids_of(self.resources(), kind)
         except ClientError as error:
@@ -113,14 +115,14 @@ class Stack:
             raise
 
     def last_event(self, stack_id: str) -> str:
-        """The id of the stack's newest event, by which `follow` recognises later ones; "" if there is none."""
+        """Return the id of the stack's newest event, by which `follow` recognises later ones; "" if there is none."""
         events = self._client.describe_stack_events(StackName=stack_id)["StackEvents"]
         return str(events[0]["EventId"]) if events else ""
 
     # -- waiting ------------------------------------------------------------------------------------------------------
 
     def follow(self, title: str, stack_id: str, total: int = 0, after: str | None = None) -> str:
-        """Show the present operation until it ends; return the stack's state then.
+        """Show the present operation until it ends, and return the stack's state then.
 
         `after` is the last event before the operation. Raises `Problem` on Ctrl-C: CloudFormation goes on, and the same
         command follows the operation again.
@@ -161,7 +163,7 @@ class Stack:
             pause = min(PAUSE, pause * 1.5)
 
     def operation(self, stack_id: str) -> Operation:
-        """The latest operation on the stack, from its events."""
+        """Read the latest operation on the stack from its events."""
         found = Operation()
         for event in reversed([*self._events(stack_id)]):
             if self._is_own(event):
@@ -175,7 +177,7 @@ class Stack:
         return found
 
     def _events(self, stack_id: str) -> Iterator[Mapping[str, Any]]:
-        """The events of the latest operation, newest first."""
+        """Yield the events of the latest operation, newest first."""
         try:
             for page in self._client.get_paginator("describe_stack_events").paginate(StackName=stack_id):
                 for event in page["StackEvents"]:
@@ -276,7 +278,7 @@ class Stack:
             )
 
     def problem(self, summary: str, stack_id: str, status: str) -> Problem:
-        """The problem of the latest operation: its first three failures with reasons, and the names of the others."""
+        """Explain the latest operation's failure: its first three failed resources with reasons, the others by name."""
         failures = self.operation(stack_id).failures
         details: list[str] = []
         for failure in failures[:3]:
@@ -291,7 +293,7 @@ class Stack:
 
 
 def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
-    """The physical ids of the resources that have this type and exist."""
+    """Return the physical ids of the resources that have this type and exist."""
     deleted = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
     return [
         str(one["PhysicalResourceId"])
@@ -349,7 +351,7 @@ def role_is_new(problem: Problem) -> bool:
 
 
 def advice(failures: Sequence[FailedResource], details: Sequence[str] = ()) -> str:
-    """The advice for the first failure, or for the `details` if no resource failed."""
+    """Advise on the first failure, or on the `details` if no resource failed."""
     reason = failures[0].reason if failures else " ".join(details)
     for pattern, text in _ADVICE:
         if re.search(pattern, reason, re.IGNORECASE):

@@ -14,7 +14,7 @@ from console.problem import Problem
 
 
 class StackAction(Enum):
-    """What `apply` does first about a stack."""
+    """The first thing that `apply` does about a stack."""
 
     CREATE = "make it"  # there is no stack, or one without resources
     UPDATE = "bring it up to date"
@@ -58,7 +58,7 @@ _BECAUSE = {
 
 
 def action_for(status: str) -> StackAction:
-    """What to do about a stack in this state ("": there is none). Unknown states are left to the administrator."""
+    """Return what to do about a stack in this state ("": no stack). Unknown states are the administrator's task."""
     return ACTIONS.get(status, StackAction.STOP) if status else StackAction.CREATE
 
 
@@ -68,7 +68,7 @@ def never_complete(status: str) -> bool:
 
 
 def problem(stack: str, status: str) -> Problem:
-    """The problem of a stack in a state that `apply` leaves to the administrator."""
+    """Explain a state of a stack that `apply` leaves to the administrator."""
     because = _BECAUSE.get(status, "is in a state that this version does not know")
     return Problem(
         f"The stack {stack} {because} ({status}).",

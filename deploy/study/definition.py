@@ -22,12 +22,12 @@ PRIVILEGED = 1024  # only a privileged user may listen on lower ports
 
 
 def port(installation: Installation) -> int:
-    """The port on which the servers of a study listen that is registered now."""
+    """Return the port on which the servers of a study will listen if it is registered now."""
     return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no such output
 
 
 def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
-    """The task definition, as RegisterTaskDefinition takes it. `cpu` in vCPU, `memory` in GB.
+    """Make the task definition, as RegisterTaskDefinition takes it. `cpu` in vCPU, `memory` in GB.
 
     The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
     the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
@@ -78,7 +78,7 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
 
 
 def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
-    """The ARN of the family's newest revision if it is active and has this content; else None."""
+    """Find the family's newest revision if it is active and has this content. Return its ARN, or None."""
     try:
         found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
     except ClientError as error:
@@ -91,7 +91,7 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
 
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
-    """Register a new revision; return its ARN."""
+    """Register a new revision, and return its ARN."""
     tags = {TAG: installation.stack, "hippodrome:project": project_id}
     answer = account.client("ecs").register_task_definition(
         **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]

@@ -59,7 +59,10 @@ def command(
 
 
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
-    """Id → signature, in the order of `users`, from the function that has the secret. Raises `Problem`."""
+    """Ask the function that has the secret for signatures. Return them by id, in the order of `users`.
+
+    Raises `Problem`.
+    """
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
         chunk = list(users[start : start + MAX_SIGNED])
@@ -72,12 +75,12 @@ def signed(account: Account, installation: Installation, project_id: str, users:
 
 
 def link(site: str, project: Project, user_id: str, signature: str) -> str:
-    """The signed address with which this participant begins."""
+    """Make the signed address with which this participant begins."""
     return f"{site.rstrip('/')}/next?{urlencode({'projectId': project.id, 'userId': user_id, 'signature': signature})}"
 
 
 def _read(file: Path) -> list[str]:
-    """The ids in a file, in their order, each once; empty lines are skipped. Raises `Problem`."""
+    """Read the ids in a file, in their order, each once, without empty lines. Raises `Problem`."""
     try:
         text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

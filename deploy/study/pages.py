@@ -21,7 +21,7 @@ LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` sends it, and the answer o
 
 @dataclass(frozen=True)
 class Changes:
-    """The differences between folder and bucket. `put`: key → file to upload. `gone`: keys without a file."""
+    """The differences between folder and bucket. `put`: by key, the file to upload. `gone`: keys without a file."""
 
     put: Mapping[str, Path]
     gone: Sequence[str]
@@ -32,7 +32,7 @@ class Changes:
 
 
 def compare(account: Account, bucket: str, project_id: str, folder: Path, more: Iterable[Path] = ()) -> Changes:
-    """Compare folder and bucket; change nothing. `more` are pages outside of the folder. Raises `Problem`."""
+    """Compare folder and bucket. Changes nothing. `more` are pages outside of the folder. Raises `Problem`."""
     prefix = f"{project_id}/steps/"
     files = {prefix + file.name: file for file in [*_files(folder), *more]}
     stored = _listing(account, bucket, prefix)
@@ -56,7 +56,10 @@ def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files in the folder of pages, without hidden ones. Raises `Problem` for a link out of it or a large file."""
+    """List the folder's files without hidden ones.
+
+    Raises `Problem` on a link that leaves the folder, or a large file.
+    """
     steps = layout.pages_folder(folder)
     files = sorted(file for file in steps.iterdir() if not file.name.startswith(".")) if steps else []
     found = []

@@ -46,7 +46,10 @@ Base = Annotated[
 
 @dataclass(frozen=True)
 class RegisterRequest:
-    """How to register. `live`: replaces config.yml's value, unless None. `again`: build an image even if one exists."""
+    """The options of `register`. `live`, if not None, replaces config.yml's value.
+
+    `again`: build an image in any case.
+    """
 
     live: bool | None = None
     again: bool = False
@@ -58,7 +61,7 @@ class RegisterRequest:
 
 @dataclass(frozen=True)
 class RegisterPlan:
-    """What `register` would do: the folder compared with AWS."""
+    """The differences between the folder and AWS, which `register` removes."""
 
     study: project_folder.ProjectFolder
     before: Project | None  # the project as it is registered now
@@ -69,7 +72,7 @@ class RegisterPlan:
 
     @property
     def steps(self) -> list[str]:
-        """What `register` would do, a line for each step; empty if nothing has changed."""
+        """The steps that `register` would take, a line for each; empty if nothing has changed."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
             found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
@@ -82,7 +85,7 @@ class RegisterPlan:
         return found + [f"remove {key}" for key in self.pages.gone]
 
     def task(self, revision: str | None) -> dict[str, Any]:
-        """The keys of a registration for this revision: the revision, and the port on which its servers listen."""
+        """Return a registration's keys for this revision: the revision, and the port on which its servers listen."""
         return {"taskDefinition": revision, "serverPort": self.port} if revision else {}
 
 
@@ -139,7 +142,7 @@ def command(
 
 
 def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> RegisterPlan:
-    """Compare the folder with AWS; change nothing. Raises `Problem` if the project cannot be registered here."""
+    """Compare the folder with AWS. Changes nothing. Raises `Problem` if the project cannot be registered here."""
     found = project_folder.read(folder, installation)
     if request.live is not None:
         found.registration["live"] = request.live
@@ -154,7 +157,7 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
-    """Register the study; return what was done, as JSON data. Raises `Problem`."""
+    """Register the study, and return what was done, as JSON data. Raises `Problem`."""
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)
@@ -198,18 +201,18 @@ def register(account: Account, installation: Installation, folder: Path, request
 
 
 def _remarks(folder: Path, found: project_folder.ProjectFolder) -> list[str]:
-    """Remarks on a project without mistakes: on its files and on the installation, with a game also on its packages."""
+    """Return remarks on a project without mistakes: on its files, the installation, and with a game its packages."""
     of_packages = [
         *agent_imports.requirement_remarks(folder),
         *agent_imports.missing(folder),
-        *agent_imports.of_players(folder, found.config),
+        *agent_imports.missing_for_players(folder, found.config),
     ]
     of_packages = of_packages if found.plays else []
     return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *of_packages]]
 
 
 def link(installation: Installation, project_id: str) -> str:
-    """The address with which participants begin. docs/recruiting.md says what recruiters add to it."""
+    """Make the address with which participants begin. docs/recruiting.md says what recruiters add to it."""
     return f"{installation['Site'].rstrip('/')}/next?projectId={project_id}"
 
 
@@ -233,7 +236,7 @@ def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
 
 
 def _close(account: Account, installation: Installation, folder: Path) -> None:
-    """Close an open study at once. Of the folder, which may have mistakes, only the id is used."""
+    """Close an open study at once. Only the id in the folder is used, since the folder may have mistakes."""
     project_id = project_folder.id_in(folder)
     before = _registered(account, installation, project_id, []) if project_id else None
     if before is None or not before.live:
@@ -285,7 +288,7 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
 
 
 def _advice(problems: Sequence[str]) -> str:
-    """What to do about these problems. If a key is unknown to the function, it is older than this version."""
+    """Advise on these problems. A function that does not know a key is older than this version."""
     if not problems:
         return "Bring it up to date with `python -m deploy apply`."
     if any("unknown key" in problem for problem in problems):
@@ -297,7 +300,7 @@ def _advice(problems: Sequence[str]) -> str:
 
 
 def _tell_warm(registration: Mapping[str, Any]) -> None:
-    """Warn how much warm servers cost from now on, even without participants."""
+    """Warn about the cost of warm servers from now on, even without participants."""
     number, setup = registration["warmServers"], registration["awsSetup"]
     if not number or not registration["live"]:
         return

@@ -128,7 +128,7 @@ def command(
 
 
 def credentials(account: Account) -> Iterator[Finding]:
-    """To whom the credentials belong, and the region. Raises botocore's errors if AWS does not accept them."""
+    """Check the credentials, and tell whose they are. Raises botocore's errors if AWS does not accept them."""
     identity = account.identity
     name = identity["Arn"].rpartition(":")[2]
     if name == "root":
@@ -141,7 +141,7 @@ def credentials(account: Account) -> Iterator[Finding]:
 
 
 def installation_state(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
-    """The installation (None if there is none), and findings on its state and version."""
+    """Find the installation (None if there is none), and check its state and version."""
     try:
         installation = find_installation(account, stack)
     except Problem as problem:
@@ -174,7 +174,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
 
 
 def _version(account: Account, stack: str) -> Iterator[Finding]:
-    """Whether the stack's template is that of this version, apart from the code of the functions."""
+    """Check whether the stack's template is that of this version, apart from the functions' code."""
     from deploy.code.template import Template  # noqa: PLC0415
     from deploy.stack.stack import Stack  # noqa: PLC0415
 
@@ -188,14 +188,14 @@ def _version(account: Account, stack: str) -> Iterator[Finding]:
 
 
 def _plain(template: str) -> str:
-    """The template without the hashes of the functions' code."""
+    """Return the template without the hashes of the functions' code."""
     import re  # noqa: PLC0415
 
     return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
 
 
 def _wanted(context: CheckContext, given: str | None) -> Project | None:
-    """The registered project with the id or folder `given`. Raises `Problem` if it is not registered."""
+    """Find the registered project with the id or folder `given`. Raises `Problem` if it is not registered."""
     if given is None:
         return None
     project_id = given

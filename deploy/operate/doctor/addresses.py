@@ -22,7 +22,7 @@ PATIENCE = 10  # seconds to wait for the site
 
 
 def zone(context: CheckContext) -> Iterator[Finding]:
-    """Whether the hosted zone exists, is for the domain, and is delegated."""
+    """Check whether the hosted zone exists, is for the domain, and is delegated."""
     domain = context.installation["RootDomain"]
     try:
         found = read_zone(context.account, context.installation["HostedZoneId"])
@@ -54,7 +54,7 @@ def zone(context: CheckContext) -> Iterator[Finding]:
 
 
 def site_certificate(context: CheckContext) -> Iterator[Finding]:
-    """The state of the site's certificate, which ACM renews by itself if DNS is right."""
+    """Check the site's certificate, which ACM renews by itself if DNS is right."""
     stack = Stack(context.account, context.installation.stack)
     arns = stack.ids_of("AWS::CertificateManager::Certificate")
     if not arns:
@@ -79,7 +79,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
 
 
 def site(context: CheckContext) -> Iterator[Finding]:
-    """Whether the site answers at the participants' address."""
+    """Check whether the site answers at the participants' address."""
     if context.fetch is None:
         return
     address = context.installation["Site"]
@@ -99,7 +99,7 @@ def site(context: CheckContext) -> Iterator[Finding]:
 
 
 def fetch(address: str) -> int:
-    """Send a GET request over https; return the status, also 4xx and 5xx. Raises OSError without an answer."""
+    """Send a GET request over https, and return the status, also 4xx and 5xx. Raises OSError without an answer."""
     if not address.startswith("https://"):
         raise ValueError(address)
     try:
@@ -112,7 +112,7 @@ def fetch(address: str) -> int:
 
 
 def authorities() -> ssl.SSLContext:
-    """A TLS context that trusts this machine's authorities and Mozilla's, which certifi has.
+    """Make a TLS context that trusts this machine's authorities and Mozilla's, which certifi has.
 
     Python from python.org has no authorities on macOS (its `Install Certificates.command` adds certifi's). A network
     that inspects TLS has an authority that only its machines know.
@@ -123,7 +123,7 @@ def authorities() -> ssl.SSLContext:
 
 
 def certificate(context: CheckContext) -> Iterator[Finding]:
-    """Whether the servers' wildcard certificate is in place, valid, and renewed in time."""
+    """Check whether the servers' wildcard certificate is in place, valid, and renewed in time."""
     order = "Order one: `python -m deploy certificate --production`."
     try:
         found = snapshot.certificate(context.installation, context.platform.documents, context.now)

@@ -20,7 +20,7 @@ HEADROOM = 4  # standard deviations above the mean: requests come at random, and
 
 
 def fargate(context: CheckContext) -> Iterator[Finding]:
-    """The vCPU quotas, on Spot and on demand, compared with what all servers need together, warm ones included."""
+    """Compare the vCPU quotas, on Spot and on demand, with what all servers need together, warm ones included."""
     cpu = context.cpu or (0 if context.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
@@ -49,7 +49,7 @@ def fargate(context: CheckContext) -> Iterator[Finding]:
 
 
 def functions(context: CheckContext) -> Iterator[Finding]:
-    """Lambda's concurrent executions, which the whole account shares."""
+    """Check Lambda's concurrent executions, which the whole account shares."""
     free = concurrency.unreserved(context.account)
     workers = concurrency.workers(free)
     waiting = context.at_once * context.players

@@ -17,7 +17,7 @@ from hippodrome.model.project import Project
 
 @dataclass
 class CheckContext:
-    """The installation to check. `delegation` asks DNS, `fetch` the site; if one is None, that is not asked."""
+    """The installation to check. `delegation` asks DNS, and `fetch` asks the site; None: do not ask."""
 
     account: Account
     installation: Installation
@@ -40,22 +40,22 @@ class CheckContext:
 
     @cached_property
     def cpu(self) -> float:
-        """vCPUs of the largest server of these projects; 0 if none has a game."""
+        """The vCPUs of the largest server of these projects; 0 if none has a game."""
         return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
 
     @cached_property
     def players(self) -> int:
-        """The largest number of participants who share a server of these projects."""
+        """The largest number of participants who share a server in these projects."""
         return max((p.players for p in self.projects if p.game_steps), default=1)
 
     @cached_property
     def warm(self) -> int:
-        """How many warm servers these projects keep. When one is assigned, another is started."""
+        """The number of warm servers that these projects keep. When one is assigned, another is started."""
         return sum(p.warm_servers for p in self.projects)
 
     @cached_property
     def warm_cpu(self) -> float:
-        """vCPUs of all warm servers."""
+        """The vCPUs of all warm servers together."""
         return sum(p.warm_servers * p.size.cpu for p in self.projects)
 
 

@@ -39,7 +39,7 @@ OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 
 def documents(context: CheckContext) -> Iterator[Finding]:
-    """The documents that cannot be read: list of projects, servers' records, slots, sessions, participants' records."""
+    """Find documents that cannot be read: list of projects, records of servers and participants, slots, sessions."""
     found = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
         found += [*_shared(context.platform.documents, project), *_participants(context.platform.documents, project)]
@@ -56,7 +56,7 @@ def _projects(context: CheckContext) -> Iterator[Finding]:
 
 
 def _secret(context: CheckContext) -> Iterator[Finding]:
-    """The installation's secret. Only functions may read it, so this only checks that it exists."""
+    """Check that the installation's secret exists. Only functions may read it."""
     needed = any(project.salt for project in context.projects)
     if needed and not any(entry.key == secret.KEY for entry in context.platform.documents.list(secret.KEY)):
         yield bad(
@@ -82,7 +82,7 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
 
 
 def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
-    """The documents with a project's slots and its pool of warm servers."""
+    """Check the documents with a project's slots and its pool of warm servers."""
     check = f"project {project.id}"
     if project.limits_servers and not _is_readable(documents, limits.server_slots_key(project.id), ServerSlots):
         yield bad(
@@ -107,7 +107,7 @@ def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
 
 
 def _sessions(documents: Documents, project: Project) -> Iterator[Finding]:
-    """The lobby's decisions, and the documents of the latest sessions."""
+    """Check the lobby's decisions, and the documents of the latest sessions."""
     check, key = f"project {project.id}", decisions.key(project.id)
     if not _is_readable(documents, key, Decisions):
         yield look(
@@ -144,7 +144,7 @@ def _participants(documents: Documents, project: Project) -> Iterator[Finding]:
 
 
 def _read_latest(documents: Documents, entries: Iterable[Entry], read: Callable[[bytes], object]) -> list[bool]:
-    """Whether each of the `LATEST` newest of these documents can be read."""
+    """Return, for each of the `LATEST` newest of these documents, whether it can be read."""
     latest = sorted(entries, key=lambda entry: entry.modified, reverse=True)[:LATEST]
     with ThreadPoolExecutor(READERS) as pool:
         return list(pool.map(lambda entry: _can_be_read(documents, entry.key, read), latest))
@@ -167,7 +167,7 @@ def _can_be_read(documents: Documents, key: str, read: Callable[[bytes], object]
 
 
 def step_pages(context: CheckContext) -> Iterator[Finding]:
-    """The projects' pages that are missing, or cannot be rendered for a participant without data."""
+    """Find the projects' pages that are missing, or cannot be rendered for a participant without data."""
     wrong = [finding for project in context.projects for finding in _pages(context.platform.documents, project)]
     yield from wrong or [good("pages", "All are there and can be shown.")]
 

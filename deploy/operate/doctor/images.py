@@ -21,7 +21,7 @@ AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
 def projects(context: CheckContext) -> Iterator[Finding]:
-    """Whether the servers of each live project, or of the wanted one, can start."""
+    """Check whether the servers of each live project, or of the wanted one, can start."""
     if not context.projects:
         yield look(
             "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."
@@ -76,7 +76,7 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
 
 
 def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Finding]:
-    """Whether warm servers have time to wait. `register` checks that, but the installation may change afterwards."""
+    """Check whether warm servers have time to wait. `register` has checked it, but the installation may change."""
     settings = context.platform.settings
     needed = project.max_runtime + MIN_RUNTIME_MARGIN
     if not (project.live and project.warm_servers) or needed <= settings.max_runtime:
@@ -96,7 +96,7 @@ def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Findi
 
 
 def _wrong(definition: Mapping[str, Any]) -> Iterator[str]:
-    """What in the task definition would keep a server from starting."""
+    """Yield the parts of the task definition that would keep a server from starting, in words."""
     if definition.get("status", "ACTIVE") != "ACTIVE":
         yield "was taken out of use"
     if _container(definition) is None:
@@ -112,7 +112,7 @@ def _container(definition: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
-    """Whether the image is in the repository, how old it is, and whether it has known vulnerabilities."""
+    """Check whether the image is in the repository, how old it is, and whether it has known vulnerabilities."""
     repository = context.installation["Repository"]
     name, _, digest = image.partition("@")
     if not name.startswith(repository) or name[len(repository) : len(repository) + 1] not in ("", ":"):
@@ -143,7 +143,7 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
 
 
 def _vulnerabilities(client: Any, repository: str, digest: str) -> dict[str, int]:
-    """The number of critical and high vulnerabilities, by severity; {} if the image was not scanned."""
+    """Return the number of critical and high vulnerabilities, by severity; {} if the image was not scanned."""
     try:
         found = client.describe_image_scan_findings(repositoryName=repository, imageId={"imageDigest": digest})
     except client.exceptions.ScanNotFoundException:

@@ -41,7 +41,7 @@ STAGES = {
 
 @dataclass
 class SecondsToStates:
-    """Seconds from the start message to each state."""
+    """The seconds from the start message to each state of the server."""
 
     seconds: dict[ServerState, float] = field(default_factory=dict)
 
@@ -53,8 +53,8 @@ class SecondsToStates:
 class Rehearsal:
     """Starts and stops one server without a participant. `progress` gets a text on each thing that happens.
 
-    In a project with sessions it is a session's server. The session has a document, since the sweep stops servers that
-    were started ahead and got no session.
+    In a project with sessions it is a session's server. The rehearsal writes the session's document, since the sweep
+    stops servers that were started ahead and got no session.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Rehearsal:
             self._sleep(PAUSE)
 
     def _late(self, record: Server | None) -> CheckFailed:
-        """Why the server may be late, by its state and by whether ECS knows its task."""
+        """Explain why the server may be late, by its state and by whether ECS knows its task."""
         if record is not None and record.state is ServerState.STARTING:
             if self._platform.tasks.find(record.name, record.cluster):
                 return CheckFailed(
@@ -147,7 +147,7 @@ class Rehearsal:
         return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
 
     def _visit(self) -> list[Finding]:
-        """Connect to the server by its name, as a browser does: this needs DNS, the port, TLS and the certificate."""
+        """Connect to the server by its name, as a browser does, which proves DNS, the port, TLS and the certificate."""
         record = self._record
         if self._reach is None or record is None or record.dns_record is None:
             return []
@@ -207,7 +207,7 @@ class Rehearsal:
         return found
 
     def _left(self) -> list[str]:
-        """What is left of the server, in words."""
+        """Find what is left of the server, in words."""
         record = self._repository.server_of(self._project.id, self.user_id)
         if record is None:
             # A function may still start the server. The stop message makes a closed record, which prevents that.
@@ -246,5 +246,5 @@ def _why(record: Server) -> str:
 
 
 def project_for(context: CheckContext) -> Project | None:
-    """The first live project with a game, whose server is started; None if there is none."""
+    """Choose the first live project with a game, to start its server; None if there is none."""
     return next((p for p in context.projects if p.live and p.game_steps and p.task_definition), None)

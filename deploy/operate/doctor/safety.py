@@ -16,7 +16,7 @@ APPLY = "Run `python -m deploy apply`: it puts this right."
 
 
 def bucket(context: CheckContext) -> Iterator[Finding]:
-    """Whether the bucket belongs to this account, is closed to the public, keeps versions, and requires TLS."""
+    """Check whether the bucket belongs to this account, is closed to the public, keeps versions, and requires TLS."""
     name, client = context.installation["Bucket"], context.account.client("s3")
     try:
         client.head_bucket(Bucket=name, ExpectedBucketOwner=context.account.id)
@@ -76,7 +76,7 @@ def _denies_without_tls(statement: dict[str, object]) -> bool:
 
 
 def queues(context: CheckContext) -> Iterator[Finding]:
-    """Whether the dead-letter queues are empty, and how many messages wait."""
+    """Check whether the dead-letter queues are empty, and count the messages that wait."""
     found = snapshot.queues(context.account, context.installation.stack)
     dead = [queue for queue in found if queue.dead]
     if not dead:
@@ -95,7 +95,7 @@ def queues(context: CheckContext) -> Iterator[Finding]:
 
 
 def alarms(context: CheckContext) -> Iterator[Finding]:
-    """Whether an alarm fires."""
+    """Check whether an alarm fires."""
     found = [*snapshot.alarms(context.account, context.installation)]
     firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
     if not found:
@@ -111,7 +111,7 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
 
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
-    """Whether the alarms' topic has a confirmed subscription."""
+    """Check whether the alarms' topic has a confirmed subscription."""
     pages = context.account.client("sns").get_paginator("list_subscriptions_by_topic")
     topic = context.installation["Alarms"]
     found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]

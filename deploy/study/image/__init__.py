@@ -31,7 +31,7 @@ class ImagePlan:
 
 @dataclass(frozen=True)
 class Image:
-    """An image in the repository. `uri` has its digest. `built`: it was built just now."""
+    """An image in the repository. `uri` has its digest. `built`: whether it was built just now."""
 
     uri: str
     content: str
@@ -48,7 +48,7 @@ def plan(
     base: str = "",
     trial: Mapping[str, Any] | None = None,
 ) -> ImagePlan:
-    """Compare the project's files with the repository; change nothing. Raises `Problem`.
+    """Compare the project's files with the images in the repository. Changes nothing. Raises `Problem`.
 
     `again`: build an image in any case, without layers of earlier ones. `base` and `trial` are as in `make_bundle`.
     """
@@ -62,7 +62,7 @@ def plan(
 
 
 def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
-    """Return the image of the plan; build it first if there is none. Raises `Problem`.
+    """Build the image of the plan unless the repository has it, and return it. Raises `Problem`.
 
     This machine's Docker builds it. If no Docker answers, or with `on_aws`, CodeBuild does.
     """

@@ -32,7 +32,7 @@ _COMMENT = re.compile(r"(^|\s+)#.*$")
 
 @dataclass(frozen=True)
 class Bundle:
-    """The files of an image's build context: name in the context → a file of this machine, or bytes."""
+    """The files of an image's build context: by the name there, a file of this machine, or bytes."""
 
     entries: Mapping[str, Path | bytes]
 
@@ -75,7 +75,7 @@ class Bundle:
 
 
 def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = None) -> Bundle:
-    """The build context for the project in `folder`. Raises `Problem` if something in it cannot go into an image.
+    """Make the build context for the project in `folder`. Raises `Problem` if a part of it cannot go into an image.
 
     `base` is the base image, instead of the Dockerfile's own. `trial` is that section of config.yml. While the image is
     built, the agent is tried with its keys `game`, `options` and `scene`; if it has `players`, also with that and
@@ -101,13 +101,16 @@ def _dockerfile(base: str) -> bytes:
 
 
 def _check_json(trial: Mapping[str, Any]) -> bytes:
-    """The keys of `trial` with which trial/check.py tries the agent."""
+    """Write the keys of `trial` with which trial/check.py tries the agent, as JSON."""
     keys = ("game", "options", "scene", *(("players", "actionSpace") if trial.get("players") else ()))
     return json.dumps({key: trial[key] for key in keys if trial.get(key)}, sort_keys=True).encode()
 
 
 def _requirements(folder: Path) -> bytes:
-    """The project's requirements.txt; b"" if there is none. Raises `Problem` for a line that cannot be installed."""
+    """Read the project's requirements.txt; b"" if there is none.
+
+    Raises `Problem` on a line that cannot be installed.
+    """
     file = layout.requirements_file(folder)
     if file is None:
         return b""
@@ -136,7 +139,7 @@ def _requirements(folder: Path) -> bytes:
 
 
 def _mode(entry: Path | bytes) -> int:
-    """A file's mode in the image: readable for all users, because the trial's user does not own the files."""
+    """Return a file's mode in the image: readable for all, because the trial's user does not own the files."""
     return 0o755 if isinstance(entry, Path) and entry.stat().st_mode & stat.S_IXUSR else 0o644
 
 

@@ -34,7 +34,7 @@ _PHASES = {
 
 
 def source_key(content: str) -> str:
-    """The key of the source bundle in the data bucket."""
+    """Return the key of the source bundle in the data bucket."""
     return f"_builds/{content}.zip"
 
 
@@ -63,7 +63,7 @@ class Builder:
             raise
 
     def _running(self, order: Order) -> str | None:
-        """The id of a running build of this image; None if there is none."""
+        """Find a running build of this image. Return its id, or None."""
         client = self.account.client("codebuild")
         found = client.list_builds_for_project(projectName=self.project, sortOrder="DESCENDING")
         newest = found.get("ids", [])[:100]
@@ -76,7 +76,7 @@ class Builder:
         return None
 
     def _upload(self, order: Order) -> None:
-        """Upload the bundle, unless the bucket has it. Its key tells its content."""
+        """Upload the bundle, unless the bucket has one of this key, and so of this content."""
         s3, key = self.account.client("s3"), source_key(order.content)
         try:
             s3.head_object(Bucket=self.bucket, Key=key)
@@ -138,7 +138,7 @@ def _follow(account: Account, build_id: str) -> None:
 
 
 def _read_log(account: Account, build: Mapping[str, Any], token: str | None, log: BuildLog) -> str | None:
-    """Show the new lines of the build's log; return the token from which the next call goes on."""
+    """Show the new lines of the build's log. Return the token at which the next call goes on."""
     logs = build.get("logs", {})
     if not logs.get("groupName") or not logs.get("streamName"):
         return token

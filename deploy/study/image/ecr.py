@@ -24,7 +24,7 @@ from hippodrome.aws import errors
 
 
 class Tagged(NamedTuple):
-    """An image in the repository with one of its tags. Sorted, they are in the order in which they were pushed."""
+    """An image in the repository with one of its tags. Sorting them gives the order in which they were pushed."""
 
     pushed: datetime
     number: int  # 1 for the first image with this content, 2 for the second, and so on
@@ -50,7 +50,7 @@ class ImageRepository:
         return self.uri.partition("/")[2]
 
     def images(self) -> Images:
-        """The images that have a tag; one DescribeImages for each 1,000. Raises `Problem` if the repository is gone."""
+        """List the images that have a tag, 1,000 with each request. Raises `Problem` if the repository is gone."""
         found: list[Tagged] = []
         pages = self._client.get_paginator("describe_images").paginate(
             repositoryName=self.name, filter={"tagStatus": "TAGGED"}, PaginationConfig={"PageSize": 1000}
@@ -70,7 +70,7 @@ class ImageRepository:
         return Images(self.uri, sorted(found))
 
     def password(self) -> str:
-        """The password for `docker login` as the user `AWS`. It is valid for twelve hours."""
+        """Ask for the password for `docker login` as the user `AWS`. It is valid for twelve hours."""
         token = self._client.get_authorization_token()["authorizationData"][0]["authorizationToken"]
         return base64.b64decode(token).decode().partition(":")[2]
 
@@ -87,26 +87,29 @@ class Images:
     found: list[Tagged]
 
     def of(self, content: str) -> str | None:
-        """The newest image with this content, as uri@digest; None if there is none."""
+        """Return the newest image with this content, as uri@digest; None if there is none."""
         same = [image for image in self.found if image.content == content]
         return f"{self.uri}@{same[-1].digest}" if same else None
 
     def tagged(self, tag: str) -> str | None:
-        """The image with this tag, as uri@digest; None if there is none."""
+        """Return the image with this tag, as uri@digest; None if there is none."""
         return next((f"{self.uri}@{image.digest}" for image in self.found if image.tag == tag), None)
 
     def next_tag(self, content: str) -> str:
-        """The tag for the next image with this content."""
+        """Return the tag for the next image with this content."""
         most = max((image.number for image in self.found if image.content == content), default=0)
         return f"{content}.{most + 1}" if most else content
 
     def alike(self, project_id: str) -> str:
-        """The image (uri:tag) that probably shares most layers with a new one of this project; "" if there is none."""
+        """Return the image (uri:tag) that probably shares most layers with this project's next one; "" without one."""
         own = re.compile(re.escape(content_tag(project_id, "")) + r"[0-9a-f]{12}")
         best = max(self.found, key=lambda image: (own.fullmatch(image.content) is not None, image), default=None)
         return f"{self.uri}:{best.tag}" if best else ""
 
 
 def content_tag(project_id: str, content: str) -> str:
-    """The tag of a project's image with this content. A project's id may begin with a dash, but a tag must not."""
+    """Return the tag of a project's image with this content.
+
+    A project's id may begin with a dash, but a tag must not.
+    """
     return f"{'x' if project_id.startswith('-') else ''}{project_id}-{content}"

@@ -30,9 +30,11 @@ _OF_HIPPO = {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.
 
 
 def project_files(folder: Path) -> dict[str, Path]:
-    """The files for the image: path below the folder of agent.py (with slashes) → file. Raises `Problem`.
+    """Choose the files for the image. Return them by their paths below agent.py's folder, with slashes.
 
-    They are those of the project folder; of a clone of HIPPO Gym those in its folder App, as in HIPPO's own images.
+    Raises `Problem`.
+
+    They come from the project folder; of a clone of HIPPO Gym from its folder App, as in HIPPO's own images.
     """
     folder = folder.resolve()
     code = layout.agent_folder(folder)
@@ -76,7 +78,7 @@ class Ignore:
 
     @classmethod
     def of(cls, folder: Path) -> Ignore:
-        """The `.dockerignore` of the folder; without one, nothing is ignored. Raises `Problem` if it cannot be read."""
+        """Read the folder's `.dockerignore`; without one, nothing is ignored. Raises `Problem` if it cannot be read."""
         file = folder / ".dockerignore"
         try:
             return cls(file.read_text(encoding="utf-8-sig").splitlines() if file.is_file() else [])
@@ -93,7 +95,7 @@ class Ignore:
 
 
 def _expression(parts: Sequence[str]) -> str:
-    """The regular expression of a pattern. It matches a path, or the beginning of a path before a slash."""
+    """Make a pattern's regular expression, which matches a path, or the beginning of a path before a slash."""
     text = ""
     for index, part in enumerate(parts):
         last = index == len(parts) - 1
@@ -105,7 +107,7 @@ def _expression(parts: Sequence[str]) -> str:
 
 
 def _segment(part: str) -> str:
-    """The regular expression of a part of a pattern. Its `*`, `?` and `[…]` match no slash."""
+    """Make the regular expression of a part of a pattern. Its `*`, `?` and `[…]` match no slash."""
     text, index = "", 0
     while index < len(part):
         char = part[index]
@@ -164,7 +166,7 @@ def _apps(root: Path) -> list[Path]:
 
 
 def _without_links(path: Path) -> Path | None:
-    """The path with all links resolved; None if a link leads to itself, or cannot be followed."""
+    """Resolve all links in the path. Return None if a link leads to itself, or cannot be followed."""
     try:
         return Path(os.path.realpath(path, strict=True))  # not Path.resolve: from Python 3.13 on it accepts circles
     except FileNotFoundError:
@@ -174,7 +176,10 @@ def _without_links(path: Path) -> Path | None:
 
 
 def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
-    """The file to which the path leads. Raises `Problem` for a link to something that must not be in the image."""
+    """Return the file to which the path leads.
+
+    Raises `Problem` if a link leads to a file that the image must not have.
+    """
     real = _without_links(path)
     if real is None:
         raise Problem(f"{name} is a link that leads to itself.", "Remove it.")

@@ -56,6 +56,7 @@ class BuildLog:
         self._last: deque[str] = deque(maxlen=400)
 
     def add(self, text: str) -> None:
+        """Show the lines of this text, without control characters and empty lines, and keep the last ones."""
         for raw in text.splitlines():
             line = _CONTROL.sub("", raw).rstrip()
             if line:
@@ -63,7 +64,10 @@ class BuildLog:
                 self._show(line)
 
     def failure(self, summary: str, more: Iterable[str] = ()) -> Problem:
-        """The problem to raise, with advice. Details: the log's lines on errors (else its last lines), and `more`."""
+        """Make the problem to raise for a failed build, with advice.
+
+        Details: the log's lines on errors (else its last lines), and `more`.
+        """
         more, lines = list(more), list(self._last)
         missing = _missing("\n".join(lines))
         if missing:
@@ -73,7 +77,7 @@ class BuildLog:
 
 
 def advice(log: str) -> str:
-    """The advice for a failed build with this log."""
+    """Advise on a failed build by its log."""
     for pattern, text in _ADVICE:
         found = re.search(pattern, log)
         if found:
@@ -82,11 +86,11 @@ def advice(log: str) -> str:
 
 
 def _missing(log: str) -> tuple[str, str] | None:
-    """What the agent needs and the image does not have (a line of trial/check.py), and what to do about it."""
+    """Find the line of trial/check.py that says what the agent needs and the image lacks, and what to do about it."""
     found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
     if found is None:
         return None
     remedy = re.sub(
-        rf"{check.PACKAGE}(\S+)", lambda module: agent_imports.wanted(module[1]) or module[0], found["remedy"]
+        rf"{check.PACKAGE}(\S+)", lambda module: agent_imports.requirement_line(module[1]) or module[0], found["remedy"]
     )
     return found["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."

@@ -25,5 +25,5 @@ class Order:
         return f"{self.repository.uri}:{self.tag}"
 
     def arrived(self) -> str | None:
-        """The image as uri@digest, if the repository has it; else None."""
+        """Look whether the repository has the image. Return it as uri@digest, or None."""
         return self.repository.images().tagged(self.tag)

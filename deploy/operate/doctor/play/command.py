@@ -27,7 +27,7 @@ QUIET = 30.0  # seconds between two lines of progress, if there is no terminal
 def played(
     context: CheckContext, bots: int, *, minutes: int, yes: bool, file: Path | None
 ) -> tuple[list[Finding], dict[str, Any]]:
-    """Ask, rehearse, and write the transcript into `file`; return the findings and the transcript as JSON data.
+    """Ask, rehearse, and write the transcript into `file`. Return the findings, and the transcript as JSON data.
 
     Raises `Problem` if the answer is no, or the file's folder does not exist.
     """
@@ -68,7 +68,7 @@ def _write(file: Path, transcript: Transcript, began: datetime, region: str, bot
 
 @contextlib.contextmanager
 def _watched() -> Iterator[Callable[[str], None]]:
-    """Within the block, show the text of each call: in one line of a terminal, else in a line every `QUIET` seconds."""
+    """Show, within the block, each call's text: in one line of a terminal, else in a line every `QUIET` seconds."""
     last = time.monotonic() - QUIET
     with screen.err.status("Rehearsing …") as status:
 
@@ -84,7 +84,7 @@ def _watched() -> Iterator[Callable[[str], None]]:
 
 @contextlib.contextmanager
 def _as_interrupt() -> Iterator[None]:
-    """Within the block, SIGTERM and a closed terminal raise KeyboardInterrupt, so that everything is removed."""
+    """Let, within the block, SIGTERM and a closed terminal raise KeyboardInterrupt, so that everything is removed."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)

@@ -50,16 +50,17 @@ class Copy:
 
     @property
     def project(self) -> Project:
+        """The copy as it is registered. Raises AssertionError before the copy is made."""
         assert self._made is not None, "not made yet"
         return self._made
 
     @property
     def players(self) -> int:
-        """How many participants play together; 1 before the copy is made."""
+        """The number of participants who play together; 1 before the copy is made."""
         return self._made.players if self._made else 1
 
     def make(self, of: Project) -> int:
-        """Copy the pages of the project `of` and register the copy; return the number of pages. Raises `Problem`."""
+        """Copy the pages of the project `of`, register the copy, and return the number of pages. Raises `Problem`."""
         documents = self._platform.documents
         for key, name in (pages := page_files(documents, of)).items():
             found = documents.get(key)
@@ -72,22 +73,22 @@ class Copy:
         return len(pages)
 
     def user(self, name: str) -> str:
-        """Add a bot; return its id."""
+        """Add a bot, and return its id."""
         self.users.append(f"bot-{self.id.rpartition('-')[2][:8]}-{name}")
         return self.users[-1]
 
     def link(self, user_id: str) -> str:
-        """The signed link of a bot."""
+        """Return the signed link of a bot."""
         (signature,) = links.signed(self._account, self._installation, self.id, [user_id]).values()
         return links.link(self._installation["Site"], self.project, user_id, signature)
 
     def remove(self, progress: Callable[[str], None] = lambda _: None) -> int:
-        """Remove servers, documents in all versions, and the registration; return how many versions were deleted."""
+        """Remove servers, documents in all versions, and the registration. Return how many versions were deleted."""
         return remove(self._account, self._installation, self._platform, self.id, users=self.users, progress=progress)
 
 
 def changed(project: Project, new_id: str) -> Project:
-    """The study as bots play it: each bot gets a signed link and a server of its own, and may stop the game."""
+    """Change the study for bots: each bot gets a signed link and a server of its own, and may stop the game."""
     ui = project.trial.get("ui") or dict.fromkeys(CONTROLS, True)
     return msgspec.structs.replace(
         project,
@@ -109,7 +110,7 @@ def changed(project: Project, new_id: str) -> Project:
 
 
 def page_files(documents: Documents, of: Project) -> dict[str, str]:
-    """Key → file name, for a project's pages and the files beside them."""
+    """Return, by key, the file name of a project's pages and of the files beside them."""
     prefix = f"{of.id}/{STEPS_FOLDER}/"
     found = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
     if of.page_folder == STEPS_FOLDER:
@@ -119,7 +120,10 @@ def page_files(documents: Documents, of: Project) -> dict[str, str]:
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:
-    """The ids of copies that killed rehearsals have left. Copies of rehearsals that may still run are left out."""
+    """Return the ids of copies that killed rehearsals have left.
+
+    Copies of rehearsals that may still run are left out.
+    """
     ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
     return [one for one in ids if _age(documents, one, now) > OLD]
 
@@ -138,7 +142,7 @@ def remove(
     users: Iterable[str] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Remove a copy by its id, with all bots in `users` or with documents; return how many versions were deleted.
+    """Remove a copy by its id, with all bots in `users` or with documents. Return how many versions were deleted.
 
     Without `users`, this searches the records of all servers, too, since a bot may have no other document. Raises
     `Problem` if something of a bot is left.
@@ -164,7 +168,7 @@ def remove(
 
 
 def _lobby_sessions(documents: Documents, project_id: str) -> list[str]:
-    """The ids of sessions in the lobby's decisions: some have a server, which was started ahead, but no members."""
+    """Return the ids of sessions in the lobby's decisions, also of those with a server ahead and without members."""
     found = documents.get(decisions.key(project_id))
     try:
         return sorted(from_json(found.body, Decisions).session_ids()) if found else []

@@ -30,12 +30,12 @@ DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 
 
 def expected(project: Project, bots: int) -> Usd:
-    """What a rehearsal of this project will cost."""
+    """Estimate what a rehearsal of this project will cost."""
     return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
 
 
 def site(context: CheckContext, project_id: str) -> OneSite:
-    """The addresses that bots may open: the installation's site, and its servers."""
+    """Return the addresses that bots may open: those of the installation's site and of its servers."""
     servers = context.platform.settings.game_sources.split()
     return OneSite(context.installation["Site"], servers, project_id, tls=addresses.authorities())
 
@@ -109,7 +109,7 @@ class Play:
         self._part("times", lambda: upkeep.times(self._scene, self._records()))
 
     def _part(self, key: str, part: Callable[[], None]) -> bool:
-        """Run one part; return whether it succeeded. If not, add a line that says why, and what to do."""
+        """Run one part, and return whether it succeeded. If it has not, add a line that says why, and what to do."""
         try:
             part()
         except CheckFailed as failed:
@@ -122,7 +122,7 @@ class Play:
         return False
 
     def _records(self) -> list[Server]:
-        """The present records of all servers of the rehearsal, each once."""
+        """Return the present records of all servers of the rehearsal, each once."""
         return each_once(record for user in self._copy.users if (record := self._scene.server(user)))
 
     def _make(self) -> None:

@@ -44,11 +44,11 @@ class RehearsalContext:
         return Repository(self.platform.documents)
 
     def left(self) -> float:
-        """Seconds until the rehearsal must end."""
+        """The seconds until the rehearsal must end."""
         return max(self.until - self.clock(), 0.0)
 
     def bot(self, name: str, play: float) -> Bot:
-        """A new bot with its signed link, which plays for `play` seconds. The transcript hides its id."""
+        """Make a bot with a signed link, which plays for `play` seconds. The transcript hides its id."""
         user = self.copy.user(name)
         self.transcript.hide(user)
         patience = min(BOT_PATIENCE, self.left())
@@ -56,7 +56,7 @@ class RehearsalContext:
         return Bot(self.copy.link(user), user, random, play=play, patience=patience, allowed=self.where)
 
     def server(self, user: str) -> Server | None:
-        """The record of a bot's server, or of its session's server. The transcript hides its token and names."""
+        """Read the record of a bot's server, or of its session's server. The transcript hides its token and names."""
         membership = self.repository.membership(self.copy.id, user) if self.copy.players > 1 else None
         found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
         if found is not None:
@@ -64,7 +64,7 @@ class RehearsalContext:
         return found
 
     def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
-        """Call `look` until it returns a value; return that. Raises `failed` after so many seconds, or at `until`."""
+        """Call `look` until it returns a value, and return that. Raises `failed` after `seconds`, or at `until`."""
         began = self.clock()
         while (found := look()) is None:
             spent = self.clock() - began

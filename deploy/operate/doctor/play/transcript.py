@@ -29,7 +29,7 @@ LINES: Mapping[str, str] = {
     "erased": "nothing of the rehearsal is left",
     "cost": "what it cost",
 }
-"""Key of a line → what it proves, in the order of a rehearsal. docs/unproven.md names the keys."""
+"""By the key of a line, what the line proves, in the order of a rehearsal. docs/unproven.md names the keys."""
 
 _PATTERNS = (
     re.compile(r"arn:[\w:/.*~-]+"),
@@ -57,7 +57,7 @@ class TranscriptLine:
 
 
 class Transcript:
-    """The lines up to now. `clean` removes secrets from every text first."""
+    """Collects the lines of a rehearsal. `clean` removes secrets from every text first."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.lines: list[TranscriptLine] = []
@@ -70,7 +70,7 @@ class Transcript:
         self._secrets.update(secret for secret in secrets if secret)
 
     def clean(self, text: str) -> str:
-        """The text without ids, tokens, and anything that reveals the account.
+        """Remove ids, tokens, and anything that reveals the account from the text.
 
         Control characters are removed, too, since a study's agent may have written a part of the text.
         """
@@ -88,12 +88,15 @@ class Transcript:
         self.lines.append(TranscriptLine(key, mark, self.clean(text), self.clean(advice), at, seconds))
 
     def good(self, key: str, text: str, **seconds: Any) -> None:
+        """Add a line on a result that is good."""
         self.say(key, Mark.GOOD, text, **seconds)
 
     def bad(self, key: str, text: str, advice: str) -> None:
+        """Add a line on a result that is bad, with advice."""
         self.say(key, Mark.BAD, text, advice)
 
     def has(self, key: str) -> bool:
+        """Whether there is a line with this key."""
         return any(line.key == key for line in self.lines)
 
     @property
@@ -108,7 +111,7 @@ class Transcript:
         return [key for key in LINES if self.has(key) and key not in bad]
 
     def document(self, began: datetime, region: str, bots: int) -> dict[str, Any]:
-        """The transcript as JSON data, for a file."""
+        """Return the transcript as JSON data, for a file."""
         return {
             "schema": SCHEMA,
             "what": "a rehearsal with simulated participants on a real account",
@@ -130,7 +133,7 @@ def _plain(line: TranscriptLine) -> dict[str, Any]:
 
 
 def shown(values: Iterable[float]) -> str:
-    """The range of these seconds, in words: `3 s`, or `3 to 8 s`."""
+    """Write the range of these seconds in words: `3 s`, or `3 to 8 s`."""
     ordered = sorted(values)
     low, high = ordered[0], ordered[-1]
     return f"{low:.0f} s" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} s"

@@ -36,7 +36,9 @@ REASON = "Rehearsal: set by hand to see whether this alarm is delivered. Nothing
 
 
 class Timer:
-    """A server without a participant, which only its timer ends. `begin` starts it, `end` checks that it has ended.
+    """Tests a server's timer by a server without a participant.
+
+    `begin` starts the server, `end` checks that it has ended.
 
     The rehearsal does not wait for the project's `maxRuntime`. It checks that the ready server has a timer at its
     deadline, and moves the timer to the next minute, with the same name, role, topic and message.
@@ -51,6 +53,7 @@ class Timer:
         self.record: Server | None = None
 
     def begin(self) -> None:
+        """Request the server, by a start message for a participant who never comes."""
         if self.user != self._bot:
             copy = self._scene.copy
             copy.users.append(self.user)
@@ -208,13 +211,13 @@ def _sent_to_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
 
 
 def _subscribers(sns: Any, topic: str) -> int:
-    """The number of confirmed subscriptions of a topic."""
+    """Return the number of confirmed subscriptions of a topic."""
     pages = sns.get_paginator("list_subscriptions_by_topic").paginate(TopicArn=topic)
     return sum(one["SubscriptionArn"].startswith("arn:") for page in pages for one in page["Subscriptions"])
 
 
 def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
-    """Add the line on how long AWS took for each stage, beside the times of the simulation. Raises `CheckFailed`."""
+    """Add the line on how long AWS took for each stage, with the simulation's times beside. Raises `CheckFailed`."""
     tasks = _tasks(scene, records)
     measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
     for record in records:
@@ -240,7 +243,7 @@ def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
 
 
 def _tasks(scene: RehearsalContext, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
-    """Task ARN → the servers' tasks by DescribeTasks, which knows a stopped task for about an hour."""
+    """Return, by ARN, the servers' tasks from DescribeTasks, which knows a stopped task for about an hour."""
     ecs = scene.context.account.client("ecs")
     found: dict[str, Mapping[str, Any]] = {}
     for record in records:
@@ -256,7 +259,7 @@ def _add_seconds(seconds: list[float], begin: datetime | None, end: datetime | N
 
 
 def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
-    """What a rehearsal will cost: its servers run for 2 to 20 minutes each. All else costs less than a cent."""
+    """Estimate what a rehearsal costs: servers run for 2 to 20 minutes each. All else costs less than a cent."""
     servers = bots + 3  # the killed server, its replacement, and the server that its timer ends
     spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) for kind in (True, False))
     return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)

@@ -30,14 +30,14 @@ STRUCK = 2.0  # seconds of play after which its task is killed
 ARRIVALS = 1.0  # seconds between the arrivals of two bots
 GONE = 240.0  # seconds until nothing of the last server may be left: stopTimeout is 120
 KILLED = "Rehearsal: killed, as when a Spot task is interrupted"
-"""The reason for StopTask. ECS puts it into the task's `stoppedReason` (ECS API Reference, StopTask). These words count
+"""The reason that StopTask gets. ECS puts it into the task's `stoppedReason` (ECS API Reference, StopTask). It counts
 as a Spot interruption in `hippodrome/model/messages.py`, whatever the stop code: the server is lost."""
 
 LOGS = "See `python -m deploy logs --errors`."
 
 
 class Walk:
-    """Sends bots through the copy (`run`). Each other method adds a line on one result to the transcript."""
+    """Sends bots through the copy (`run`). Each other method checks one result, and adds a line to the transcript."""
 
     def __init__(self, scene: RehearsalContext, bots: int) -> None:
         self._scene = scene
@@ -50,6 +50,7 @@ class Walk:
 
     @property
     def all(self) -> list[Bot]:
+        """All bots; the victim, whose task is killed, is the last."""
         return [*self.bots, self.victim]
 
     @property
@@ -60,7 +61,7 @@ class Walk:
     # Links
 
     def links(self) -> None:
-        """A link without a signature is refused, and so is a link with another participant's signature."""
+        """Check that a link is refused without a signature, and with another participant's signature."""
         scene = self._scene
         own, other = scene.copy.link(self.bots[0].report.user_id), scene.copy.link(self.victim.report.user_id)
         unsigned = own.partition("&signature=")[0]
@@ -80,7 +81,7 @@ class Walk:
             )
 
     def site(self) -> None:
-        """The site answers over TLS, and tells browsers to use only TLS (HSTS)."""
+        """Check that the site answers over TLS, and tells browsers to use only TLS (HSTS)."""
         scene = self._scene
 
         async def asked() -> tuple[int, str]:
@@ -123,7 +124,7 @@ class Walk:
             await asyncio.sleep(0.2)
         try:
             self._struck = await asyncio.to_thread(self._kill)
-        except Exception as error:  # noqa: BLE001 - the line `killed` says it
+        except Exception as error:  # noqa: BLE001 - the rehearsal's line `killed` shows it
             self._not_struck = f"{type(error).__name__}: {error}"
 
     def _kill(self) -> Server | None:
@@ -138,7 +139,7 @@ class Walk:
     # The results
 
     def pages(self) -> None:
-        """Every bot came to the last page."""
+        """Check that every bot came to the last page."""
         reports = [bot.report for bot in self.all]
         for report in reports:
             self._scene.transcript.hide(report.code, report.user_id)
@@ -150,7 +151,7 @@ class Walk:
         self._scene.transcript.bad("pages", f"{finished} of {len(reports)} bots finished: {why}.", LOGS)
 
     def servers(self) -> None:
-        """Every bot got a server that became ready. The line tells how many were on Spot, and how long bots waited."""
+        """Check that every bot got a server that became ready. Tell how many were on Spot, and how long bots waited."""
         transcript = self._scene.transcript
         found = {bot: self._scene.server(bot.report.user_id) for bot in self.all}
         self.records = {bot.report.user_id: record for bot, record in found.items() if record}
@@ -171,7 +172,7 @@ class Walk:
         )
 
     def games(self) -> None:
-        """The bots played: frames came, and each game came to its end."""
+        """Check that the bots played: frames came, and each game came to its end."""
         plays = [play for bot in self.bots for play in bot.report.plays]
         frames, done = sum(play.frames for play in plays), sum(play.done for play in plays)
         if plays and done == len(plays) and frames:
@@ -187,7 +188,7 @@ class Walk:
         )
 
     def killed(self) -> None:
-        """The victim's server was replaced, and the victim came to the end of its game there."""
+        """Check that the victim's server was replaced, and that the victim came to the end of its game there."""
         transcript, report = self._scene.transcript, self.victim.report
         record = self.records.get(report.user_id)
         if self._struck is None or record is None:
@@ -210,7 +211,7 @@ class Walk:
         )
 
     def end(self) -> None:
-        """The stop step ended every server, and nothing of the servers is left."""
+        """Check that the stop step ended every server, and that nothing of the servers is left."""
         scene, users = self._scene, [bot.report.user_id for bot in self.all]
         late = CheckFailed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
         for bot in self.all:
@@ -238,13 +239,13 @@ class Walk:
         )
 
     def _played_with_the_victim(self) -> list[Bot]:
-        """The victim, and the bots of its session."""
+        """Return the victim, and the bots of its session."""
         record = self.records.get(self.victim.report.user_id)
         own = {user for user, other in self.records.items() if record and other.label == record.label}
         return [bot for bot in self.all if bot is self.victim or bot.report.user_id in own]
 
     def data(self) -> None:
-        """`deploy data` fetches all answers and recordings of the bots."""
+        """Check that `deploy data` fetches all answers and recordings of the bots."""
         scene, context = self._scene, self._scene.context
         scene.progress("fetching the bots' data")
         source = Bucket(context.account.client("s3"), context.installation["Bucket"], context.account.id)
@@ -282,12 +283,12 @@ class Walk:
 
 
 def each_once(records: Iterable[Server]) -> list[Server]:
-    """The servers without repetitions. The members of a session have the same server."""
+    """Remove repetitions: the members of a session have the same server."""
     return list({record.label: record for record in records}.values())
 
 
 def left(scene: RehearsalContext, user: str) -> list[str]:
-    """What is left of a bot's server, in words; empty if the bot never had a server."""
+    """Find what is left of a bot's server, in words; empty if the bot never had a server."""
     record = scene.server(user)
     if record is None:
         return []
