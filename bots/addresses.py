@@ -22,7 +22,7 @@ Dial = Callable[[str, int], tuple[str, int]]
 
 
 class AddressRefused(ValueError):
-    """Bots may not send requests to this address. `str()` names it, without its query."""
+    """Bots may not send requests to this address. `str()` names the address, without its query."""
 
 
 class AllowedAddresses(Protocol):
@@ -39,7 +39,10 @@ class AllowedAddresses(Protocol):
         """Return the address if it is one of the study's trial servers. Raises AddressRefused for any other."""
 
     def dial(self, host: str, port: int) -> tuple[str, int]:
-        """Return the host and port of the TCP connection for an allowed address: its own ones, except in tests."""
+        """Return the host and port to which to open the TCP connection for an allowed address.
+
+        They are the address's own, except in tests.
+        """
 
 
 @dataclass(frozen=True)

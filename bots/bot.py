@@ -52,7 +52,7 @@ class _Connect(connect):
 
 
 class Bot:
-    """One simulated participant. `run` raises nothing except when it is cancelled; `report` says what happened.
+    """One simulated participant. `run` sends it through the study, and `report` says what happened.
 
     After `play` seconds of a game the bot stops the game, if its controls have "stop"; with 0 it plays to the end.
     `patience` is how many seconds the bot waits for one thing: for a response, a server, or the end of a game.
@@ -78,7 +78,10 @@ class Bot:
         self._restarts = 0
 
     async def run(self) -> BotReport:
-        """Walk through the whole study and return the report."""
+        """Walk through the whole study and return the report.
+
+        A failure is written into the report, and not raised.
+        """
         report, began = self.report, time.monotonic()
         try:
             page = await self.open()
@@ -88,7 +91,7 @@ class Bot:
                     break
                 page = following
             else:
-                raise Failed("the study does not end")
+                raise Failed(f"the study does not end: after {MAX_PAGES} pages there is another one")
         except Failed as failed:
             report.errors.append(str(failed))
             report.stage = "failed"
@@ -114,7 +117,7 @@ class Bot:
     # Pages
 
     async def open(self) -> VisitedPage:
-        """Open the participant's link and return the page: it is that of the participant's next step."""
+        """Open the participant's link and return the page of the step that is due. Raises Failed."""
         return VisitedPage(self.address, (await self._ask(self.address)).text)
 
     async def answer(self, page: VisitedPage, form: forms.Form) -> VisitedPage:
@@ -128,9 +131,9 @@ class Bot:
         return await self.post(urljoin(page.address, form.action or page.address), pairs)
 
     async def post(self, address: str, pairs: form_filling.Pairs) -> VisitedPage:
-        """Send a form, follow the redirect, and return its page.
+        """Send a form, follow the redirect, and return its page. Raises Failed if the response is no redirect.
 
-        A form may be sent twice, since Hippodrome keeps the first answer. Raises Failed without a redirect.
+        A form may be sent twice, since Hippodrome keeps the first answer.
         """
         reply = await self._ask(address, urlencode(pairs).encode())
         if reply.status not in (302, 303) or "location" not in reply.headers:
@@ -207,7 +210,7 @@ class Bot:
         began, until = time.monotonic(), max(until, time.monotonic() + self.patience + self.play)
         while state["state"] != "ready":
             if time.monotonic() > until:
-                raise Failed(f"no server: still {state['state']}")
+                raise Failed(f"the server is not ready in time: its state is still {state['state']}")
             if state["state"] in ("ended", "failed"):
                 await self._restart(page, state)
             await asyncio.sleep(POLL_SECONDS)
@@ -232,7 +235,7 @@ class Bot:
         """Press "Try again" on the page of a server that has ended or failed. Raises Failed if that is not offered."""
         form = page.form
         if not state.get("again") or form is None or self._restarts >= MAX_RESTARTS:
-            raise Failed(f"no server: {state['state']} ({state.get('reason')})")
+            raise Failed(f"there is no server: the last one was {state['state']} ({state.get('reason')})")
         self._restarts += 1
         self.report.troubles.append(f"the server was {state['state']} ({state.get('reason')}): started again")
         await self.post(urljoin(page.address, form.action), form_filling.fill(form, self.random))

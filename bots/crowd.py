@@ -19,7 +19,8 @@ async def walk(
 ) -> list[BotReport]:
     """Send these bots through their study, `at_once` at a time, and return their reports in the order of the bots.
 
-    The first bots start `ramp` seconds apart. `watch` gets the reports five times a second. Cancelling ends all bots.
+    The first bots start `ramp` seconds apart. `watch` is called with the reports five times a second. If the walk is
+    cancelled, all bots end.
     """
     slots = asyncio.Semaphore(at_once)
 
@@ -45,7 +46,7 @@ async def walk(
 
 
 def interruptible(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run the coroutine and return its result. A signal (`SIGNALS`) cancels it; then this raises KeyboardInterrupt.
+    """Run the coroutine and return its result. After a signal (`SIGNALS`), cancel it and raise KeyboardInterrupt.
 
     The cancellation is repeated every second until the coroutine has ended, since a timeout that expires at the same
     moment swallows a cancellation.

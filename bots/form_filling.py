@@ -52,8 +52,10 @@ _EPOCH = datetime(1970, 1, 1)
 
 
 def fill(form: Form, random: Random) -> Pairs:
-    """Return a name and value for each field that a browser would send. Every required field has an answer, most of
-    the others too, and one of the buttons is pressed."""
+    """Return a name and value for each field that a browser would send.
+
+    Every required field has an answer, most of the others too, and one of the buttons is pressed.
+    """
     chosen = _choose_radios(form, random)
     checked = _choose_boxes(form, random)
     pressed = random.choice(form.buttons) if form.buttons else None
@@ -293,8 +295,10 @@ _GENERATORS = {
 
 
 def gathered(pairs: Iterable[tuple[str, str]]) -> dict[str, str | list[str]]:
-    """Return the answers as the study stores them: a name that comes several times has the list of its values, and
-    Hippodrome's own fields are left out."""
+    """Return the answers as the study stores them.
+
+    A name that comes several times has the list of its values. Hippodrome's own fields are left out.
+    """
     answers: dict[str, list[str]] = {}
     for name, value in pairs:
         if not name.startswith("hippodrome-"):

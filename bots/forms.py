@@ -70,12 +70,12 @@ def read(page: str) -> list[Form]:
 
 
 def to_answer(page: str) -> Form | None:
-    """Return the first form of a page that is sent by POST; None if there is none."""
+    """Return the first form of a page that is sent by POST; None if the page has no such form."""
     return next((form for form in read(page) if form.method == "post"), None)
 
 
 def hidden(form: Form) -> Iterator[tuple[str, str]]:
-    """Return the names and values of a form's hidden fields."""
+    """Yield the name and the value of each hidden field of a form."""
     return ((control.name, control.value) for control in form.controls if control.kind == "hidden")
 
 

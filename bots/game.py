@@ -22,8 +22,8 @@ from trial.pictures.scene_encoder import ASSET, PACKED_SCENE, SCENE, SceneDecode
 
 _ASSET, _SCENES = bytes([ASSET]), (bytes([SCENE]), bytes([PACKED_SCENE]))
 
-MAX_TURN_SECONDS = 600.0  # of another player's turn: the largest `policySeconds`
-QUIET_SECONDS = 20.0  # without a message, after which the bot takes a game that is played for lost
+MAX_TURN_SECONDS = 600.0  # the longest turn of another player: the largest `policySeconds`
+QUIET_SECONDS = 20.0  # if no message comes for so long while a game is played, the bot gives the game up as lost
 
 
 class RandomKeys:
@@ -40,7 +40,9 @@ class RandomKeys:
         self._held: list[str] = []
 
     def move(self) -> list[dict[str, Any]]:
-        """Return the next messages to the server: key releases, then key presses or an action, and rarely a word."""
+        """Return the next messages to the server: some release keys, others press keys or take an action, and a few are
+        words.
+        """
         random = self._random
         field, keys = ("key", self._mapped_keys) if self._mapped_keys else ("action", self._keys)
         messages: list[dict[str, Any]] = [{field: key, "held": False} for key in self._held]
@@ -63,7 +65,7 @@ def _offered(action: str, shown: Sequence[str]) -> bool:
 
 
 class GameConnection:
-    """Plays on one connection to a trial server, and writes into `play` and `report` what comes over it.
+    """Plays on one connection to a trial server. What the server sends is counted in `play` and `report`.
 
     After `seconds` of play it stops the game, if the game's controls have "stop"; with 0 it plays to the end.
     """
@@ -89,8 +91,11 @@ class GameConnection:
         self._break_seconds = 0.0  # that the server has announced, in which nothing is played
 
     async def run(self, hello: dict[str, Any]) -> None:
-        """Play until the server closes. Raises ConnectionClosed then, TimeoutError after QUIET_SECONDS without a
-        message, and FrameError for a frame that cannot be decoded."""
+        """Play until the server closes.
+
+        Raises ConnectionClosed then, TimeoutError after QUIET_SECONDS without a message, and FrameError for a frame
+        that cannot be decoded.
+        """
         await self._send(hello)
         pressing: asyncio.Task[None] | None = None
         try:

@@ -31,9 +31,10 @@ class Reply:
 async def ask(
     address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS, allowed: AllowedAddresses = THIS_MACHINE
 ) -> Reply:
-    """Send one request and return its response. With a `body`, the request is the POST of a form.
+    """Send one request and return its response. With a `body`, the request is a POST of the form in it.
 
-    Raises AddressRefused if `allowed` does not have the address, OSError without a whole response in `seconds`.
+    Raises AddressRefused if `allowed` does not have the address, and OSError if there is no whole response within
+    `seconds`.
     """
     parts = urlsplit(allowed.page(address))
     target = urlunsplit(("", "", parts.path or "/", parts.query, ""))

@@ -6,7 +6,10 @@ from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 
 def with_project(link: str, project_id: str) -> str:
-    """Return the study's link: the link itself, or `/next?projectId=…` below it if it names only a host and a port."""
+    """Return the study's link.
+
+    It is the link itself, or `/next?projectId=…` below it if it names only a host and a port.
+    """
     parts = urlsplit(link)
     if parts.path not in ("", "/"):
         return link
@@ -14,7 +17,7 @@ def with_project(link: str, project_id: str) -> str:
 
 
 def with_user(link: str, user_id: str) -> str:
-    """Return the study's link for one participant: its `userId` takes the place of the one in the link."""
+    """Return the study's link for one participant: with this `userId`, whether the link had one or not."""
     parts = urlsplit(link)
     others = [(name, value) for name, value in parse_qsl(parts.query) if name != "userId"]
     return urlunsplit(parts._replace(query=urlencode([*others, ("userId", user_id)])))

@@ -13,7 +13,7 @@ from typing import Any
 
 from bots.report import BotReport, PlayedStep
 
-MAX_BYTES = 512 * 1024**2  # of a recording, unpacked: a study's agent writes it, and bots play only for seconds
+MAX_BYTES = 512 * 1024**2  # of an unpacked recording: the study's agent writes it, and bots play only for seconds
 ANYWHERE = ("presence", "ping")  # kinds of lines of a session that may stand anywhere, also after an episode's end
 PIECE = 1024**2  # bytes unpacked at once
 
@@ -75,7 +75,10 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 
 @dataclass
 class Verification:
-    """What was found of the bots in the data, and what is missing. `recorded`: the project keeps recordings."""
+    """What was found in the data of what bots sent and played, and what is missing.
+
+    `recorded`: whether the project keeps recordings.
+    """
 
     recorded: bool = True
     answers: int = 0  # of pages, found as they were sent
@@ -98,10 +101,10 @@ def verify(
     recorded: bool = True,
     last_error: Callable[[str], str] = lambda _: "",
 ) -> Verification:
-    """Compare a data folder with the bots' reports. `recorded`: the project keeps recordings.
+    """Compare a data folder with the bots' reports, and return what was found and what is missing.
 
-    `last_error` returns the last error in the log of a participant's last server, by the participant's id; "" if it
-    is not known.
+    `recorded`: whether the project keeps recordings. `last_error` gets a participant's id, and returns the last error
+    in the log of their last server; "" if it is not known.
     """
     found, read = Verification(recorded=recorded), dict[Path, list[StoredRecording]]()
     for report in reports:

@@ -7,5 +7,5 @@ from lambdas import installed, web
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """API Gateway HTTP API event → response."""
+    """Respond to a request of API Gateway's HTTP API: show the due step's page, or store an answer."""
     return web.respond(event, lambda request: installed.shared(Journey).respond(request))

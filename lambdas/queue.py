@@ -32,7 +32,7 @@ def read(event: Mapping[str, Any], parse: Callable[[Any], M | None]) -> list[tup
         message_id = _id_of(record)
         message = parse(body_of(record))
         if message is None or not message_id:
-            logger.warning("not our message: dropped", extra={"messageId": message_id})
+            logger.warning("a message was dropped: it is none of ours", extra={"messageId": message_id})
         else:
             found.append((message_id, message))
     return found
@@ -63,14 +63,15 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
 
 
 def batch_response(message_ids: Sequence[str]) -> BatchResponse:
-    """The partial batch response that makes SQS deliver these messages again."""
+    """Return the partial batch response that makes SQS deliver these messages again."""
     return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
 def response(event: Mapping[str, Any], message_ids: Sequence[str]) -> BatchResponse:
-    """The partial batch response. Raises `RetryLater` if the event came from SNS and a message failed.
+    """Return the partial batch response that makes SQS deliver these messages again.
 
-    SNS invokes functions asynchronously, so their return value is lost. Lambda repeats an invocation that raises:
+    If the event came from SNS and a message failed, raise `RetryLater` instead. SNS invokes functions asynchronously,
+    so their return value is lost; but Lambda repeats an invocation that raises:
     https://docs.aws.amazon.com/lambda/latest/dg/invocation-async-error-handling.html
     """
     if message_ids and any(isinstance(record, dict) and "Sns" in record for record in event.get("Records") or ()):
@@ -88,7 +89,10 @@ def _id_of(record: Any) -> str | None:
 
 
 def report_failures(services: ServerServices) -> None:
-    """Write metrics of the servers that failed since the last call, if the variable `STACK` names the installation."""
+    """Write metrics of the servers that failed since the last call.
+
+    Writes nothing unless the variable `STACK` names the installation.
+    """
     causes, stack = services.failures(), os.environ.get("STACK")
     if causes and stack:
         from hippodrome import metrics  # noqa: PLC0415 - seldom needed

@@ -15,7 +15,10 @@ MARGIN = 60.0  # seconds after an order to end its last request, remove the TXT 
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
-    """Scheduled event → the decision and the certificate's expiry. Raises if an order fails; an alarm watches."""
+    """Renew the certificate if it is due; return the decision and the certificate's expiry (`notAfter`, ISO 8601).
+
+    Raises if an order fails; an alarm reports failed invocations.
+    """
     platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
     domain = platform.settings.servers_domain
     left = context.get_remaining_time_in_millis() / 1000 if context else MAX_ORDER_SECONDS + MARGIN
@@ -29,7 +32,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
     )
     outcome = renew(renewal, domain, min(MAX_ORDER_SECONDS, left - MARGIN))
     if outcome is None:
-        logger.info("no certificate was ever ordered here: nothing to renew")
+        logger.info("there is no certificate that Hippodrome has ordered: nothing to renew")
         return {"certificate": "none"}
     result = {
         "certificate": "ordered" if outcome.ordered else outcome.decision.verdict.value,

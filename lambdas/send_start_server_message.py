@@ -7,5 +7,5 @@ from lambdas import installed, web
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """API Gateway HTTP API event → response."""
+    """Respond to a request of API Gateway's HTTP API: publish a participant's start message."""
     return web.respond(event, lambda request: installed.shared(Relays).start(request))

@@ -8,7 +8,7 @@ from lambdas import installed, web
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """API Gateway HTTP API event → response."""
+    """Respond to a request of API Gateway's HTTP API: return presigned requests to a server with its own credential."""
     return web.respond(event, lambda request: installed.shared(_signing).respond(request))
 
 

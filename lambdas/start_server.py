@@ -10,7 +10,10 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of start messages, or an event of SNS → partial batch response."""
+    """Handle the start messages of an SQS batch, or of an event that SNS sends to the function itself.
+
+    Returns the partial batch response with the messages that SQS must deliver again.
+    """
     found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
     services = installed.shared(ServerServices)
     failed = queue.one_by_one(found, Start(services).handle)

@@ -10,6 +10,9 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of stop messages, or an event of SNS → partial batch response."""
+    """Handle the stop messages of an SQS batch, or of an event that SNS sends to the function itself.
+
+    Returns the partial batch response with the messages that SQS must deliver again.
+    """
     found: list[tuple[str, StopServer | StopUser]] = queue.read(event, messages.parse_stop_server)
     return queue.response(event, queue.all_at_once(found, Stops(installed.shared(ServerServices)).handle))

@@ -10,7 +10,10 @@ from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, int]:
-    """Scheduled event → the counts of a `SweepResult`. Writes metrics to the log if `STACK` names the installation."""
+    """Run a sweep, and return its counts, which are the fields of `SweepResult`.
+
+    Writes metrics to the log if the variable `STACK` names the installation.
+    """
     sweep = Sweep(installed.platform())
     swept = sweep.run()
     if stack := os.environ.get("STACK"):

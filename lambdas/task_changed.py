@@ -10,7 +10,10 @@ from lambdas import installed, queue
 
 
 def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """SQS batch of ECS events and of the function's own messages → partial batch response."""
+    """Handle an SQS batch of ECS events and of messages that the function has sent to itself.
+
+    Returns the partial batch response with the messages that SQS must deliver again.
+    """
     found = queue.read(event, lambda body: messages.parse_dns_changed(body) or messages.parse_task_changed(body))
     services = installed.shared(ServerServices)
     dns = DnsRecords(services)

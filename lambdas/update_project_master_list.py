@@ -7,5 +7,8 @@ from lambdas import installed
 
 
 def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """`{"project": registration}` → `{"registered": …}` or `{"problems": […]}`; see `registry.handle`."""
+    """Register the project in `{"project": registration}`; return `{"registered": …}` or `{"problems": […]}`.
+
+    `registry.handle` describes the other events.
+    """
     return registry.handle(installed.platform(), event)

@@ -21,9 +21,9 @@ from hippodrome.model import ids
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = "examples"
 STUDY_FILES = ("config.yml", "agent.py", "steps", "requirements.txt")
-"""What belongs to the example study in Hippodrome's own folder, and is copied."""
+"""The files and folders that belong to the example study in Hippodrome's own folder, and are copied."""
 LEFT_OUT = shutil.ignore_patterns("data", "data-*", "erased-*.json", "__pycache__", "*.pyc", ".*")
-"""Leaves out data, caches and hidden files, wherever they lie in a template."""
+"""Names the files of a template that are not copied: data, caches and hidden files."""
 
 _ID = ("project", "id")
 _ID_LINE = re.compile(r"(?P<key>\s*id:\s*)[^#\s]+(?P<comment>.*)", re.DOTALL)
@@ -45,7 +45,7 @@ class StudyTemplate:
 
 
 def templates(root: Path = ROOT) -> dict[str, StudyTemplate]:
-    """Every template by its name: the examples by their folders' names, the study at the top by its id."""
+    """Return the templates by their names: for an example its folder's name, for the study at the top its id."""
     found: dict[str, StudyTemplate] = {}
     top = _source(root)
     if top is not None:
@@ -58,13 +58,13 @@ def templates(root: Path = ROOT) -> dict[str, StudyTemplate]:
 
 
 def listing(known: Mapping[str, StudyTemplate]) -> str:
-    """The templates in words, a line for each."""
+    """Return the templates as text, a line for each."""
     width = max(map(len, known), default=0)
     return "\n".join(["There are these templates:", *(f"  {name:{width}}  {known[name].title}" for name in known)])
 
 
 def make_study(template: StudyTemplate, folder: Path) -> str:
-    """Copy the template to `folder`, and give the copy a project id made from the folder's name. Returns the id.
+    """Copy the template to `folder`, and give the copy a project id made from the folder's name; return this id.
 
     Raises NotMade if the folder is not empty, if its name makes no id, or if it cannot be written.
     """
@@ -81,7 +81,7 @@ def make_study(template: StudyTemplate, folder: Path) -> str:
 
 
 def what_next(folder: Path) -> str:
-    """What to do with a new study: the commands, and the files to change."""
+    """Return what the researcher can do with a new study: the commands, and the files to change."""
     given = f"PROJECT={shlex.quote(str(folder))}"
     lines = [
         "Next:",

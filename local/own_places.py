@@ -14,10 +14,10 @@ MOST_TRIED = 10_000
 def user_ids(
     project_id: str, players: int, matching: str | dict[str, Any], groups: int, new: Callable[[int], str]
 ) -> list[str]:
-    """An id for each of the `players`, such that `matching` by groups lets them play together.
+    """Return an id for each of the `players`, such that `matching` by groups lets them play together.
 
     With `group` all ids belong to one group; with `mixed` they belong to different groups, as far as there are enough.
-    `new` makes an id from a number. There are fewer ids than players if `MOST_TRIED` of them do not suffice.
+    `new` makes an id from a number. If `MOST_TRIED` of them do not suffice, there are fewer ids than players.
     """
     made = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):
@@ -36,7 +36,7 @@ def user_ids(
 
 
 def advice(matching: str | dict[str, Any]) -> str:
-    """What the researcher has to answer, if participants are matched by an answer; otherwise empty."""
+    """Return what the researcher has to answer, if participants are matched by an answer; otherwise ""."""
     if not isinstance(matching, dict):
         return ""
     how, field = next(iter(matching.items()))

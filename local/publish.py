@@ -30,9 +30,10 @@ class NotPublished(Exception):
 def publish(
     folder: Path, documents: Documents, subdomain: str | None = None, say: Callable[[str], None] = lambda _: None
 ) -> Config:
-    """Check the project, copy its pages where they differ, and register it. Raises `NotPublished`.
+    """Check the project, copy its pages where they differ, and register it; return the project.
 
-    `subdomain` replaces the project's. `say` gets a sentence if steps have changed and participants have begun.
+    `subdomain` replaces the project's. `say` gets a sentence if steps have changed and participants have begun. Raises
+    `NotPublished`.
     """
     try:
         config = read_project(folder)
@@ -70,7 +71,7 @@ def _changed(documents: Documents, config: Config) -> str:
 
 
 def step_files(folder: Path) -> list[Path]:
-    """The files of the pages' folder, sorted: pages, and pictures and the like; no hidden ones."""
+    """Return the files in the folder of pages, sorted: pages, pictures and the like, without hidden files."""
     pages = layout.pages_folder(folder)
     found = pages.iterdir() if pages else ()
     return sorted(file for file in found if file.is_file() and not file.name.startswith("."))

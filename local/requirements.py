@@ -21,7 +21,7 @@ OF_THE_IMAGE = ROOT / "requirements" / "trial.txt"
 
 
 def wanted(folder: Path) -> Path | None:
-    """The project's `requirements.txt`; None if there is none, or if it is that of a clone of HIPPO Gym.
+    """Return the project's `requirements.txt`; None if there is none, or if it is that of a clone of HIPPO Gym.
 
     HIPPO Gym's names versions for Python 3.7, which cannot be installed (docs/hippo.md).
     """
@@ -33,13 +33,13 @@ def wanted(folder: Path) -> Path | None:
 
 
 def stamp_of(file: Path, constraints: Path, stamps: Path) -> Path:
-    """The empty file whose existence says that the packages of these two files have been installed."""
+    """Return the path of the empty file that exists once the packages of these two files have been installed."""
     content = hashlib.sha256(file.read_bytes() + b"\0" + constraints.read_bytes())
     return stamps / content.hexdigest()[:32]
 
 
 def install(file: Path, constraints: Path, stamps: Path) -> str:
-    """Install the file's packages, unless that has been done. Returns a sentence if that failed, otherwise ""."""
+    """Install the file's packages, unless that has been done. Return a sentence if it failed, otherwise ""."""
     stamp = stamp_of(file, constraints, stamps)
     if stamp.exists():
         return ""

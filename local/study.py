@@ -207,13 +207,16 @@ def _new_id() -> str:
 
 
 def from_here(path: Path) -> Path:
-    """The path relative to the working directory, if it lies below it."""
+    """Return the path relative to the working directory, if it lies below that; otherwise the path itself."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def _end_servers_of_other_addresses(state: Path, named_port: int | None) -> None:
-    """End the servers of an earlier run if browsers can no longer reach them at their addresses. Raises OSError."""
+    """End the servers of an earlier run if browsers can no longer reach them at their addresses; note the port.
+
+    The addresses hold the port that the earlier run named, which `state` remembers. Raises OSError.
+    """
     file, now = state / "named-port", str(named_port or "")
     state.mkdir(parents=True, exist_ok=True)
     before = file.read_text() if file.exists() else ""

@@ -24,7 +24,7 @@ class Watch:
     """Looks at the project's files, and publishes the project again when one changes.
 
     `config` is the project as it was published last. `publish` publishes it again and returns it, or raises
-    NotPublished; `published` is called with what it returns.
+    NotPublished; `published` is called with the project that `publish` has returned.
     """
 
     def __init__(

@@ -32,7 +32,7 @@ class TerminalHandler(logging.Handler):
 
 
 def log_line(message: str, fields: Mapping[str, object]) -> str:
-    """A record of the functions' log in a line: its message, and where and why, as far as `fields` say so."""
+    """Return a record of the functions' log as one line: its message, and those `fields` that say where and why."""
     details = [f"{key} {_plain(fields[key])}" for key in ("file", "line", "server", "error", "where") if key in fields]
     return f"{message} ({', '.join(details)})" if details else message
 

@@ -25,9 +25,9 @@ from local.activity.server_logs import WatchedServer
 from local.backend.task_record import folder_of
 from local.backend.tasks import ProcessTasks
 
-LOOK = 0.5  # seconds
+LOOK = 0.5  # seconds between looks for what servers have written
 HOLD_BACK = 0.8  # seconds for which a server's line waits for the participant's line that caused it
-ID_CHARACTERS = 6  # as many of an id are shown
+ID_CHARACTERS = 6  # the characters of an id that are shown
 
 _SESSION = re.compile(r"[^/]+/sessions/([^/]+)/session\.json")
 _PERSON = re.compile(r"[^/]+/users/([^/]+)/(.+)\.json")
@@ -79,7 +79,7 @@ class ActivityLog:
         self._line("", text, "yellow")
 
     def participant(self, user_id: str, text: str, style: str = "") -> None:
-        """Show something that happens to a participant."""
+        """Show something that happens to a participant, in the Rich style `style`."""
         self._line(_short(user_id), text, style)
 
     def _hold_back(self, user_id: str, text: str) -> None:
@@ -114,12 +114,15 @@ class ActivityLog:
     # What this process writes
 
     def set_steps(self, steps: Iterable[str]) -> None:
-        """Set the keys of the steps, in order. A participant who answers the last but one comes to the end."""
+        """Set the keys of the steps, in order. The participant who answers the last but one comes to the end."""
         keys = list(steps)
         self._last_step = keys[-2] if len(keys) > 1 else ""
 
     def wrote(self, key: str, body: bytes) -> None:
-        """Show the event that this document tells of, if it tells of one."""
+        """Show what happened, as a document that was just written tells it.
+
+        Nothing is shown for documents that tell of no event.
+        """
         found = _PERSON.fullmatch(key)
         together = _SESSION.fullmatch(key)
         record = _json(body) if found or together or key.startswith("_servers/") else {}

@@ -19,7 +19,7 @@ _ERROR = re.compile(r"(?:\S+:\d+: )?(?:\w+\.)*(?P<kind>\w+): (?P<text>.*)")
 class WatchedServer:
     """A running server: finds new answers of its participant or its session's members, and new errors in its log.
 
-    `whole_log`: also errors that are in the log already.
+    With `whole_log`, errors that are in the log already are found, too.
     """
 
     def __init__(self, task: TaskRecord, data: Path, log: Path, whole_log: bool) -> None:
@@ -31,7 +31,10 @@ class WatchedServer:
         self.assign(task.folder)
 
     def assign(self, folder: str) -> None:
-        """Make it the server of this participant or session. Answers that exist by now are not of its game."""
+        """Set the folder of the participant or session that the server now belongs to.
+
+        Answers that are there already are not of this server's game, and are not returned by `answers`.
+        """
         self.folder = folder
         self.user_id = folder.rpartition("/")[2]
         self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # of the participants
@@ -39,7 +42,7 @@ class WatchedServer:
         self._returned: set[str] = set()
 
     def answers(self) -> list[tuple[str, bytes]]:
-        """New answers since the last call: their keys, with their content."""
+        """Return the answers that are new since the last call: the key and the content of each."""
         if not self._folders:
             self._find_members()
             return []
@@ -51,7 +54,10 @@ class WatchedServer:
         return found
 
     def errors(self) -> list[str]:
-        """New errors in the server's log, each text once: the logged line, and the exception in its own words."""
+        """Return the errors that are new in the server's log, each text once.
+
+        An error is a logged line, or an exception in its own words.
+        """
         try:
             with self._log.open("rb") as log:
                 log.seek(self._read)
@@ -93,7 +99,10 @@ class ErrorReader:
         self._in_traceback = False
 
     def read(self, raw: bytes) -> str:
-        """The text to show for this line: a logged error, or the exception below a traceback, indented; else ""."""
+        """Return the text to show for the next line of the log; "" if there is nothing to show.
+
+        It is a logged error, or the exception at the end of a traceback, indented.
+        """
         line = raw.decode("utf-8", "replace").rstrip()
         if " ERROR " in line[:40]:
             self._in_traceback = False
@@ -121,7 +130,7 @@ def _begins_anew(raw: bytes) -> str:
 
 
 def last_error(log: Path) -> str:
-    """The words of the last error in a server's log; empty if there is none."""
+    """Return the words of the last error in a server's log; "" if there is none."""
     reader = ErrorReader(log)
     try:
         with log.open("rb") as lines:

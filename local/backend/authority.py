@@ -42,7 +42,7 @@ class Authority:
         self._own, self._key = found if found is not None else self._make()
 
     def context(self, *names: str) -> ssl.SSLContext:
-        """A TLS context for a server, with a new certificate for these names and addresses."""
+        """Return a TLS context for a server, with a new certificate for these names and addresses."""
         chain, key = self._certify(names)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory(dir=self._folder) as place:  # readable by its owner alone
@@ -127,7 +127,7 @@ def _builder(subject: x509.Name, days: int) -> x509.CertificateBuilder:
 
 
 def general_name(name: str) -> x509.GeneralName:
-    """A DNS name or an IP address as certificates hold it."""
+    """Return a DNS name or an IP address in the form that certificates have it in."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:

@@ -34,9 +34,10 @@ QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
 WORKERS = 2  # threads for each queue: SQS calls a function with several batches at once, too
 RETRY = (1, 2, 6, 24)
-"""Seconds until a message that failed is delivered again: after the first failure, the second, and so on.
+"""The seconds until a message that failed is delivered again: after its first failure, its second, and so on.
 
-After one more failure it is put aside. A server stops within their sum.
+After one failure more than there are numbers, the message is put aside. A message that has to wait until a server has
+stopped succeeds before that, since a server stops within the sum of these seconds.
 """
 
 
@@ -258,12 +259,12 @@ class FolderBus:
         self._queues[TASK].put(event)
 
     def start(self) -> None:
-        """Begin to deliver."""
+        """Begin to deliver messages."""
         for queue in self._queues.values():
             queue.start()
 
     def drain(self, seconds: float) -> bool:
-        """Wait until everything that is due has been handled; return whether it has."""
+        """Wait up to `seconds` until everything that is due has been handled; return whether it has."""
         until = time.monotonic() + seconds
         quiet = 0
         while (
@@ -277,7 +278,7 @@ class FolderBus:
         return self._queues[queue].take_all()
 
     def close(self, seconds: float = 5.0) -> None:
-        """Stop delivering. What is left stays in its files."""
+        """Stop delivering messages. Those that are left stay in their files."""
         until = time.monotonic() + seconds
         for queue in self._queues.values():
             queue.stop(until)

@@ -49,7 +49,7 @@ class FileDns:
         return record.name if self._named else record.host
 
     def has(self, name: str) -> bool:
-        """Whether there is a record of this name."""
+        """Return whether there is a record of this name."""
         return name in self._zone()
 
     def _zone(self) -> dict[str, str]:

@@ -91,7 +91,9 @@ class FolderDocuments:
         return known if known and known.etag == etag else Document(body, etag)
 
     def create(self, key: str, body: bytes) -> str:
-        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
+        """Create a document; return its ETag. Raises `Conflict` if it exists, and ValueError if the key cannot be a
+        file.
+        """
         path = self._writable(key)
         disk.make_folder(path.parent)
         try:
@@ -102,7 +104,10 @@ class FolderDocuments:
         return _etag(body)
 
     def replace(self, key: str, body: bytes, etag: str) -> str:
-        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
+        """Replace the version with this ETag; return the new ETag.
+
+        Raises `Conflict` if another version is present, and ValueError if the key cannot be a file.
+        """
         path = self._writable(key)
         with self._lock(key):
             present = self.get(key)
@@ -113,7 +118,7 @@ class FolderDocuments:
         return _etag(body)
 
     def put(self, key: str, body: bytes) -> None:
-        """As `Documents` says. Raises ValueError for a key that cannot be a file."""
+        """Write a document without a condition. Raises ValueError if the key cannot be a file."""
         path = self._writable(key)
         with self._lock(key):
             disk.make_folder(path.parent)
@@ -121,7 +126,11 @@ class FolderDocuments:
         self._tell(key, body)
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Lists lazily, a folder at a time. Documents that come or go meanwhile may be listed or not."""
+        """Yield an entry for each document whose key begins with `prefix`, in the order of the keys.
+
+        Folders are read one at a time, when the caller comes to them. Documents that come or go meanwhile may be listed
+        or not.
+        """
         folder, _, start = prefix.rpartition("/")
         path = self._path(folder) if folder else self.folder
         if path is not None:
@@ -152,7 +161,9 @@ class FolderDocuments:
     def _writable(self, key: str) -> Path:
         path = self._path(key)
         if path is None:
-            raise ValueError("not a key for a document in a folder")
+            raise ValueError(
+                "this key cannot be a file: a part of it is empty, too long or begins with a dot, or it has a \\"
+            )
         return path
 
     def _lock(self, key: str) -> AbstractContextManager[None]:

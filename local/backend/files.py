@@ -24,7 +24,7 @@ def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
+    """Return the content of a JSON file; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
     try:
         return json.loads(path.read_bytes())
     except (FileNotFoundError, ValueError):
@@ -32,7 +32,7 @@ def read_json(path: Path) -> Any:
 
 
 def names(folder: Path, suffix: str = "") -> list[str]:
-    """The sorted names in a folder that end with `suffix`, without those of unfinished files. Raises OSError.
+    """Return the sorted names in a folder that end with `suffix`, without those of unfinished files. Raises OSError.
 
     `Path.glob` would take a folder that cannot be read for an empty one.
     """
@@ -40,7 +40,7 @@ def names(folder: Path, suffix: str = "") -> list[str]:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is such a file or folder. Raises OSError if that cannot be seen."""
+    """Return whether there is such a file or folder. Raises OSError if that cannot be found out."""
     try:
         os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -64,7 +64,7 @@ class InUse(Exception):
 
 
 class Hold:
-    """A lock kept for as long as the process lives, with a note for the next process that wants it."""
+    """A lock that this process keeps until it ends, with a note for the next process that wants the lock."""
 
     def __init__(self, path: Path) -> None:
         """Take the lock. Raises `InUse`, and OSError if it cannot be taken for another reason."""
@@ -81,7 +81,7 @@ class Hold:
         self.write("")
 
     def write(self, note: str) -> None:
-        """Leave a note, if there is room for it."""
+        """Leave a note for the next process. On a full disk there is no note."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._handle, 0)
             os.pwrite(self._handle, note.encode(), 0)

@@ -11,7 +11,7 @@ from local.backend.task_record import HOST
 
 
 def port_in(log: Path) -> int | None:
-    """The port that the server has written into its log; None if it has not yet. Raises OSError."""
+    """Return the port that the server has written into its log; None if there is none yet. Raises OSError."""
     try:
         text = log.read_bytes()
     except FileNotFoundError:
@@ -24,7 +24,7 @@ def port_in(log: Path) -> int | None:
 
 
 def is_healthy(port: int) -> bool:
-    """Whether the server at this port answers. Raises OSError if this machine refuses the connection."""
+    """Return whether the server at this port answers. Raises OSError if this machine refuses the connection."""
     connection = http.client.HTTPConnection(HOST, port, timeout=2)
     try:
         connection.request("GET", "/healthz")

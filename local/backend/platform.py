@@ -112,7 +112,7 @@ class LocalPlatform:
         return publish(self._project, self.documents, self._subdomain, self._say)
 
     def port_of(self, name: str) -> int | None:
-        """The port of the server with this DNS name; None if there is no such server."""
+        """Return the port of the server with this DNS name; None if there is no such server."""
         label, _, domain = name.partition(".")
         return self.tasks.port_of(label) if domain == DOMAIN and self.dns.has(name) else None
 

@@ -51,12 +51,12 @@ def spawn(
 
 
 def mark_of(state: Path, name: str) -> str:
-    """The mark in the command lines of a server's processes."""
+    """Return the mark by which a server's processes are found: it stands in their command lines."""
     return f"hippodrome={state.resolve() / 'tasks' / name}"
 
 
 def marked(state: Path) -> dict[str, list[psutil.Process]]:
-    """Every process that carries the mark of this state folder, by the server's name."""
+    """Return the processes that carry the mark of this state folder, by the server's name."""
     found: dict[str, list[psutil.Process]] = {}
     ours = mark_of(state, "") + "/"
     for process in psutil.process_iter():
@@ -75,7 +75,7 @@ def end_everything(state: Path) -> None:
 
 
 def process_of(pid: int | None, mark: str) -> psutil.Process | None:
-    """The process with that id, if it carries the mark; otherwise None."""
+    """Return the process with this id if it carries the mark; otherwise None."""
     if pid is None:
         return None
     try:
@@ -86,7 +86,10 @@ def process_of(pid: int | None, mark: str) -> psutil.Process | None:
 
 
 def child_of(shell: int | None, mark: str) -> psutil.Process | None:
-    """The server below this shell, for the case that its id could not be written down; None if there is none."""
+    """Return the server that this shell has started; None if there is none.
+
+    It finds the server by the mark, in case its process id could not be written down.
+    """
     try:
         children = psutil.Process(shell).children() if shell else []
     except psutil.Error:
@@ -96,7 +99,7 @@ def child_of(shell: int | None, mark: str) -> psutil.Process | None:
 
 
 def is_shell(process: psutil.Process) -> bool:
-    """Whether it is the shell, and not the server below it."""
+    """Return whether the process is the shell that waits for a server, and not the server itself."""
     try:
         return SHELL in process.cmdline()
     except psutil.Error:
@@ -111,7 +114,7 @@ def kill(processes: Sequence[psutil.Process]) -> None:
 
 
 def kill_group(pid: int | None) -> None:
-    """Kill the process group that this process leads; nothing for None."""
+    """Kill the process group that the process with this id leads. None: do nothing."""
     if pid:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(pid, signal.SIGKILL)

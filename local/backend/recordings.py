@@ -14,7 +14,7 @@ from protocol.keys import with_number
 
 
 def unfinished(spool: Path, task: TaskRecord) -> Sequence[Path]:
-    """The task's recordings in the spool that belong in the data folder. Raises OSError."""
+    """Return the task's recordings in the spool that belong in the data folder. Raises OSError."""
     if not (task.kept and task.folder):
         return []
     folder = spool / f"{task.folder}/trials/{task.server or task.name}"

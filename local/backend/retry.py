@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 FIRST, LONGEST = 0.05, 10.0  # seconds between two attempts
-SILENCE = 60.0  # seconds until the same sentence is said again
+SILENCE = 60.0  # seconds for which the same sentence is not said again
 
 _FULL = "The disk is full: please make room"
 _FILES = "This machine cannot open more files: please close programs, or raise the limit (`ulimit -n`)"
@@ -40,7 +40,7 @@ P = TypeVar("P")
 
 
 class Retry:
-    """Tries again, and says what this machine refuses: each sentence once a minute at most.
+    """Tries again what this machine refuses, and says what it is. Each sentence is said once a minute at most.
 
     The sentences name no files, since file names contain participants' ids.
     """
@@ -52,7 +52,7 @@ class Retry:
         self._last = -math.inf
 
     def report(self, error: BaseException) -> None:
-        """Say what this machine refused, and remember when."""
+        """Say what this machine refused, and remember the time (`reported_within`)."""
         text = message_for(error)
         with self._lock:
             now = self._last = time.monotonic()
@@ -62,7 +62,7 @@ class Retry:
         self._say(text)
 
     def reported_within(self, seconds: float) -> bool:
-        """Whether this machine has refused something within the last `seconds`."""
+        """Return whether `report` was called within the last `seconds`."""
         return time.monotonic() < self._last + seconds
 
     def run(
@@ -70,8 +70,8 @@ class Retry:
     ) -> T | None:
         """Call `act` until it succeeds, and return its result.
 
-        `wait` pauses for so many seconds; if it returns True, this gives up and returns None. If `seconds` are given,
-        the last error is raised when they are over.
+        Between two calls, `wait` pauses for the seconds that it gets; if it returns True, this gives up and returns
+        None. After `seconds`, if given, the last error is raised.
         """
         until = None if seconds is None else time.monotonic() + seconds
         pause = FIRST
@@ -88,7 +88,7 @@ class Retry:
 
 
 def message_for(error: BaseException) -> str:
-    """The sentence for the researcher: what this machine refuses, and what to do about it."""
+    """Return the sentence for the researcher: what this machine refuses, and what to do about it."""
     number = getattr(error, "errno", None)
     words = _WORDS.get(number or 0)
     if words is None:
@@ -98,7 +98,7 @@ def message_for(error: BaseException) -> str:
 
 
 def reports_errors(port: type[P]) -> type[P]:
-    """Decorates the class of a port: an OSError of a public method is reported to `self.retry` and raised again."""
+    """Decorate the class of a port: an OSError of a public method is reported to `self.retry`, and raised again."""
     for name, method in list(vars(port).items()):
         if not name.startswith("_") and inspect.isfunction(method):
             wrap = _reporting_generator if inspect.isgeneratorfunction(method) else _reporting

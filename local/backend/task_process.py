@@ -56,7 +56,7 @@ class Shared:
     say: Say
     retry: Retry
     lock: threading.RLock = field(default_factory=threading.RLock)
-    closed: threading.Event = field(default_factory=threading.Event)  # this process is ending
+    closed: threading.Event = field(default_factory=threading.Event)  # set when this process ends
 
     @property
     def agent_folder(self) -> Path:
@@ -64,11 +64,11 @@ class Shared:
         return layout.agent_folder(self.project).resolve()
 
     def log(self, name: str) -> Path:
-        """The log file of the server of this name."""
+        """Return the log file of the server of this name."""
         return self.logs / f"{name}.log"
 
     def environment(self, request: TaskRequest) -> dict[str, str]:
-        """The environment variables of a server's process."""
+        """Return the environment variables of a server's process."""
         # SESSION is a common name: a desktop may have set it for its own purposes.
         inherited = {k: v for k, v in os.environ.items() if not k.startswith(_AWS) and k != environment.SESSION}
         ours = str(Path(__file__).resolve().parents[2])
@@ -105,7 +105,7 @@ class TaskProcess:
 
     @property
     def lives(self) -> bool:
-        """Whether it counts as running. As in ECS's lists, a task does not once it was asked to stop."""
+        """Whether the task counts as running. As in ECS's lists, a task that was asked to stop does not."""
         return not self._over and self.task.status != "STOPPED" and self.task.asked is None
 
     # What `ProcessTasks` calls
@@ -113,8 +113,8 @@ class TaskProcess:
     def begin(self, request: TaskRequest) -> None:
         """Start the process, and a thread that follows it once the caller has set `begun`.
 
-        If one of them cannot be started, neither runs. Raises `Refused` if the command can never be run, OSError if it
-        may be possible later.
+        If one of the two cannot be started, neither runs. Raises `Refused` if the command can never be run, and OSError
+        if it may be possible later.
         """
         self._save()
         self._shared.files.remove_notes(self.task.name)
@@ -136,9 +136,9 @@ class TaskProcess:
         self.begun.set()
 
     def end(self, reason: str, until: float, *, even_unsaved: bool = False) -> None:
-        """Send SIGTERM; send SIGKILL at `until` (monotonic). Returns at once.
+        """Send SIGTERM, and SIGKILL at the time `until` (`time.monotonic`). Returns at once.
 
-        Raises OSError if the reason cannot be saved; then no signal is sent, unless `even_unsaved`.
+        Raises OSError if the reason cannot be saved; then no signal is sent, unless `even_unsaved` is True.
         """
         with self._shared.lock:
             if self.task.status == "STOPPED":
@@ -166,12 +166,12 @@ class TaskProcess:
             kill_group(self.task.pid)
 
     def forget(self) -> None:
-        """Remove its file, and do not write it again. Raises OSError."""
+        """Remove the task's file, and do not write it again. Raises OSError."""
         self.forgotten.set()
         self._shared.files.file(self.task.name).unlink(missing_ok=True)
 
     def read_handover(self) -> None:
-        """If it is a warm server that has been assigned, save to whom. Raises OSError if that is refused."""
+        """If the task is a warm server that has been assigned, save its participant or session. Raises OSError."""
         with self._shared.lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = self.task
             if task.handover_key and not task.folder and not self.forgotten.is_set():
@@ -181,7 +181,7 @@ class TaskProcess:
 
     @property
     def unfinished(self) -> Sequence[Path]:
-        """Its recordings that are still in the spool. Raises OSError."""
+        """The task's recordings that are still in the spool. Raises OSError."""
         return recordings.unfinished(self._shared.spool, self.task)
 
     # Its process

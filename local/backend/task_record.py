@@ -53,7 +53,7 @@ class TaskRecord:
 
     @classmethod
     def of(cls, request: TaskRequest, id_: str) -> TaskRecord:
-        """The record of a requested task that has no process yet."""
+        """Return the record of a requested task that has no process yet."""
         return cls(
             name=request.name,
             cluster=request.cluster,
@@ -86,7 +86,7 @@ class TaskFolder:
                 continue
 
     def note(self, name: str, kind: str) -> str:
-        """The shell's note of this kind ("pid" or "exit"); empty if there is none. Raises OSError."""
+        """Return the shell's note of this kind ("pid" or "exit"); empty if there is none. Raises OSError."""
         try:
             return self.file(name, kind).read_text().strip()
         except FileNotFoundError:
@@ -98,7 +98,7 @@ class TaskFolder:
             self.file(name, kind).unlink(missing_ok=True)
 
     def file(self, name: str, kind: str = "json") -> Path:
-        """The path of a task's record ("json") or of a note."""
+        """Return the path of a task's record ("json") or of a note."""
         return self.path / f"{name}.{kind}"
 
 
@@ -115,7 +115,7 @@ def _from_json(stored: Any) -> TaskRecord:
 
 
 def event(task: TaskRecord, exit_code: int | None = None) -> dict[str, Any]:
-    """The "ECS Task State Change" event of EventBridge for this state of a task."""
+    """Return the "ECS Task State Change" event that EventBridge would send for this state of a task."""
     details = {"subnetId": "subnet-local", "networkInterfaceId": task.interface, "privateIPv4Address": HOST}
     detail: dict[str, Any] = {
         "taskArn": task.arn,
@@ -167,12 +167,15 @@ def event(task: TaskRecord, exit_code: int | None = None) -> dict[str, Any]:
 
 
 def claim_of(request: TaskRequest) -> str:
-    """A hash of the server's token, by which servers of the same name differ."""
+    """Return a hash of the server's token. Servers of the same name differ by it."""
     return hashlib.sha256(request.environment.get(environment.TOKEN, "").encode()).hexdigest()[:16]
 
 
 def folder_of(project_id: str, owner: str) -> str:
-    """The folder of the `owner`, a participant or a session: relative to the data, without a slash at its end."""
+    """Return the folder of a participant or a session, relative to the data folder and without a slash at its end.
+
+    `owner` is the participant's or the session's id.
+    """
     return owner_folder(project_id, owner).rstrip("/")
 
 
@@ -199,5 +202,5 @@ def _kept(variables: Mapping[str, str]) -> bool:
 
 
 def now() -> str:
-    """The time as ECS writes it."""
+    """Return the present time as ECS writes it."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -110,7 +110,10 @@ class ProcessTasks:
         }
 
     def port_of(self, label: str) -> int | None:
-        """The port of the newest server with this name, or of the participant with this id in lower case."""
+        """Return the port of the newest server that has this label in its DNS name; None if there is none.
+
+        The label is the server's name, or its participant's id in lower case.
+        """
         listening = [server.task for server in self._all() if server.lives and server.task.port]
         named = [task for task in listening if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())]
         return max(named, key=lambda task: task.created).port if named else None
@@ -205,7 +208,7 @@ class ProcessTasks:
         return len(playing)
 
     def playing(self) -> Sequence[TaskRecord]:
-        """The servers that have not stopped. A warm server's `folder` is empty until it is assigned."""
+        """Return the servers that have not stopped. A warm server's `folder` is empty until it is assigned."""
         playing = [server for server in self._all() if server.task.status != "STOPPED"]
         for server in playing:
             with contextlib.suppress(OSError):  # the next look sees it
@@ -213,7 +216,7 @@ class ProcessTasks:
         return [server.task for server in playing]
 
     def log(self, name: str) -> Path:
-        """The log file of the server of this name."""
+        """Return the log file of the server of this name."""
         return self._shared.log(name)
 
     def _all(self) -> Sequence[TaskProcess]:

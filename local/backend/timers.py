@@ -40,7 +40,10 @@ class FolderTimers:
         self._thread = threading.Thread(target=self._work, name="timers", daemon=True)
 
     def set(self, name: str, at: datetime, message: Message) -> None:
-        """As `Timers` says. Raises ValueError for a name that EventBridge Scheduler would not accept."""
+        """Publish `message` to the stop topic at `at`. Replaces a timer of the same name.
+
+        Raises ValueError for a name that EventBridge Scheduler would refuse.
+        """
         path = self._path(name)
         when = float(int(at.timestamp()))
         with self._changed:
@@ -64,7 +67,7 @@ class FolderTimers:
                 self._path(name).unlink(missing_ok=True)
 
     def start(self) -> None:
-        """Begin to fire, first the timers that became due while no process ran. Raises OSError."""
+        """Begin to fire timers. Those that became due while no process ran come first. Raises OSError."""
         with self._changed:
             self._queue = [(at, name) for name in self.list() if (at := self._due(name)[0])]
             heapq.heapify(self._queue)
@@ -72,7 +75,7 @@ class FolderTimers:
         start(self._thread)
 
     def close(self) -> None:
-        """Fire nothing more."""
+        """Stop firing timers."""
         with self._changed:
             self._open = False
             self._changed.notify()
@@ -81,7 +84,7 @@ class FolderTimers:
 
     def _path(self, name: str) -> Path:
         if not NAME.fullmatch(name) or name.startswith("."):
-            raise ValueError("not a name for a timer")
+            raise ValueError("a timer's name has 1 to 64 letters, digits and _.-, and does not begin with a dot")
         return self._folder / f"{name}.json"
 
     def _due(self, name: str) -> tuple[float, Any]:

@@ -36,7 +36,7 @@ def main(
     label = agent_file.label_of(folder)
     playable = not _mistakes(found, label) and config is not None and bool(config.game_steps)
     if playable and config and agent_imports.may_run_on_aws(config):
-        lacking = [*agent_imports.missing(folder), *agent_imports.of_players(folder, config)]
+        lacking = [*agent_imports.missing(folder), *agent_imports.missing_for_players(folder, config)]
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
     _print(found)
     if playable and config:

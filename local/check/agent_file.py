@@ -15,13 +15,13 @@ from trial.agent.callback_names import NAMES
 
 
 def label_of(folder: Path) -> str | None:
-    """The path of agent.py from the project's folder, as messages name it; None if there is no agent.py."""
+    """Return the path of agent.py from the project's folder, as messages name it; None if there is no agent.py."""
     code = layout.agent_folder(folder)
     return (code / AGENT).relative_to(folder).as_posix() if (code / AGENT).is_file() else None
 
 
 def read_agent(folder: Path) -> list[Diagnostic]:
-    """The mistake for which Python cannot read agent.py, if there is one."""
+    """Return the mistake for which Python cannot read agent.py, if there is one."""
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         source = path.read_bytes() if path.is_file() else b""
@@ -39,7 +39,10 @@ def read_agent(folder: Path) -> list[Diagnostic]:
 
 
 def never_called(folder: Path, config: Config) -> list[Diagnostic]:
-    """Remarks on a method whose name is nearly a callback's, and on a `match` that config.yml does not ask for."""
+    """Return remarks on methods that are never called.
+
+    These are a method whose name is nearly a callback's, and a function `match` that config.yml does not ask for.
+    """
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         tree = ast.parse(path.read_bytes())
@@ -70,9 +73,10 @@ def _nearly_a_callback(name: str) -> str:
 
 
 def line_of(path: Path, method: str) -> int | None:
-    """The line of a method of class Agent, else of the class; without that class, of the function of that name.
+    """Return the line of a method of class Agent, or else that of the class.
 
-    `match` stands beside the class. None if nothing is found.
+    Without that class, it is the line of the function of that name, since `match` stands beside the class. The result
+    is None if nothing is found.
     """
     try:
         body = ast.parse(path.read_bytes()).body

@@ -39,7 +39,7 @@ from trial.pictures.reader import PictureReader
 from trial.server import assignment
 from trial.settings import trial_section
 
-_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # modules of os.getenv, environ.get and "in"
+_LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # where os.getenv, environ.get and `in` are implemented
 
 
 class _EarlyEnviron(os._Environ[str]):
@@ -170,7 +170,10 @@ def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> Pict
 
 
 def _assigned(document: str) -> assignment.AssignmentDocument:
-    """The handover; or a document of the session that it names, without members, since none is stored here."""
+    """Read a handover, and return the document that says who plays: the handover itself, for one participant.
+
+    If it names a session, the session's document is made up, with no members: `make check` has no stored one.
+    """
     found = handover.parse(document.encode())
     if not is_session_id(found.user_id):
         return found

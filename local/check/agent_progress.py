@@ -23,10 +23,10 @@ REPORT_BYTES = 2**20  # a report of this size begins anew
 
 
 class AgentProgress:
-    """Reports each method before it calls it: if the process ends or hangs, the last line names the method.
+    """Reports each method before it is called: if the process ends or hangs, the last line names the method.
 
-    Each line holds all that is known. There are two lines for each step: to make a new file for each would take longer
-    than a step of many environments.
+    Each line holds all that is known. Two lines are appended to the file for each step: to write a new file for each
+    would take longer than a step of many environments.
     """
 
     def __init__(
@@ -51,13 +51,16 @@ class AgentProgress:
         self._until = math.inf
 
     def time_over(self) -> bool:
-        """Whether the steps or the time of playing are over. The time counts from the end of the first step."""
+        """Return whether no more steps should be taken: there were enough, or the time of playing is over.
+
+        The time counts from the end of the first step.
+        """
         if self.steps == 1 and self._until == math.inf:
             self._until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
         return self.steps >= PLAY_STEPS or time.monotonic() > self._until
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
-        """Report the name, call the function and keep its `result`; False if it raised, which is reported too."""
+        """Report the name, call the function and keep its `result`. Return False if it raised, which is reported."""
         self._write(call=name)
         try:
             self.result = function()
@@ -73,7 +76,10 @@ class AgentProgress:
         self._callback_errors.append({"name": name, **_described(error, self._folder)})
 
     def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
-        """Note the first value that is too large for the recording: of the infos, or of what the agent records."""
+        """Note the first value that is too large for the recording.
+
+        It is one of the `infos` of a step, or of what the agent records itself (`extra`).
+        """
         if "tooLarge" in self.known:
             return
         for where, values in (

@@ -29,14 +29,17 @@ _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
 
 
 def last_line(report: str) -> dict[str, Any]:
-    """The last whole line of a report; the process may have been killed while it wrote another. Raises ValueError."""
+    """Return the last whole line of a report. Raises ValueError if there is none.
+
+    The process may have been killed while it wrote another line.
+    """
     whole, _, _ = report.rpartition("\n")
     found: dict[str, Any] = json.loads(whole.rpartition("\n")[2])
     return found
 
 
 class AgentReport:
-    """The report of an agent that was tried in one group. `place` is the folder that its process wrote to."""
+    """The report of an agent that was tried in one group. `place` is the folder that has the report."""
 
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
@@ -49,7 +52,10 @@ class AgentReport:
             self._report = {}
 
     def problems(self, status: int | None) -> list[Diagnostic]:
-        """The diagnostics, if the process has ended with this exit status (None: it had to be killed)."""
+        """Return what is wrong with the agent.
+
+        `status` is the exit status of the process; None if it had to be killed.
+        """
         return [
             *self._early(),
             *self._failures(status),
@@ -72,7 +78,7 @@ class AgentReport:
         return bool(self._report.get("steps"))
 
     def how_far(self) -> str:
-        """How far the agent played, in a line."""
+        """Return one line that says how far the agent played."""
         report = self._report
         where = "" if self._group is None else f" in group {self._group}"
         episodes, steps, most = report.get("episodes", 0), report.get("steps", 0), self._config.trial.max_episodes
@@ -211,7 +217,7 @@ class AgentReport:
         """Remarks on packages that were loaded here and that servers on AWS lack."""
         if not agent_imports.may_run_on_aws(self._config):
             return []
-        found = agent_imports.loaded(self._folder, self._config, self._report.get("loaded", ()))
+        found = agent_imports.missing_of_loaded(self._folder, self._config, self._report.get("loaded", ()))
         return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:
@@ -395,7 +401,10 @@ class AgentReport:
 
 
 def slowness(pace: Pace, rate: int) -> str | None:
-    """The remark on an agent that is far slower than the frame rate (steps a second); None if it is not."""
+    """Return the remark on an agent that is far slower than the frame rate; None if it is not.
+
+    `rate` is in steps a second.
+    """
     seconds = pace.seconds - pace.slowest
     if seconds < LONG_ENOUGH or (pace.steps - 1) / seconds >= SLOW * rate:
         return None

@@ -16,7 +16,7 @@ _METHODS = frozenset(dir(dict))
 
 
 def check_answers_named(label: str, parsed: nodes.Template, earlier: EarlierAnswers) -> Iterator[Diagnostic]:
-    """Remarks on keys of steps without quotes, and on fields that an earlier step does not have."""
+    """Yield remarks on keys of steps without quotes, and on fields that an earlier step does not have."""
     for node in _lookups(parsed):
         inner, key = node.node, _key(node)
         if _is_answers(inner) and isinstance(key, int) and not isinstance(key, bool):

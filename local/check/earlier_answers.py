@@ -17,7 +17,10 @@ from protocol.answer import UNMATCHED
 
 
 class EarlierAnswers:
-    """The answers of a participant who sees a page: to every question, or only to the required ones."""
+    """The answers that a participant may have given before they see a page.
+
+    They are answers to every question, or only to the required ones.
+    """
 
     def __init__(self, folder: Path, config: Config | None, steps: Sequence[StepFiles]) -> None:
         """`steps` are the steps before the page; `folder` holds the pages."""
@@ -27,12 +30,12 @@ class EarlierAnswers:
 
     @classmethod
     def before_the_game(cls, folder: Path, config: Config) -> EarlierAnswers:
-        """The answers of a participant who comes to the first game step."""
+        """Return what a participant who comes to the first game step may have answered."""
         return cls(folder, config, list(itertools.takewhile(lambda step: not step.type.on_server, config.steps)))
 
     @classmethod
     def before_page(cls, folder: Path, config: Config | None, name: str) -> EarlierAnswers:
-        """The answers of a participant who comes to the page with this file."""
+        """Return what a participant who comes to the page with this file may have answered."""
         steps = list(config.steps) if config else []
         in_game = [file.name for page in (config.game_pages if config else ()) for file in page.files]
         place = next(
@@ -46,13 +49,13 @@ class EarlierAnswers:
         return cls(folder, config, steps[:place])
 
     def fields(self) -> tuple[list[str], str]:
-        """The names of the fields of all earlier pages, and the text of these pages."""
+        """Return the names of the fields of all earlier pages, and the text of these pages."""
         texts = self._texts()
         found = (name for text in texts for name in _answered(text)[0])
         return list(dict.fromkeys(found)), "\n".join(texts)
 
     def fields_of(self, key: str) -> list[str] | None:
-        """The names of all fields of an earlier step; None if they are not known.
+        """Return the names of all fields of an earlier step; None if they are not known.
 
         They are not known if a script or Jinja may make fields, or if the step does not come before the page.
         """
@@ -67,7 +70,10 @@ class EarlierAnswers:
         return None if may_have_more else list(dict.fromkeys(names))
 
     def choices(self, field: str) -> int | None:
-        """The number of different answers to a field; None if participants write it, or a script may make it."""
+        """Return how many different answers a field can have.
+
+        The result is None if participants write the answer, or if a script may make it.
+        """
         texts = self._texts()
         if any("<script" in text.lower() for text in texts):
             return None
@@ -83,7 +89,10 @@ class EarlierAnswers:
         return len(found) if found else None
 
     def answers(self, group: int | None, person: int = 1) -> list[dict[str, dict[str, Any]]]:
-        """Two lists of answers by step: to all questions, and to the required ones. `person` seeds the choices."""
+        """Return two sets of answers, by step: one to all questions, one to the required ones alone.
+
+        `person` seeds the random choices.
+        """
         most: dict[str, dict[str, Any]] = {}
         least: dict[str, dict[str, Any]] = {}
         for step in self._steps:
@@ -149,7 +158,7 @@ def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
 
 
 def source_of(path: Path) -> str:
-    """The text of a page; empty if it cannot be read, which the check of the configuration reports."""
+    """Return the text of a page; empty if it cannot be read, which the check of the configuration reports."""
     try:
         return path.read_bytes().decode("utf-8", "replace")
     except OSError:

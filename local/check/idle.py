@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-SECONDS = 3.0  # after which it gives up
+SECONDS = 3.0  # after so many seconds `actions_without_effect` gives up
 _STATES = (0, 2, 5, 9)  # each state by its number of steps after a reset
 _MOST_ACTIONS = 10
 
@@ -21,9 +21,11 @@ _MOST_ACTIONS = 10
 def actions_without_effect(
     begin: Callable[[int], Any], step: Callable[[int], bool], picture: Callable[[], Any], count: int, idle: int
 ) -> list[int] | None:
-    """If the idle action changes the picture where another does not, return the actions that never do; otherwise None.
+    """If the idle action changes the picture in a state where another does not, return the actions that never do.
 
-    It also returns None if that is not known: the game is random, or the time is over.
+    Otherwise return None, also if this is not known: the game is random, or the time or the episode was over too soon.
+    Only the first `_MOST_ACTIONS` actions are tried, in the states of `_STATES`. If the time or the episode is over
+    after such a state was found, the result is what the states before have shown.
 
     `begin(seed)` begins an episode. `step(action)` takes a step, and returns whether the episode is over. `picture`
     returns the picture. `count` is the number of actions.
@@ -56,7 +58,7 @@ def actions_without_effect(
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two pictures show the same: frames, scenes, or one for each player."""
+    """Return whether two pictures show the same. A picture is a frame, a scene, or a map with one for each player."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return bool(np.array_equal(one, other))
     if isinstance(one, dict) and isinstance(other, dict):

@@ -15,7 +15,7 @@ _LARGEST = 4096  # pixels of a sprite that has the size of its image
 
 
 class Outside:
-    """Looks at each picture of the episodes that `make check` plays."""
+    """Finds the objects that are never in the picture, among the pictures of the episodes that `make check` plays."""
 
     def __init__(self, section: SceneSection | None) -> None:
         self._size = (section.width, section.height) if section and section.coordinates == "relative" else None
@@ -32,7 +32,10 @@ class Outside:
                     self._look_at((view, name), each, self._size)
 
     def found(self) -> dict[str, tuple[float, float]]:
-        """The objects that were never inside, but would be if their coordinates were pixels: by name, with a place."""
+        """Return the objects that were never in the picture, but would be if their coordinates were pixels.
+
+        Each name of an object has one of its places.
+        """
         return {name: place for (_, name), place in self._outside.items()}
 
     def _look_at(self, key: tuple[str, str], each: CheckedObject, size: tuple[int, int]) -> None:

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 @dataclass
 class Pace:
-    """The seconds that steps have taken, with their pictures; the slowest apart, since it may have loaded something."""
+    """The seconds that an agent's steps have taken, each with its picture.
+
+    The slowest step is kept apart, since it may have loaded something.
+    """
 
     steps: int = 0
     seconds: float = 0.0

@@ -20,7 +20,10 @@ from local.check.templates import check_template
 
 
 def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
-    """The problems of the study's pages; of all pages in the folder if the configuration cannot be read."""
+    """Return the problems of the study's pages.
+
+    If the configuration cannot be read, these are the problems of all pages in the folder.
+    """
     try:
         steps = open_folder(folder)
     except StepFileError:

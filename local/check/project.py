@@ -11,7 +11,7 @@ from local.check.sessions import check_sessions
 
 
 def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
-    """The problems of pages and agent.py, which is not run, and remarks on the configuration.
+    """Return the problems of pages and agent.py, and remarks on the configuration. agent.py is not run.
 
     `config` is None if the configuration cannot be read.
     """

@@ -25,7 +25,7 @@ _OLD = {
 
 
 def remedy(kind: str, text: str) -> str:
-    """Advice to append to an error's text, beginning with a semicolon; empty if there is none for this error.
+    """Return advice to append to an error's text, beginning with a semicolon; "" if there is none for this error.
 
     `kind` is the name of the exception's class.
     """

@@ -16,7 +16,7 @@ from protocol.similar import did_you_mean
 
 
 def check_sessions(folder: Path, config: Config) -> Iterator[Diagnostic]:
-    """Mistakes in how participants find each other, and a remark on the page for those who find no other."""
+    """Yield mistakes in how participants find each other, and a remark on the page for those who find no other."""
     if not config.project.has_sessions or not config.game_steps:
         return
     try:

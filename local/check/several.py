@@ -42,7 +42,7 @@ class Reporting(Protocol):
 
 
 class GameOfSeveral:
-    """A game of several players: `load`, `play`, `close`."""
+    """A game of several players that `make check` plays: `load` it, `play` it, `close` it."""
 
     def __init__(
         self, adapter: JointAdapter, players: Sequence[Player], config: TrialSection, folder: Path, progress: Reporting
@@ -154,7 +154,10 @@ class GameOfSeveral:
         return actions
 
     def _replaced(self) -> str | None:
-        """The player whom the substitute replaces at this step: none at first, then each human in turn."""
+        """The player whose human is replaced by the substitute at this step; None if no human is.
+
+        Every `STAYS` steps comes the next one: nobody, then each human in turn, then nobody again.
+        """
         names = (None, *self._substitutes)
         return names[self._progress.steps // STAYS % len(names)]
 

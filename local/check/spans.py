@@ -28,7 +28,7 @@ SCRIPT = Marks(
 
 JINJA = (VALUE, BLOCK, NOTE)
 MARK = "\ue000"
-"""Stands in the place of what Jinja fills in."""
+"""A private character that takes the place of each Jinja expression, whose value is not known."""
 
 
 class Span(NamedTuple):
@@ -41,7 +41,7 @@ class Span(NamedTuple):
 
 
 def spans(text: str, *kinds: Marks) -> Iterator[Span]:
-    """The spans of these kinds, from left to right. No span begins inside of another or at an unclosed mark."""
+    """Yield the spans of these kinds, from left to right. No span begins inside of another or at an unclosed mark."""
     at = 0
     following = {kind: kind.opening.search(text) for kind in kinds}
     while True:
@@ -62,7 +62,7 @@ def spans(text: str, *kinds: Marks) -> Iterator[Span]:
 
 
 def replace(text: str, by: Callable[[str], str], *kinds: Marks) -> str:
-    """The text in which each span of these kinds is replaced: `by` gets the span and returns its replacement."""
+    """Return the text with each span of these kinds replaced by what `by` returns for the text of the span."""
     parts, at = [], 0
     for span in spans(text, *kinds):
         parts += [text[at : span.start], by(text[span.start : span.end])]
@@ -71,5 +71,5 @@ def replace(text: str, by: Callable[[str], str], *kinds: Marks) -> str:
 
 
 def lines(text: str) -> str:
-    """The ends of lines of the text alone. As its replacement, they keep the numbers of later lines."""
+    """Return only the line ends of a text. If they take the text's place, later lines keep their numbers."""
     return "\n" * text.count("\n")

@@ -24,7 +24,7 @@ _SWALLOWS = ("script", "style", "textarea", "title", "select")
 
 
 def check_structure(label: str, source: str) -> list[Diagnostic]:
-    """The page's mistakes and remarks, in no order."""
+    """Return the page's mistakes and remarks, in no order."""
     found = [*_scripts(label, source)]
     text = spans.replace(source, spans.lines, spans.RAW)
     text = spans.replace(text, lambda value: spans.MARK + spans.lines(value), spans.VALUE, spans.NOTE)
@@ -138,7 +138,7 @@ class _Reader(PageParser):
     # Diagnostics
 
     def radios(self) -> Iterator[Diagnostic]:
-        """Mistakes: radio buttons without a value, and questions that share a name."""
+        """Yield mistakes: radio buttons without a value, and questions that share a name."""
         for name, radios in self._radios.items():
             shown = printable(name, 40)
             for radio in radios:
@@ -179,7 +179,7 @@ class _Reader(PageParser):
         return None
 
     def open_tags(self) -> Iterator[Diagnostic]:
-        """Mistakes and remarks: tags that are never closed, and end tags that close nothing."""
+        """Yield mistakes and remarks: tags that are never closed, and end tags that close nothing."""
         for tag, line in [*self._left, *self._open]:
             swallows = tag in _SWALLOWS
             rest = ", so the rest of the page is not shown" if swallows else ""

@@ -36,7 +36,7 @@ class Tags(PageParser):
         self._styling = False
 
     def read(self, source: str) -> list[Diagnostic]:
-        """The problems of a page's tags. Values with Jinja expressions are not checked."""
+        """Return the problems of a page's tags. Values with Jinja expressions are not checked."""
         self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
         self.close()
         return self._found

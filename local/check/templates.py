@@ -29,7 +29,7 @@ VALUES = (
 def check_template(
     label: str, source: str, config: Config | None, groups: list[int | None], earlier: EarlierAnswers
 ) -> Iterator[Diagnostic]:
-    """Problems in parsing the page, and in showing it to participants who have answered the pages before it."""
+    """Yield the problems of the page: in parsing it, and in showing it to participants with different answers."""
     page = fragments.prepare(source)
     if not sandbox.uses_jinja(page.text):
         return

@@ -1,12 +1,12 @@
-"""Texts of others as parts of messages."""
+"""Shortens texts that others wrote, such as an error of the agent, so that messages can quote them."""
 
 from __future__ import annotations
 
 from hippodrome.config.diagnostics import printable
 
-LIMIT = 300  # characters of a text of others
+LIMIT = 300  # characters of a quoted text
 
 
 def short(text: str) -> str:
-    """The text on one line, cut after LIMIT characters, without invisible characters."""
+    """Return the text on one line, without invisible characters and cut after LIMIT characters."""
     return printable(" ".join(text.split()), LIMIT)

@@ -48,7 +48,7 @@ from local.rehearsal.study_process import (
 
 @dataclass(frozen=True)
 class Crowd:
-    """How many bots walk through the study, how many of them `at_once`, and how. Times are in seconds."""
+    """How many bots walk through the study, and how. `at_once` is how many walk at one time; times are in seconds."""
 
     bots: int
     _: KW_ONLY
@@ -59,7 +59,7 @@ class Crowd:
 
 
 async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
-    """Send the crowd through the study; return each bot's report. Cancelling ends all bots."""
+    """Send the crowd through the study, and return the bots' reports. If this is cancelled, all bots end."""
     run, width = secrets.token_hex(3), len(str(crowd.bots))
     bots = [
         Bot(link, f"bot-{run}-{number:0{width}}", Random(f"{run}{number}"), play=crowd.play, patience=crowd.patience)  # noqa: S311

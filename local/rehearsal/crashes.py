@@ -17,27 +17,32 @@ _LONGEST = 40  # lines of a traceback
 
 @dataclass
 class AgentCrash:
-    """An error of agent.py: its place and text (`agent.py:30: ValueError: …`), its traceback, how often it happened."""
+    """An error of agent.py: its place and text (`agent.py:30: ValueError: …`), its traceback, and how often it
+    happened.
+    """
 
     text: str
     traceback: str
     count: int = 0
 
     def words(self) -> str:
-        """The crash in a line."""
+        """Return the error and how often it happened, as one line."""
         times = "once" if self.count == 1 else f"{self.count} times"
         return f"agent.py failed {times}: {self.text}"
 
 
 class ServerLogs:
-    """The servers' logs of a study, from now on."""
+    """The servers' logs of a study. Only what is logged after this object is made counts."""
 
     def __init__(self, data: Path) -> None:
         self._folder = logs_of(data)
         self._sizes = {log: log.stat().st_size for log in self._logs()}
 
     def crashes(self, names: Mapping[str, str] | None = None) -> list[AgentCrash]:
-        """Each error of agent.py once, the most frequent first; in the texts, `names` are replaced by their values."""
+        """Return the errors of agent.py, each once, the most frequent first.
+
+        `names` maps texts to those that replace them in the errors.
+        """
         found: dict[str, AgentCrash] = {}
         for log in self._logs():
             try:
@@ -55,7 +60,7 @@ class ServerLogs:
 
 
 def read(lines: Iterable[str]) -> Iterator[AgentCrash]:
-    """The errors in a server's log, one for each time that agent.py failed."""
+    """Yield the errors in a server's log, one for each time that agent.py failed."""
     last: AgentCrash | None = None
     traceback: list[str] | None = None  # the lines so far of the traceback that is being read
     for line in [*lines, "0000-00-00 00:00:00 INFO the end"]:

@@ -18,7 +18,10 @@ from protocol.keys import membership_key
 
 
 def verify(data: Path, project_id: str, reports: Sequence[BotReport], *, recorded: bool = True) -> Verification:
-    """Compare the data folder with the bots' reports. `recorded`: the project keeps recordings."""
+    """Compare the data folder with the bots' reports, and return what was found and what is missing.
+
+    `recorded`: whether the project keeps recordings.
+    """
     return verification.verify(
         data, project_id, reports, recorded=recorded, last_error=partial(_last_error, data, project_id)
     )
@@ -33,14 +36,14 @@ def _last_error(data: Path, project_id: str, user_id: str) -> str:
 
 
 class FunctionLog:
-    """The log of a study's functions, from now on."""
+    """The log of a study's functions. Only what is logged after this object is made counts."""
 
     def __init__(self, data: Path) -> None:
         self._log = logs_of(data) / "functions.log"
         self._size = self._log.stat().st_size if self._log.is_file() else 0
 
     def warnings(self) -> list[str]:
-        """New warnings and errors, a line each, as often as they were logged."""
+        """Return the warnings and errors that are new, a line each, as often as they were logged."""
         found = []
         try:
             lines = self._log.read_bytes()[self._size :].splitlines()

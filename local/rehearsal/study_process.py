@@ -28,10 +28,10 @@ from protocol.session import is_session_id
 
 ROOT = Path(__file__).resolve().parents[2]
 TRIED = "data-try"  # the project's folder with the data of its rehearsals
-START_SECONDS = 60.0  # in which the study must have started
+START_SECONDS = 60.0  # the study must start within so many seconds
 PATIENCE = 30  # seconds: the longest `patience` in the copy of a study
-GONE_SECONDS = 45.0  # after the last bot, in which the servers must have ended
-END_SECONDS = 30.0  # in which local mode must have ended
+GONE_SECONDS = 45.0  # after the last bot has ended, the servers must end within so many seconds
+END_SECONDS = 30.0  # local mode must end within so many seconds
 
 _LINK = re.compile(r"http://127\.0\.0\.1:\d+/next\S*")
 
@@ -56,9 +56,9 @@ class Process(Protocol):
 
 
 class StudyProcess:
-    """`python -m local` in a process of its own. `link` is the study's link once it has started.
+    """Runs a study by `python -m local` in a process of its own. `link` is the study's link once the study has started.
 
-    The study ends after this process, too, however this one ends.
+    If this process ends in whatever way, the study ends, too.
     """
 
     def __init__(self, folder: Path, data: Path, *, log: Path | None = None) -> None:
@@ -73,7 +73,7 @@ class StudyProcess:
         return self._process.pid
 
     def start(self, seconds: float = START_SECONDS) -> None:
-        """Start it and wait for its link. Raises StudyNotStarted."""
+        """Start the study and wait for its link. Raises StudyNotStarted after `seconds`, or if the study ends."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with self.log.open("ab") as log:
             begin = log.tell()
@@ -95,7 +95,7 @@ class StudyProcess:
                 return
             if ended or time.monotonic() > until:
                 self.kill()
-                raise StudyNotStarted(text.strip() or "it printed nothing")
+                raise StudyNotStarted(text.strip() or "local mode printed nothing")
             time.sleep(0.05)
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
@@ -104,7 +104,7 @@ class StudyProcess:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)  # noqa: S603 - our own command
 
     def interrupt(self, seconds: float = END_SECONDS) -> bool:
-        """End it as Ctrl-C does; return False if it had to be killed after `seconds`."""
+        """End the study as Ctrl-C does; return False if it had to be killed after `seconds`."""
         process = self._process
         if process is None:
             return True
@@ -118,13 +118,13 @@ class StudyProcess:
         return True
 
     def kill(self) -> None:
-        """Send SIGKILL, and wait for its end. Its servers go on."""
+        """Send SIGKILL to local mode, and wait for its end. Its servers go on."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
 
     def clear(self) -> int:
-        """Kill it and all its servers; return how many servers there were."""
+        """Kill local mode and all its servers; return how many servers there were."""
         self.kill()
         left = servers_of(self.data)
         for process in left:
@@ -135,9 +135,9 @@ class StudyProcess:
 
 
 def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
-    """The server processes of a data folder, found by their environment; with `users`, only those of these owners.
+    """Return the server processes of a data folder, which are found by their environment.
 
-    An owner is a participant's id or a session's.
+    With `users`, return only those whose owner is one of these: a participant's id, or a session's.
     """
     store = str(data.resolve())
     found = []
@@ -161,7 +161,10 @@ def _owner(variables: Mapping[str, str], data: Path) -> str | None:
 
 
 def copy_of(project: Path, folder: Path) -> list[str]:
-    """Make a copy of the project, of links, in which bots can end the game; return what was changed, in words."""
+    """Copy the project to `folder`, by links, and change the copy so that bots can end the game.
+
+    Returns what was changed, in words.
+    """
     folder.mkdir(parents=True)
     source = read_source(project)
     config = source.layout.config
@@ -212,18 +215,18 @@ def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> Non
 
 
 def logs_of(data: Path) -> Path:
-    """The folder with the logs of the functions and servers of a study with this data folder."""
+    """Return the folder with the logs of the functions and servers of a study with this data folder."""
     return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
 
 
 def sessions_of(data: Path, project_id: str, users: Collection[str]) -> set[str]:
-    """The ids of the sessions in which these participants play with others."""
+    """Return the ids of the sessions in which these participants play with others."""
     keys = (membership_key(project_id, user_id) for user_id in users)
     return {str(membership["session"]) for key in keys if (membership := document(data / key)).get("session")}
 
 
 def sessions_not_open(data: Path, project_id: str) -> set[str]:
-    """The ids of the sessions that have a server, without those that the lobby lists as open.
+    """Return the ids of the sessions that have a server, except those that the lobby lists as open.
 
     The servers of open sessions were started ahead, and wait for participants who may still come.
     """
@@ -233,7 +236,10 @@ def sessions_not_open(data: Path, project_id: str) -> set[str]:
 
 
 def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
-    """The labels of the servers whose records are not closed; with `users`, only those of these owners."""
+    """Return the labels of the servers whose records are not closed.
+
+    With `users`, return only those whose owner is one of these: a participant's id, or a session's.
+    """
     records = ((path.stem, document(path)) for path in sorted((data / "_servers").glob("*.json")))
     return [
         name
@@ -248,10 +254,10 @@ class Leftovers:
 
     processes: int = 0
     records: list[str] = field(default_factory=list)
-    local_mode_killed: bool = False  # it did not end by itself
+    local_mode_killed: bool = False  # because it did not end by itself
 
     def words(self) -> list[str]:
-        """A line for each thing that is left over."""
+        """Return lines that say what is left over; none if nothing is."""
         lines = [f"the record of server {name} is not closed" for name in self.records]
         if self.processes:
             lines.append(f"{self.processes} server process(es) were left over")

@@ -22,9 +22,10 @@ TLS_NAMES = frozenset({"study.localhost", "api.localhost"})
 def refusal(
     method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = (), *, scheme: str = "http"
 ) -> str | None:
-    """The sentence with which a request is refused; None if it is answered. Names of headers are in lower case.
+    """Return the sentence with which a request is refused; None if it is answered.
 
-    `origins` are other origins whose pages are answered too, such as `http://localhost:3000`.
+    The names in `headers` are in lower case. `origins` are other origins whose pages are answered too, such as
+    `http://localhost:3000`.
     """
     host = headers.get("host", "")
     if _name(host) not in (NAMES | TLS_NAMES if scheme == "https" else NAMES):
@@ -46,7 +47,7 @@ def refusal(
 
 
 def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: Collection[str]) -> dict[str, str]:
-    """The headers that are sent with a response, made from those of the function (`sent`).
+    """Return the headers to send with a response. `sent` are those that the function has returned.
 
     On AWS any origin may read responses, since only participants have their links. Here a study's id suffices, so only
     `origins` get the CORS headers. Pages of this server may send each other a referrer: without that, browsers send
@@ -67,7 +68,7 @@ def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: 
 
 
 def origin_of(address: str) -> str | None:
-    """The origin that an address names, as browsers write it; None if the text names no origin."""
+    """Return the origin that an address names, as browsers write it; None if the text names no origin."""
     try:
         parts = urlsplit(address)
         port = f":{parts.port}" if parts.port else ""

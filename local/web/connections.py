@@ -8,14 +8,17 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-HEADER_SECONDS = 10.0  # from the connection or the last answer until the headers of a request have come
-REQUEST_SECONDS = 60.0  # from then until its body has come and its answer is sent
+HEADER_SECONDS = 10.0  # from the connection, or the last response, until the headers of a request have come
+REQUEST_SECONDS = 60.0  # from the headers of a request until its body has come and its response is sent
 MAX_CONNECTIONS = 512  # connections at once
-SHARE = 4  # at most one in so many of the files that this process may open is a connection
+SHARE = 4  # of the files that this process may open, at most one in so many is a connection
 
 
 def most() -> int:
-    """The most connections at once. It is computed anew each time: the limit of open files may change."""
+    """Return how many connections there may be at once.
+
+    It is computed anew each time, because the limit of open files may change.
+    """
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return MAX_CONNECTIONS if soft == resource.RLIM_INFINITY else max(1, min(MAX_CONNECTIONS, soft // SHARE))
 
@@ -23,8 +26,8 @@ def most() -> int:
 class HttpConnection(H11Protocol):
     """uvicorn's connection, which is closed when its client is too slow.
 
-    If there are more connections than `most`, the oldest that waits for a request is closed; if all are being answered,
-    the newest.
+    If there are more connections than `most`, the one that has waited longest for a request is closed. If all of them
+    are being answered, the newest is closed.
     """
 
     _timer: asyncio.TimerHandle | None = None

@@ -34,7 +34,7 @@ class Route(NamedTuple):
     function: str
 
     def match(self, method: str, path: str) -> dict[str, str] | None:
-        """The path parameters of a request for this route; None if it is for another route."""
+        """Return the path parameters of a request for this route; None if it is for another route."""
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.path))
         found = re.fullmatch(pattern, path) if method in self.methods else None
         return found.groupdict() if found else None
@@ -58,7 +58,7 @@ class GatewayResponse(NamedTuple):
 
 
 def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:
-    """The event of payload format 2.0 for this request."""
+    """Return the event of payload format 2.0 for this request."""
     headers: dict[str, str] = {}
     cookies: list[str] = []
     for raw_name, raw_value in scope["headers"]:
@@ -114,7 +114,10 @@ def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, s
 
 
 def answer_of(result: Any) -> GatewayResponse:
-    """The response that API Gateway makes of a function's result. Raises an exception where API Gateway sends a 500."""
+    """Return the response that API Gateway makes of a function's result.
+
+    Raises an exception where API Gateway would send a 500.
+    """
     if not isinstance(result, dict) or "statusCode" not in result:
         return json_answer(200, result)
     body = result.get("body") or ""
@@ -142,5 +145,5 @@ def _text(body: bytes, content_type: str) -> str | None:
 
 
 def json_answer(status: int, data: Any) -> GatewayResponse:
-    """A response with JSON."""
+    """Return a response with JSON."""
     return GatewayResponse(status, [(b"content-type", b"application/json")], json.dumps(data).encode())

@@ -27,7 +27,10 @@ Find = Callable[[str], int | None]
 
 
 class Names:
-    """Listens in a thread of its own. `find` returns the port of the server with a name; None if there is none."""
+    """Leads TLS connections to the servers of their names, in a thread of its own.
+
+    `find` returns the port of the server with a name; None if there is none.
+    """
 
     def __init__(self, listener: socket.socket, authority: Authority, find: Find) -> None:
         self.port: int = listener.getsockname()[1]

@@ -29,7 +29,7 @@ class NoPort(Exception):
 
 
 def listen(port: int) -> socket.socket:
-    """A listening socket that only this machine can reach: at this port or the next free one; 0: any port.
+    """Return a listening socket that only this machine can reach, at this port or the next free one. 0 means any port.
 
     Raises `NoPort`.
     """
@@ -115,7 +115,7 @@ class WebServer:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """End, after the requests that are being answered, but at most two seconds later. Close the port."""
+        """End the server and close its port. Requests that are being answered get two seconds to end."""
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(4)
