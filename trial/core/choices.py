@@ -190,9 +190,15 @@ class Choices:
         self.policies.take_place(replace(self._players[player], plays=plays))
 
     def ask(self, player: str, steps: int, now: float) -> AskPolicy | None:
-        """Return a question to the policy that has replaced a human; None if its player is not to act now."""
+        """Return a question to the policy that has replaced a human; None if its player is not to act now.
+
+        None also if the human has already chosen in this turn: the choice stands, and a recording has no place for an
+        observation that no action follows.
+        """
         view = self._view
-        return self.policies.ask(player, view, steps, now) if view is not None and player in view.to_act else None
+        if view is None or player not in view.to_act or (self.turns is not None and not self.turns.waits_for(player)):
+            return None
+        return self.policies.ask(player, view, steps, now)
 
     # ---- turn by turn
 

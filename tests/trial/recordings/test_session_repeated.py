@@ -15,6 +15,7 @@ from protocol.session import Member
 from testing.exploration import examples
 from tests.trial import repeated
 from tests.trial.repeated import repeat
+from trial.core.effects import ResetPolicy
 from trial.core.flow_control import Window
 from trial.core.unfinished import RecordedTrial
 from trial.settings import TrialSettings
@@ -83,6 +84,16 @@ def test_a_sessions_game_can_be_repeated_from_its_recording_alone_also_on_two_se
     repeat(folder, first.settings.trial, first.head, first.lines)
     second = Game(folder, section, earlier=first.lines).plays(after)
     repeat(folder, first.settings.trial, first.head, first.lines + second.lines)
+
+
+def test_a_policy_is_not_asked_in_a_turn_for_which_the_participant_has_chosen_before_they_left(tmp_path: Path) -> None:
+    chooses = ("says", ("P2", {"action": "up", "held": True}))
+    game = Game(tmp_path, {"pace": "turns", "turnSeconds": 3, "policySeconds": 2})
+    game.plays([("tick", 5), chooses, ("goes", "P2"), ("tick", 10)])
+    assert [type(effect) for effect in game.waiting["it"]] == [ResetPolicy]
+    game.plays([("tick", 30), *[("answers", "it"), ("tick", 30)] * 3])
+    assert [part["by"] for part in (line["players"]["it"] for line in game.steps)][:3] == ["human", None, "policy"]
+    repeat(tmp_path, game.settings.trial, game.head, game.lines)
 
 
 def test_a_policy_that_played_for_a_participant_is_repeated_too(tmp_path: Path) -> None:
