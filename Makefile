@@ -107,13 +107,13 @@ test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 quick: $(VENV)/dev ## run the tests of the pure core and the services, in less than a minute
 	@$(PYTEST) $(QUICK)
 
-# With SEED=0 the examples differ each time; pytest prints the seed that repeats a failure.
+# With SEED=0 the examples differ each time; hypothesis prints the line that repeats a failure.
 TIMES ?= 10
 SEED ?= 0
 WITHIN ?=
 .PHONY: hunt
 hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them, WITHIN= ends it)
-	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) $(PYTEST) -rs $(if $(filter-out 0,$(SEED)),--hypothesis-seed=$(SEED))
+	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) HUNT_SEED=$(SEED) $(PYTEST) -rs
 
 .PHONY: mutants
 mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the quick tests notice? (SEED=, MODULES=, JOBS=2)

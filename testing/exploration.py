@@ -5,7 +5,7 @@ the same verdict within minutes. `make hunt` sets the environment variable HUNT,
 
 * tests with the mark `hunt`, which `make test` leaves out,
 * tests with the mark `explores`, which then take all their cases instead of a sample (`sample`),
-* hypothesis tests, with HUNT times as many examples, different ones each time (`--hypothesis-seed` repeats them).
+* hypothesis tests, with HUNT times as many examples, different ones each time; the same ones with HUNT_SEED.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ import random
 from collections.abc import Iterable
 from typing import TypeVar
 
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, core, settings
 from hypothesis.internal.conjecture import providers
 
 T = TypeVar("T")
 
 TIMES = int(os.environ.get("HUNT") or 0)
 """The factor by which `make hunt` multiplies the examples of a property; 0 in `make test`."""
+
+SEED = int(os.environ.get("HUNT_SEED") or 0)
+"""The number that decides which examples `make hunt` runs; 0: others each time."""
 
 SECONDS = float(os.environ.get("HUNT_SECONDS") or "inf")
 """The seconds after which `make hunt` begins no new test, and reports the remaining tests as skipped."""
@@ -52,8 +55,9 @@ def sample(cases: Iterable[T], share: int, seed: int = 0) -> list[T]:
 def load_profile() -> None:
     """Make one profile of hypothesis the default of all tests.
 
-    In `make test` examples hold no constants from our modules: hypothesis 6.170 takes constants from the modules that
-    the process has loaded, so the tests that a worker has run before would decide which examples it runs.
+    In `make test`, and with HUNT_SEED, examples hold no constants from our modules: hypothesis 6.170 takes constants from
+    the modules that the process has loaded, so the tests that a worker has run before would decide which examples it
+    runs.
 
     The profile has no deadline, because a slow machine is no fault of the code; no database, because an example that
     failed once belongs in a test; and no health checks, because they measure time, too, and because no example changes
@@ -69,5 +73,7 @@ def load_profile() -> None:
         suppress_health_check=list(HealthCheck),
     )
     settings.load_profile("hippodrome")
-    if not TIMES:
+    if SEED:
+        core.__dict__["global_force_seed"] = SEED  # as the option `--hypothesis-seed` does
+    if SEED or not TIMES:
         providers._get_local_constants = lambda: providers._local_constants  # loaded modules add nothing to these
