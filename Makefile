@@ -151,7 +151,7 @@ NEWEST := 14
 REQUIREMENTS := requirements
 endif
 WHEELS := --only-binary ale-py,cryptography,h5py,isal,numpy,pillow,pyarrow,pydantic-core
-INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check
+INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c $(REQUIREMENTS)/constraints.txt
 # Pip has printed what is missing (a wheel, the network); this sentence says on which machines it works.
 NOT_INSTALLED = || { echo 'Not everything could be installed: see above. There are packages for Linux (x86-64 and ARM) and macOS, with' \
 	'Python 3.11 to 3.$(NEWEST) on this machine ($(MACHINE)). With the right Python: rm -r $(VENV); make PYTHON=python3.$(NEWEST)'; exit 1; }
@@ -169,7 +169,7 @@ $(VENV)/requirements/%.txt: requirements/%.txt requirements/intel-mac.txt | $(VE
 	@awk 'NR == FNR { if ($$0 !~ /^#/) { split($$0, pin, "=="); older[pin[1]] = $$0 } next } \
 		{ split($$0, pin, "=="); if (pin[1] in older) print older[pin[1]]; else print $$0 }' requirements/intel-mac.txt $< > $@
 
-$(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas) | $(VENV)/bin/python
+$(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas constraints) | $(VENV)/bin/python
 	@echo 'Installing what a study needs (once; a minute or two) …'
 	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/local.txt $(NOT_INSTALLED)
 	@touch $@
