@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from protocol import values
 from protocol.similar import did_you_mean
@@ -124,21 +124,6 @@ def idle_action(value: object) -> str | dict[str, str]:
             for name, item in value.items()
         }
     return values.action_name(value)
-
-
-class NamesPolicies(Protocol):
-    """The keys of a section `trial` that name policies."""
-
-    @property
-    def players(self) -> Mapping[str, Any]: ...
-
-    @property
-    def substitute(self) -> str | None: ...
-
-
-def files_of(trial: NamesPolicies) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the policies' files that a section `trial` names, each after its path of keys."""
-    yield from files({"players": trial.players, "substitute": trial.substitute})
 
 
 def files(named: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:

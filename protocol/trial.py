@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from protocol import key_maps, values
 from protocol import players as player_checks
 from protocol import trial_keys as keyed
-from protocol.trial_sections import SceneSection, Ui, default_ui
+from protocol.trial_sections import SceneSection, Ui
 from protocol.values import Keys, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
@@ -81,28 +81,23 @@ class TrialSection:
         0,
         "Seconds of play after which an episode is truncated; the page shows the time left. 0 is no limit.",
     )
-    keys: dict[str, Any] = field(
-        default_factory=dict,
-        metadata=keyed.about(
-            values.section("ArrowLeft: left"),
-            "The action of each key of the keyboard, by KeyboardEvent.key, with + between keys that are held together; "
-            "or such a map for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
-            {
-                "type": "object",
-                "additionalProperties": {
-                    "anyOf": [
-                        {"type": ["string", "integer"]},
-                        {"type": "object", "additionalProperties": {"type": ["string", "integer"]}},
-                    ]
-                },
+    keys: dict[str, Any] = keyed.key(
+        values.section("ArrowLeft: left"),
+        {},
+        "The action of each key of the keyboard, by KeyboardEvent.key, with + between keys that are held together; "
+        "or such a map for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
+        {
+            "type": "object",
+            "additionalProperties": {
+                "anyOf": [
+                    {"type": ["string", "integer"]},
+                    {"type": "object", "additionalProperties": {"type": ["string", "integer"]}},
+                ]
             },
-            entries=key_maps.actions_of_keys,
-        ),
+        },
+        entries=key_maps.actions_of_keys,
     )
-    labels: dict[str, str] = field(
-        default_factory=dict,
-        metadata=keyed.texts("left: Go left", "Texts of the buttons, by action.", key_maps.labels),
-    )
+    labels: dict[str, str] = keyed.texts("left: Go left", "Texts of the buttons, by action.", key_maps.labels)
     input: str = keyed.choice(
         ("held", "single"),
         "Whether an action goes on while its keys are held, or each press of a key is one action.",
@@ -130,14 +125,12 @@ class TrialSection:
     min_frame_rate: int = _rate(1, "Lowest rate, in frames per second.")
     max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
     starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
-    ui: Ui = field(
-        default_factory=default_ui,
-        metadata=keyed.about(
-            values.section("bad: …"),
-            "Controls on the game page. Default: left, right, up, down, start, pause.",
-            {"$ref": "#/$defs/Ui"},
-            section=Ui,
-        ),
+    ui: Ui = keyed.key(
+        values.section("bad: …"),
+        Ui(left=True, right=True, up=True, down=True, start=True, pause=True),
+        "Controls on the game page. Default: left, right, up, down, start, pause.",
+        {"$ref": "#/$defs/Ui"},
+        section=Ui,
     )
     record_observations: bool = keyed.flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = keyed.flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
@@ -151,29 +144,25 @@ class TrialSection:
         "What programs with the server's token may do at its path /gym: nothing, watch each step, also advise, or "
         "make environments of their own.",
     )
-    scene: SceneSection | None = field(
-        default=None,
-        metadata=keyed.about(
-            values.section("width: 600"),
-            "With this section the game is drawn by the objects that render() returns, without it by frames.",
-            {"$ref": "#/$defs/SceneSection"},
-            section=SceneSection,
-        ),
+    scene: SceneSection | None = keyed.key(
+        values.section("width: 600"),
+        None,
+        "With this section the game is drawn by the objects that render() returns, without it by frames.",
+        {"$ref": "#/$defs/SceneSection"},
+        section=SceneSection,
     )
-    players: dict[str, Any] = field(
-        default_factory=dict,
-        metadata=keyed.about(
-            player_checks.players,
-            "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
-            "gym://name. If groups differ, one such map for each group, by its number. Default: human, in an "
-            "environment with one player.",
-            {
-                "type": "object",
-                "additionalProperties": {
-                    "anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]
-                },
+    players: dict[str, Any] = keyed.key(
+        player_checks.players,
+        {},
+        "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
+        "gym://name. If groups differ, one such map for each group, by its number. Default: human, in an "
+        "environment with one player.",
+        {
+            "type": "object",
+            "additionalProperties": {
+                "anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]
             },
-        ),
+        },
     )
     frame_skip: int = keyed.whole(1, 1000, 1, "In real time, the steps from one choice of a policy to its next.")
     policy_seconds: float = keyed.seconds(
@@ -213,13 +202,10 @@ class TrialSection:
         "milliseconds; 0 is no limit.",
     )
     ping_samples: int = keyed.whole(1, 100, 5, "Round trips that are measured before the game; their median counts.")
-    player_names: dict[str, str] = field(
-        default_factory=dict,
-        metadata=keyed.texts(
-            "red: The red one",
-            "Names of players that participants who play together read, instead of the environment's names.",
-            key_maps.player_names,
-        ),
+    player_names: dict[str, str] = keyed.texts(
+        "red: The red one",
+        "Names of players that participants who play together read, instead of the environment's names.",
+        key_maps.player_names,
     )
     seed: int | None = keyed.whole(
         0,
@@ -240,22 +226,15 @@ class TrialSection:
         ("idle", "random", "episode"),
         "What happens when turnSeconds are over: the idle action, a random possible one, or the episode ends.",
     )
-    idle_action: str | dict[str, str] | None = field(
-        default=None,
-        metadata=keyed.about(
-            player_checks.idle_action,
-            "Name of the action that is taken without a key, or one for each player. Default: noop if there is such "
-            "an action, otherwise the first action.",
-            {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
-        ),
+    idle_action: str | dict[str, str] | None = keyed.key(
+        player_checks.idle_action,
+        None,
+        "Name of the action that is taken without a key, or one for each player. Default: noop if there is such "
+        "an action, otherwise the first action.",
+        {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
     )
-    options: dict[str, Any] = field(
-        default_factory=dict,
-        metadata=keyed.about(
-            values.options,
-            "A map of your own keys for the agent; at most 4 KB.",
-            {"type": "object"},
-        ),
+    options: dict[str, Any] = keyed.key(
+        values.options, {}, "A map of your own keys for the agent; at most 4 KB.", {"type": "object"}
     )
 
     @property
@@ -331,6 +310,10 @@ class TrialSection:
     def named_players(self) -> tuple[str, ...]:
         """Return the players that `players` names in any group, each once."""
         return tuple(dict.fromkeys(name for _, players in self.player_maps() for name in players))
+
+    def policy_files(self) -> Iterator[tuple[tuple[str, ...], str]]:
+        """Yield the policies' files that `players` and `substitute` name, each after its path of keys."""
+        yield from player_checks.files({"players": self.players, "substitute": self.substitute})
 
     def document(self) -> dict[str, Any]:
         """Return the section as JSON, with every default filled in. `trial_check.check` accepts it unchanged."""

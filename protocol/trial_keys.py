@@ -22,7 +22,7 @@ class Key:
     attribute: str
     check: Check
     default: Any
-    """The value if the file does not have the key; None if this value is a section or a map."""
+    """The value if the file does not have the key; None for an empty map."""
     meaning: str
     schema: Mapping[str, Any]
     """JSON Schema of the value, for editors."""
@@ -35,14 +35,12 @@ class Key:
     the problems (`protocol/key_maps.py`)."""
 
 
-def about(check: Check, meaning: str, schema: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """Return the metadata of a field that declares a key; `more` are further attributes of `Key`."""
-    return {"check": check, "meaning": meaning, "schema": schema, **more}
-
-
 def key(check: Check, default: Any, meaning: str, schema: Mapping[str, Any], **more: Any) -> Any:
-    """Declare a key whose default is no section and no map."""
-    return field(default=default, metadata=about(check, meaning, schema, **more))
+    """Declare a key. `more` are further attributes of `Key`. With the default {} each section gets a map of its own."""
+    metadata = {"check": check, "meaning": meaning, "schema": schema, **more}
+    if default == {}:
+        return field(default_factory=dict, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def flag(default: bool, meaning: str) -> Any:
@@ -66,12 +64,10 @@ def choice(words: tuple[str, ...], meaning: str) -> Any:
     return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
 
 
-def texts(
-    example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]]
-) -> dict[str, Any]:
-    """Return the metadata of a key that maps names, which the project chooses, to texts."""
+def texts(example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]]) -> Any:
+    """Declare a key that maps names, which the project chooses, to texts."""
     schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
-    return about(values.section(example), meaning, schema, entries=entries)
+    return key(values.section(example), {}, meaning, schema, entries=entries)
 
 
 def document(section: Any) -> dict[str, Any]:

@@ -85,8 +85,3 @@ class SceneSection:
     assets: str = keyed.key(
         _folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"}
     )
-
-
-def default_ui() -> Ui:
-    """Return the controls that the game page shows if `trial` has no section `ui`."""
-    return Ui(left=True, right=True, up=True, down=True, start=True, pause=True)

@@ -99,7 +99,7 @@ def missing_for_players(folder: Path, config: Config) -> list[Diagnostic]:
 def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str, str]]:
     """The path and the name of each policy's file or game that needs a package, and the package's line for
     requirements.txt."""
-    for path, file in players.files_of(config.trial):
+    for path, file in config.trial.policy_files():
         yield ("trial", *path), file, players.ONNXRUNTIME
     game = config.trial.game or ""
     package = game.partition(".")[0]

@@ -98,7 +98,7 @@ def read_project(folder: Path) -> Config:
 
 def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
     """A mistake for each policy's file in `trial.players` and `trial.substitute` that does not exist."""
-    for path, file in players.files_of(checked.trial):
+    for path, file in checked.trial.policy_files():
         if not (layout.agent_folder / file).is_file():
             hint = players.files_there(layout.agent_folder)
             yield Mistake(("trial", *path), f"there is no file {file} beside agent.py{hint}")
