@@ -45,17 +45,10 @@ def items(item: str, limit: int, single: bool = False) -> BeforeValidator:
     return BeforeValidator(values.items(item, limit, single))
 
 
-_ODD_NAMES = {"use_aws": "useAWS"}
-
-
 class Model(BaseModel):
     """A section of the file. A key without a value counts as not given."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        alias_generator=lambda name: _ODD_NAMES.get(name) or to_camel(name),
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", alias_generator=to_camel)
 
     @classmethod
     def names(cls) -> frozenset[str]:

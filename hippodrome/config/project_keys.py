@@ -265,7 +265,7 @@ class ProjectKeys(Model):
     """Whether participants can take part now."""
     max_runtime: Annotated[int, whole(1, 1440)] = 60
     """Minutes after which a server is stopped, whatever happens."""
-    use_aws: _Flag = False
+    use_aws: _Flag = Field(default=False, alias="useAWS")
     """Whether the study runs on AWS; false keeps it on one machine. Default: on AWS as soon as it is deployed."""
     aws_setup: AwsSetupKeys = AwsSetupKeys()
     """The size of the servers, and their place on AWS; needed for AWS."""
@@ -295,7 +295,7 @@ class ProjectKeys(Model):
     ] = ()
     """Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients."""
     allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", MAX_HOSTS)] = ()
-    """https:// origins from which step pages may load images, media and frames."""
+    """https:// origins from which step pages may load images, media, frames and scripts."""
     max_participants: Annotated[int, whole(1, 100_000)] | None = None
     """The largest number of participants. Later ones are told that the study is full. Default: no limit."""
     max_servers: Annotated[int, whole(1, 10_000)] | None = None
