@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -52,8 +53,7 @@ def _missing(checked: Checked) -> Iterator[Mistake]:
         yield Mistake(("project", "id"), "missing; give the project an id of letters, digits, dashes and underscores")
     if not checked.step_keys and checked.valid(STEPS):
         yield Mistake(STEPS, 'missing; list the pages in order, such as "1: consent"')
-    has_game = any(type_of(page).on_server for page in project.steps.values())
-    if has_game and not checked.trial.game and checked.valid(("trial", "game")):
+    if checked.game_steps and not checked.trial.game and checked.valid(("trial", "game")):
         yield Mistake(("trial", "game"), "missing; a project with a game step needs the name of its environment")
 
 
@@ -63,7 +63,7 @@ def _hours(checked: Checked) -> Iterator[Mistake]:
     if not checked.valid(path, ("project", "maxRuntime")) or project.max_server_hours is None:
         return
     if project.max_server_hours * 60 < project.max_runtime:
-        needed = -(-project.max_runtime // 60)
+        needed = math.ceil(project.max_runtime / 60)
         yield Mistake(path, f"must be at least {needed}, since one server may run {project.max_runtime} minutes")
 
 
@@ -96,10 +96,8 @@ def _plain_clients(checked: Checked) -> Iterator[Mistake]:
 
 def _starts_nothing(checked: Checked) -> bool:
     """Whether it is certain that no step starts a server."""
-    project = checked.root.project
     known = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
-    on_server = any(type_of(page).on_server for page in project.steps.values())
-    return known and not on_server and project.events.start_server_step is None
+    return known and not checked.game_steps and checked.root.project.events.start_server_step is None
 
 
 _AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the installation are used
@@ -150,9 +148,8 @@ def _environment_size(checked: Checked) -> Iterator[Mistake]:
     if not checked.valid(("trial",), STEPS):
         return
     project, trial = checked.root.project, checked.trial.registered()
-    games = ",".join(key for key, page in project.steps.items() if type_of(page).on_server)
     pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
-    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), games, pages))
+    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), ",".join(checked.game_steps), pages))
     if length > _ECS_LIMIT:
         key = max(("actionSpace", "options", "keys", "labels", "game"), key=lambda name: len(_json(trial[name])))
         message = (

@@ -18,6 +18,7 @@ from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, 
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
+from hippodrome.model.step_types import type_of
 from protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
 from protocol.trial_check import check as check_trial
 from protocol.trial_keys import names
@@ -38,6 +39,11 @@ class Checked:
     trial: TrialSection = field(default_factory=TrialSection)
     mistakes: list[Mistake] = field(default_factory=list)
     invalid: list[Keys] = field(default_factory=list)
+
+    @property
+    def game_steps(self) -> list[str]:
+        """The keys of the game steps."""
+        return [key for key, page in self.root.project.steps.items() if type_of(page).on_server]
 
     def valid(self, *paths: Keys) -> bool:
         """Return whether no mistake is at one of these paths, below it or above it."""

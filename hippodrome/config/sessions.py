@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Keys, Mistake, Remark
 from hippodrome.config.each_value import Checked
-from hippodrome.model.step_types import type_of
 from protocol.players import HUMAN, by_group
 from protocol.trial import SESSION_KEYS, TrialSection
 from protocol.values import printable
@@ -64,8 +63,7 @@ def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
 def _humans(checked: Checked) -> Iterator[Mistake]:
     """In each group, the number of human players must be `project.players`."""
     wanted, trial = checked.root.project.players, checked.trial
-    has_game = any(type_of(page).on_server for page in checked.root.project.steps.values())
-    if not checked.valid(WHO_PLAYS) or not has_game:
+    if not checked.valid(WHO_PLAYS) or not checked.game_steps:
         return
     if not trial.players:
         example = ", ".join(f"player_{index}: {HUMAN}" for index in range(min(wanted, 2)))

@@ -6,7 +6,7 @@ from hippodrome.config.diagnostics import Keys, path_text
 from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
-from protocol.similar import nearest
+from protocol.similar import SIMILAR, nearest
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How similar an unknown key must be to a known one to be most likely a typing error: for a key of the same section,
@@ -32,12 +32,10 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
     if home is not None:
         place = f"under {path_text(home)}" if home else "at the top of the file, not indented"
         return f"unknown key; it belongs {place} (check the indentation)", [(*home, key)]
-    for home in (section, *_ELSEWHERE):
-        similar = nearest(key, sorted(NAMES[home]))
-        if similar:
-            meant = (*home, similar)
-            question = f"did you mean {similar if home == section else path_text(meant)}?"
-            return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
+    meant = _similar(path, SIMILAR, SIMILAR)
+    if meant is not None:
+        question = f"did you mean {meant[-1] if meant[:-1] == section else path_text(meant)}?"
+        return f"unknown key; {question}" + (f" If not, {own}" if own else ""), [meant]
     names_here = sorted(NAMES[section])
     which = f"the keys here are {', '.join(names_here)}" if len(names_here) <= 5 else "docs/config.md lists all keys"
     return f"unknown key; {which}" + (f"; {own}" if own else ""), []
@@ -50,12 +48,18 @@ def meant_for(path: Keys) -> Keys | None:
     """
     section, key = path[:-1], str(path[-1])
     home = _home(key, section)
-    if home is not None:
-        return (*home, key)
-    for home in (section, *_ELSEWHERE):
-        similar = nearest(key, sorted(NAMES[home]), _LIKELY if home == section else _LIKELY_ELSEWHERE)
-        if similar:
-            return (*home, similar)
+    return _similar(path, _LIKELY, _LIKELY_ELSEWHERE) if home is None else (*home, key)
+
+
+def _similar(path: Keys, here: float, elsewhere: float) -> Keys | None:
+    """The path of the known key that is most similar to an unknown one; None if no known key is similar enough.
+
+    `here` is how similar a key of the same section must be, and `elsewhere` a key of another section.
+    """
+    for section in (path[:-1], *_ELSEWHERE):
+        found = nearest(str(path[-1]), sorted(NAMES[section]), here if section == path[:-1] else elsewhere)
+        if found:
+            return (*section, found)
     return None
 
 
