@@ -14,7 +14,7 @@ import json
 from dataclasses import dataclass
 
 from protocol.keys import NAME, SERVER_NAME
-from protocol.session import is_session_id
+from protocol.session import is_group, is_session_id
 
 SCHEMA = 1
 
@@ -54,6 +54,6 @@ def parse(body: bytes) -> Handover:
         raise BadHandover("its document names no participant")
     if not (isinstance(server, str) and SERVER_NAME.fullmatch(server)):
         raise BadHandover("its document names no server")
-    if group is not None and (isinstance(group, bool) or not isinstance(group, int) or group < 0):
+    if not is_group(group):
         raise BadHandover("its document has a group that is no number")
     return Handover(user_id, group, server)

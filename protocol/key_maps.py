@@ -24,10 +24,12 @@ def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], 
     """
     if not value or not all(isinstance(each, dict) for each in value.values()):
         return _one_players_keys(value, path)
-    read = {str(player): _one_players_keys(each, (*path, player)) for player, each in value.items()}
-    return {player: found for player, (found, _) in read.items()}, [
-        problem for _, problems in read.values() for problem in problems
-    ]
+    found: dict[str, Any] = {}
+    problems: list[SectionProblem] = []
+    for player, keys in value.items():
+        found[str(player)], wrong = _one_players_keys(keys, (*path, player))
+        problems += wrong
+    return found, problems
 
 
 def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:

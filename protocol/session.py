@@ -130,9 +130,14 @@ def _member(found: Any) -> Member:
 
 
 def _group(value: Any) -> int | None:
-    if value is not None and not (_is_number(value) and value >= 0):
+    if not is_group(value):
         raise BadSession("its document has a group that is no number")
     return value
+
+
+def is_group(value: object) -> TypeGuard[int | None]:
+    """Return whether this is the number of a group, or None for a study without groups."""
+    return value is None or (_is_number(value) and value >= 0)
 
 
 def _is_number(value: Any) -> TypeGuard[int]:

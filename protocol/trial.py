@@ -256,7 +256,7 @@ class TrialSection:
 
     def keys_of(self, player: str) -> Mapping[str, str]:
         """Return the actions of a player's keys by combination (`protocol.keyboard`); {} for the default keys."""
-        return dict(self.key_maps()).get((player,) if self.keys_differ else (), {})
+        return self.keys.get(player, {}) if self.keys_differ else self.keys
 
     def labels_of(self, player: str) -> Mapping[str, str]:
         """Return the texts of a player's buttons, by action.

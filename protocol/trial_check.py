@@ -77,7 +77,7 @@ def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...],
     """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
     found: list[str] = []
     problems: list[SectionProblem] = []
-    for name in section.keys() - names(Ui):
+    for name in [name for name in section if name not in names(Ui)]:
         here = (*path, name)
         shown, wrong = (False, []) if section[name] in (None, "") else checked(values.flag, section[name], here)
         if shown and name in RESERVED_CONTROLS:
@@ -88,11 +88,9 @@ def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...],
             found.append(name)
         problems += wrong
     if len(found) > MAX_OWN_CONTROLS:
-        problems.append(
-            SectionProblem(path, f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}")
-        )
-    order = list(section)
-    return tuple(sorted(found, key=order.index)), sorted(problems, key=lambda problem: len(problem.path))
+        sentence = f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"
+        problems.insert(0, SectionProblem(path, sentence))
+    return tuple(found), problems
 
 
 def _items(check_item: Check, items: list[object], path: Keys) -> tuple[tuple[Any, ...], list[SectionProblem]]:
