@@ -22,7 +22,7 @@ from hippodrome.model.project import (
     write_list,
 )
 from hippodrome.model.records import from_data
-from hippodrome.ports import Conflict, Platform
+from hippodrome.ports import Conflict, Document, Platform
 from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage import uploaded_pages
 from hippodrome.storage.project_cache import ProjectCache
@@ -61,8 +61,7 @@ def _enter(platform: Platform, project: Project) -> Project:
     keys = SecretCache(platform.documents)
     keys.get_or_create()  # the installation's secret must exist before anything is written that needs it
     for _ in range(TRIES):
-        found = platform.documents.get(MASTER_LIST)
-        listed = _master_list(found.body) if found else MasterList()
+        found, listed = _master_list(platform)
         before = listed.find(project.id)
         if before and before.has_sessions and not project.has_sessions:
             raise NotRegistered([ALONE.format(players=before.players)])
@@ -93,8 +92,7 @@ def migrate_secrets(platform: Platform) -> int:
     """
     keys = SecretCache(platform.documents)
     for _ in range(TRIES):
-        found = platform.documents.get(MASTER_LIST)
-        listed = _master_list(found.body) if found else MasterList()
+        found, listed = _master_list(platform)
         known = listed.secrets()
         if found is None or not known:
             return 0
@@ -108,10 +106,16 @@ def migrate_secrets(platform: Platform) -> int:
     raise NotRegistered(["too many registrations at this moment; please try again"])
 
 
-def _master_list(body: bytes) -> MasterList:
-    """Read the master list. Raises `NotRegistered` if it cannot be read, so that it is not overwritten."""
+def _master_list(platform: Platform) -> tuple[Document | None, MasterList]:
+    """Return the document of the master list, and the list in it; None and an empty list if there is no document.
+
+    Raises `NotRegistered` if the document cannot be read, so that it is not overwritten.
+    """
+    found = platform.documents.get(MASTER_LIST)
+    if found is None:
+        return None, MasterList()
     try:
-        return read_list(body)
+        return found, read_list(found.body)
     except (ValueError, RecursionError) as error:
         failure("the list of projects cannot be read", error)
         text = f"{MASTER_LIST} cannot be read; the bucket keeps older versions: put the last good one in its place"
@@ -198,8 +202,8 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
     """
     settings = platform.settings
     try:
-        found = platform.documents.get(MASTER_LIST)
-        before = _master_list(found.body).find(hippo_registration.project_id(event) or "") if found else None
+        _, listed = _master_list(platform)
+        before = listed.find(hippo_registration.project_id(event) or "")
         earlier = msgspec.to_builtins(before) if before else {}
         registration, remarks = hippo_registration.registration_of(event, earlier)
         remarks += hippo_registration.lower_runtime(registration, settings.max_runtime)
@@ -216,7 +220,7 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
 
 
 def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
-    """Handle one call of the function; return `{"registered": id, "live": …}` or `{"problems": […]}`.
+    """Handle one call of the function; return `{"registered": id, "live": …, "steps": n}` or `{"problems": […]}`.
 
     * `{"project": …}` registers the project.
     * `{"links": {"projectId": …, "userIds": […]}}` gets `{"signatures": […]}` of signed links instead, so that

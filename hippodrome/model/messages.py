@@ -111,9 +111,9 @@ class TaskChanged(NamedTuple):
     name: str  # startedBy
     status: str  # lastStatus; STOPPING if it is to stop and its container may still run, as after Spot's warning
     interface: str | None  # the id of its network interface
-    stop_code: str | None
-    stopped_reason: str
-    exit_code: int | None
+    stop_code: str | None = None
+    stopped_reason: str = ""
+    exit_code: int | None = None
     container_reason: str = ""
     looked: int = 0  # how often its address was looked up before
 
@@ -161,7 +161,7 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
     """Read an ECS event or a `TaskSeen`; None if the body is neither, or if the task is not a server's."""
     if seen := _read(body, TaskSeen):
         running = TaskChanged(
-            seen.task, seen.cluster, seen.name, "RUNNING", seen.interface, None, "", None, "", seen.looked
+            seen.task, seen.cluster, seen.name, status="RUNNING", interface=seen.interface, looked=seen.looked
         )
         return running if ids.parse_server_name(seen.name) else None
     try:

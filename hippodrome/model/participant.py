@@ -147,4 +147,4 @@ def reached_without_post(project: Project, step: Step) -> bool:
     The trial stores the answer to a game step, so no POST has published the messages of the step after it.
     """
     at = project.index(step.key)
-    return bool(at) and project.steps[(at or 0) - 1].type.on_server
+    return project.steps[at - 1].type.on_server if at else False

@@ -60,7 +60,10 @@ REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which the next
 
 
 class PastAttempt(Record, frozen=True):
-    """An earlier attempt, kept in the record of the present one; `deploy cost` counts it."""
+    """An earlier attempt, kept in the record of the present one; `deploy cost` counts it.
+
+    Its fields are fields of `Server`.
+    """
 
     attempt: int
     requested: datetime
@@ -168,7 +171,7 @@ class Server(Record, frozen=True):
     @property
     def has_default_name(self) -> bool:
         """Whether its DNS name begins with its own name, not with a participant's id."""
-        return self.dns.partition(".")[0] == self.name
+        return ids.host_server(self.dns) == self.name
 
     @property
     def domain(self) -> str:
@@ -250,20 +253,7 @@ def new_attempt(
 
 def past_attempt(server: Server) -> PastAttempt:
     """Return what the record of the next attempt keeps of this attempt."""
-    return PastAttempt(
-        attempt=server.attempt,
-        requested=server.requested,
-        running=server.running,
-        closed=server.closed,
-        cpu=server.cpu,
-        memory=server.memory,
-        spot=server.spot,
-        reason=server.reason,
-        cause=server.cause,
-        warm_server_name=server.warm_server_name,
-        nonce=server.nonce,
-        game_steps=server.game_steps,
-    )
+    return PastAttempt(**{name: getattr(server, name) for name in PastAttempt.__struct_fields__})
 
 
 def next_attempt(closed: Server) -> int | None:
@@ -345,7 +335,7 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
 def with_default_name(server: Server) -> Server:
     """Return the record with the default DNS name, because the zone refuses the present name."""
-    return msgspec.structs.replace(server, dns=f"{server.name}.{server.dns.partition('.')[2]}")
+    return msgspec.structs.replace(server, dns=f"{server.name}.{server.domain}")
 
 
 def ready(server: Server, now: datetime) -> Server:

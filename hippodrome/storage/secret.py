@@ -119,12 +119,14 @@ class SecretCache:
 
         Raises `Conflict` after `TRIES` conflicts.
         """
-        for _ in range(TRIES if found else 0):
+        if not found:
+            return
+        for _ in range(TRIES):
             self.get_or_create()
             document = self._documents.get(KEY)
-            before = from_json(document.body, Secret) if document else None
-            if document is None or before is None:
+            if document is None:
                 continue
+            before = from_json(document.body, Secret)
             after = msgspec.structs.replace(before, projects={**before.projects, **found})
             with contextlib.suppress(Conflict):
                 if after != before:
@@ -132,8 +134,7 @@ class SecretCache:
                 with self._lock:
                     self._cached = after
                 return
-        if found:
-            raise Conflict(KEY)
+        raise Conflict(KEY)
 
     def _invalidate(self) -> None:
         with self._lock:
