@@ -6,6 +6,7 @@ configuration of HIPPO has. So the sites that its pages load from are allowed.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -48,13 +49,13 @@ class _Addresses(PageParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         for name, value in attrs:
-            if name in _LOADED.get(tag, ()):
-                self._note(value or "", anywhere=name == "srcset")
-
-    def _note(self, value: str, anywhere: bool) -> None:
-        starts = _ORIGIN.findall(value) if anywhere else [found[0] for found in [_ORIGIN.match(value.strip())] if found]
-        for start in starts:
-            try:
-                self.origins.append(origin(start.removesuffix(":443")))
-            except ValueError:
+            if name not in _LOADED.get(tag, ()):
                 continue
+            if name == "srcset":  # it has several addresses
+                starts = _ORIGIN.findall(value or "")
+            else:
+                first = _ORIGIN.match((value or "").strip())
+                starts = [first[0]] if first else []
+            for start in starts:
+                with contextlib.suppress(ValueError):
+                    self.origins.append(origin(start.removesuffix(":443")))

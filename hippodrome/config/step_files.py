@@ -62,8 +62,11 @@ class StepFolder:
     def _pages(self) -> list[str]:
         """The names of all pages for config.yml: without `.html`, and without the number of a group."""
         stems = [name.removesuffix(".html") for name in self.names if name.endswith(".html")]
-        versions = {stem: found[1] for stem in stems if (found := _VERSION.fullmatch(stem))}
-        return [page if f"{page}-0" in stems else stem for stem in stems for page in [versions.get(stem, stem)]]
+        pages = []
+        for stem in stems:
+            version = _VERSION.fullmatch(stem)
+            pages.append(version[1] if version and f"{version[1]}-0" in stems else stem)
+        return pages
 
     def _read(self, name: str) -> Path:
         """The file, after a check that it is text in UTF-8 of at most LIMIT_BYTES. Raises StepFileError."""
