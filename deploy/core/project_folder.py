@@ -13,9 +13,9 @@ import msgspec
 from console.problem import Problem
 from deploy.aws.account import Installation
 from hippodrome.config import Config, ConfigErrors, Diagnostic, layout, read_project
-from hippodrome.config.diagnostics import Keys
 from hippodrome.config.folder import read_source
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
+from protocol.values import Keys
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from hippodrome.config import Config, Diagnostic, hippo_requirements, layout
-from hippodrome.config.diagnostics import Keys, printable
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT, REQUIREMENTS
 from protocol import players
+from protocol.values import Keys, printable
 
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_IMAGE = ("trial", "protocol", "pip")  # Hippodrome's packages in the image, and that of Python's base image

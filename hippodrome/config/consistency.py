@@ -9,13 +9,14 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from hippodrome.config import fargate, sessions, texts
-from hippodrome.config.diagnostics import Keys, Mistake
+from hippodrome.config.diagnostics import Mistake
 from hippodrome.config.each_value import Checked, check_values
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import step_name, step_range
 from hippodrome.model.step_order import FINAL, default_start, position, visited
 from hippodrome.model.step_types import type_of
 from protocol.environment import PLAIN_ORIGINS
+from protocol.values import Keys
 
 
 def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:

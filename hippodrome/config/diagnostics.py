@@ -6,9 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from protocol.values import Keys, path_text, printable
-
-__all__ = ["ConfigErrors", "Diagnostic", "Keys", "Mistake", "Remark", "in_order", "path_text", "printable"]
+from protocol.values import Keys
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from hippodrome.config.diagnostics import Keys, Mistake
+from hippodrome.config.diagnostics import Mistake
 from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, Root
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
@@ -23,7 +23,7 @@ from protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
 from protocol.trial_check import check as check_trial
 from protocol.trial_keys import names
 from protocol.trial_sections import Ui
-from protocol.values import show
+from protocol.values import Keys, show
 
 _EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
 _ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding them takes time

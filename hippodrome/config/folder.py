@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from hippodrome.config import hippo_pages, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Keys, Mistake, in_order, path_text
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
 from hippodrome.config.each_value import Checked
 from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
 from hippodrome.config.layout import Layout, find
@@ -21,6 +21,7 @@ from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
 from protocol import players
 from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
+from protocol.values import Keys, path_text
 
 if TYPE_CHECKING:
     from hippodrome.config.yaml_file import ParsedFile

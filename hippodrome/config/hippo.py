@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hippodrome.config.diagnostics import Keys, Remark, path_text
+from hippodrome.config.diagnostics import Remark
 from hippodrome.config.project_keys import MAX_STEPS, NAMES, STEPS
 from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from hippodrome.model.step_order import FINAL
 from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
-from protocol.values import Plain, flag, number_in, show
+from protocol.values import Keys, Plain, flag, number_in, path_text, show
 
 CLOSING_PAGE = "hippodrome-the-end"
 """The last page of a study without pages (`step_files.CLOSING`)."""

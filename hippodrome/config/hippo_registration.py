@@ -6,13 +6,12 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from hippodrome.config.diagnostics import path_text
 from hippodrome.config.hippo import adapt
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
 from hippodrome.model.step_order import ordered
-from protocol.values import number_in, show
+from protocol.values import number_in, path_text, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script does not know these keys, so a registration by it keeps their earlier values

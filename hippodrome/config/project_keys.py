@@ -13,7 +13,6 @@ from typing import Annotated
 from pydantic import Field
 
 from hippodrome.config import fargate
-from hippodrome.config.diagnostics import Keys
 from hippodrome.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.model import ids, step_types
 from hippodrome.model.matching import MATCHED_BY, MATCHINGS, SEATS
@@ -25,7 +24,7 @@ from protocol.similar import did_you_mean
 from protocol.trial import TrialSection
 from protocol.trial_keys import names
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import Plain, as_text, number_in, show, step_file
+from protocol.values import Keys, Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
 MAX_HOSTS = 50

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from hippodrome.config import project_keys, sessions
 from hippodrome.config.config import Config, StepFiles
 from hippodrome.config.consistency import check
-from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order, path_text
+from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
 from hippodrome.config.each_value import message_of
 from hippodrome.config.key_types import Model, Rule, whole
 from hippodrome.config.project_keys import STEPS
@@ -19,6 +19,7 @@ from hippodrome.model.project import STEPS_FOLDER, number_of_groups
 from hippodrome.model.step_order import FINAL, ordered, visited
 from hippodrome.model.step_types import type_of
 from hippodrome.ports import PORTS
+from protocol.values import path_text
 
 MESSAGE = "message"  # stands in the place of a file name in the mistakes of a registration
 LIMIT_VARIANTS = 1000

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from hippodrome.config import sessions, texts
 from hippodrome.config.config import Config
-from hippodrome.config.diagnostics import Diagnostic, Keys, Remark
+from hippodrome.config.diagnostics import Diagnostic, Remark
 from hippodrome.config.folder import ConfigSource, read_source
 from hippodrome.config.hippo import SSL_NO_EFFECT
 from hippodrome.config.project_keys import STEPS
 from protocol import keyboard
-from protocol.values import printable
+from protocol.values import Keys, printable
 
 START: Keys = ("project", "events", "startServerStep")
 

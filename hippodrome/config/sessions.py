@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 
 from hippodrome.config.config import Config
-from hippodrome.config.diagnostics import Keys, Mistake, Remark
+from hippodrome.config.diagnostics import Mistake, Remark
 from hippodrome.config.each_value import Checked
 from protocol.players import HUMAN, by_group
 from protocol.trial import SESSION_KEYS, TrialSection
-from protocol.values import printable
+from protocol.values import Keys, printable
 
 PLAYERS: Keys = ("project", "players")
 MATCHING: Keys = ("project", "matching")

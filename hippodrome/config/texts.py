@@ -6,12 +6,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 
 from hippodrome.config.config import Config
-from hippodrome.config.diagnostics import Keys, Mistake, Remark
+from hippodrome.config.diagnostics import Mistake, Remark
 from hippodrome.config.each_value import Checked
 from hippodrome.config.english import is_not_english, words_of
 from hippodrome.config.project_keys import TEXTS
 from hippodrome.model.texts import ENGLISH, LANGUAGE, is_language, places, texts_of
-from protocol.values import show
+from protocol.values import Keys, show
 
 _BRACES = re.compile(r"\{[^{}]*\}")
 _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from hippodrome.config.diagnostics import Keys, path_text
 from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
 from protocol.similar import SIMILAR, nearest
+from protocol.values import Keys, path_text
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How similar an unknown key must be to a known one to be most likely a typing error: for a key of the same section,

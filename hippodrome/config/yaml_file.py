@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import yaml
 
-from hippodrome.config.diagnostics import Keys, Mistake, printable
-from protocol.values import Plain
+from hippodrome.config.diagnostics import Mistake
+from protocol.values import Keys, Plain, printable
 
 LIMIT_BYTES = 256 * 1024
 LIMIT_DEPTH = 16

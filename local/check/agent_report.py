@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, Diagnostic, agent_imports, layout, remarks
-from hippodrome.config.diagnostics import Keys, printable
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
 from local.check.agent_file import label_of, line_of
@@ -20,6 +19,7 @@ from local.check.remedies import remedy
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.players import HUMAN
+from protocol.values import Keys, printable
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace

@@ -8,7 +8,6 @@ from pathlib import Path
 from jinja2 import meta
 
 from hippodrome.config import Config, Diagnostic
-from hippodrome.config.diagnostics import printable
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import fragments, sandbox
 from hippodrome.participants.page_parser import PageParser
@@ -17,6 +16,7 @@ from local.check.earlier_answers import EarlierAnswers, source_of
 from local.check.structure import check_structure
 from local.check.tags import Tags
 from local.check.templates import check_template
+from protocol.values import printable
 
 
 def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from hippodrome.config import Diagnostic
-from hippodrome.config.diagnostics import printable
 from hippodrome.participants.page_parser import PageParser
 from local.check import spans
+from protocol.values import printable
 
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
 _STEP = "\ue001"  # stands for {% … %}

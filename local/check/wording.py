@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hippodrome.config.diagnostics import printable
+from protocol.values import printable
 
 LIMIT = 300  # characters of a quoted text
 
