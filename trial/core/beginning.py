@@ -35,7 +35,7 @@ class Beginning:
         self._message_log = message_log
         self._new_seed = new_seed
         self._emit = emit
-        self._seed = 0  # of the episode
+        self._seed = 0  # the seed of the present episode
         self.unfinished: UnfinishedEpisode | None = None
         """The next episode if an earlier server has begun it; else None."""
         self.begun_again: int | None = None
@@ -63,7 +63,7 @@ class Beginning:
             default = {name: player.idle for name, player in progress.players.items()}
             return ReplayCall(limit=self._settings.start_seconds, unfinished=unfinished, default_actions=default)
         if unfinished is not None:
-            self.repeat_feedback(unfinished, ns)
+            self._message_log.repeat(unfinished.unheard, ns)
         return self._reset(progress, participants)
 
     def begin_again(self, progress: TrialProgress, participants: Participants) -> Call:
@@ -95,7 +95,3 @@ class Beginning:
         self._timing.resume_episode(steps / progress.frame_rate)
         progress.replayed(steps, unfinished.scores or {progress.first: unfinished.score})
         progress.choices.policies.resume(unfinished.last_actions, unfinished.failures)
-
-    def repeat_feedback(self, unfinished: UnfinishedEpisode, ns: int) -> None:
-        """Put feedback that the earlier server's agent did not hear before all other feedback. `ns` as in `opened`."""
-        self._message_log.repeat(unfinished.unheard, ns)

@@ -205,8 +205,9 @@ class Choices:
     def policies_choose(self, now: float) -> None:
         """Take the choices of all policies that have answered, or whose time is over."""
         turns = self.turns
+        assert turns is not None
         for name in self._waiting():
-            if turns is not None and name in self.policies:
+            if name in self.policies:
                 action = self.policies.choice(name, self._mask(name), now)
                 if action is not None:
                     turns.choose(name, action)
@@ -217,10 +218,9 @@ class Choices:
         A program's advice counts first; without advice, `turnEnds` decides.
         """
         turns = self.turns
-        for name in self._waiting():
+        assert turns is not None
+        for name in self.waits_for:
             player, mask = self._players[name], self._mask(name)
-            if turns is None or name in self.policies:
-                continue
             advice = self._advice.get(name)
             if advice is not None and is_legal(advice, mask):
                 turns.choose(name, Action(advice, player.action_space[advice], "advice"))
@@ -235,16 +235,14 @@ class Choices:
         return False
 
     def _waiting(self) -> tuple[str, ...]:
+        """Return the players for whom the turn waits; none in real time."""
         turns = self.turns
         return () if turns is None else tuple(name for name in self._players if turns.waits_for(name))
 
     @property
     def waits_for(self) -> tuple[str, ...]:
         """The players of the humans for whom the turn waits; none in real time."""
-        turns, policies = self.turns, self.policies
-        if turns is None:
-            return ()
-        return tuple(name for name in self._players if turns.waits_for(name) and name not in policies)
+        return tuple(name for name in self._waiting() if name not in self.policies)
 
     def policies_until(self) -> float | None:
         """Return when the first policy for which the turn waits runs out of time; None if it waits for none."""

@@ -41,10 +41,11 @@ class Clients:
         """`assets` describe the images of a game that is drawn by objects."""
         self._timing = timing
         self._emit = emit
-        self._scene = _scene_of(config, assets)
+        self._scene = _scene_fields(config, assets)
         self._timed = config.pace == "turns" or bool(config.reset_freeze or config.episode_seconds)
         """Whether the message with the state holds times also while the game is on."""
-        self._by_human: dict[str, Client] = {}
+        self.by_human: dict[str, Client] = {}
+        """The connected clients, by human."""
         self.pictures: Pictures | None = None
         """The pictures that clients show now; None before the first ones."""
         self.frame_id = 0
@@ -52,28 +53,28 @@ class Clients:
 
     def add(self, human: str, connection: Hashable, window: Window, player: str) -> Client:
         """Add a client of the human who plays this player. The human's earlier client must have been removed."""
-        client = self._by_human[human] = Client(connection, window, player)
+        client = self.by_human[human] = Client(connection, window, player)
         return client
 
     def replace(self, human: str) -> Client | None:
         """Close, remove and return the client of a human who opens another one; None if the human has none."""
-        client = self._by_human.pop(human, None)
+        client = self.by_human.pop(human, None)
         if client is not None:
             self._emit(Close(client.connection, 4409, messages.error(REPLACED)))
         return client
 
     def remove(self, connection: Hashable) -> Client | None:
         """Remove a connection that is closed, and return its client; None if another has replaced it."""
-        human = next((human for human, each in self._by_human.items() if each.connection == connection), None)
-        return None if human is None else self._by_human.pop(human)
+        human = next((human for human, each in self.by_human.items() if each.connection == connection), None)
+        return None if human is None else self.by_human.pop(human)
 
     def of(self, connection: Hashable) -> Client | None:
         """Return the client with this connection; None if another has replaced it."""
-        return next((each for each in self._by_human.values() if each.connection == connection), None)
+        return next((each for each in self.by_human.values() if each.connection == connection), None)
 
     def stalled(self, now: float) -> list[Client]:
         """Return the clients that have stopped acknowledging frames."""
-        return [client for client in self._by_human.values() if client.window.stalled(now)]
+        return [client for client in self.by_human.values() if client.window.stalled(now)]
 
     def send(self, client: Client, text: str) -> None:
         """Send a message to one client."""
@@ -81,12 +82,12 @@ class Clients:
 
     def send_all(self, text: str) -> None:
         """Send a message to all clients."""
-        for client in self._by_human.values():
+        for client in self.by_human.values():
             self.send(client, text)
 
     def say_each(self, words_for: Callable[[str], str | None]) -> None:
         """Send each client the sentence that `words_for` returns for its player. None: send nothing."""
-        for client in self._by_human.values():
+        for client in self.by_human.values():
             words = words_for(client.player)
             if words is not None:
                 self.send(client, messages.error(words))
@@ -94,12 +95,12 @@ class Clients:
     def send_controls(self, client: Client, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send a client the message with everything about the game and its controls (`messages.controls`)."""
         times = self._timing.state_times(progress, now, participants.session_fields(now))
-        self.send(client, _controls_of(progress, client.player, times, self._scene))
+        self.send(client, _controls_text(progress, client.player, times, self._scene))
 
     def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send each client the state of its trial, if one of the values in it has changed."""
         progress.session_version = participants.session_version()
-        for client in self._by_human.values():
+        for client in self.by_human.values():
             player = client.player
             state = state_of(progress, player)
             if client.sent == state:
@@ -114,7 +115,7 @@ class Clients:
                 progress.scores[player],
                 progress.frame_rate,
                 episode_score=progress.episode_scores[player],
-                **(_of_state(progress, player, times) if times is not None else {}),
+                **(_state_arguments(progress, player, times) if times is not None else {}),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
 
@@ -122,7 +123,7 @@ class Clients:
         """Send each client its new picture, under a new frame id."""
         self.pictures = pictures
         self.frame_id = (self.frame_id + 1) & 0xFFFFFFFF
-        for client in self._by_human.values():
+        for client in self.by_human.values():
             self.show_again(client)
 
     def show_again(self, client: Client) -> None:
@@ -130,10 +131,6 @@ class Clients:
         picture = self.pictures.get(client.player) if isinstance(self.pictures, dict) else self.pictures
         if picture is not None:
             self._emit(SendPicture(client.connection, picture, self.frame_id))
-
-    def by_human(self) -> list[tuple[str, Client]]:
-        """Return all connected clients, each with its human."""
-        return list(self._by_human.items())
 
     def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
         """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for the member."""
@@ -147,14 +144,14 @@ def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
     return progress.state, progress.episode, score, progress.frame_rate, frozen, members, to_act
 
 
-def _of_state(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
+def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
     """Return the arguments of `messages.state` that say the times, the player's turn and the session."""
-    turn = _turn_of(progress, player, times.turn_ends_in)
+    turn = _turn_arguments(progress, player, times.turn_ends_in)
     arguments = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
     return arguments if times.session is None else {**arguments, "session": {**times.session, "you": player}}
 
 
-def _turn_of(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
+def _turn_arguments(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
     """Return the arguments of `messages.state` that say the player's turn; none in real time."""
     if progress.turns is None:
         return {}
@@ -162,8 +159,8 @@ def _turn_of(progress: TrialProgress, player: str, ends_in: float | None) -> dic
     return {"to_act": to_act, "turn_ends_in": ends_in if to_act else None}
 
 
-def _controls_of(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
-    """Build the message about the game and its controls for this player's client. `scene` is from `_scene_of`."""
+def _controls_text(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
+    """Build the message about the game and its controls for this player's client. `scene` is from `_scene_fields`."""
     config, action_space = progress.config, progress.players[player].action_space
     return messages.controls(
         ui=config.ui.shown(),
@@ -182,12 +179,12 @@ def _controls_of(progress: TrialProgress, player: str, times: StateTimes, scene:
         player=player,
         players=tuple(progress.players),
         scene=scene,
-        input_of_project=_input(config, player),
-        **_of_state(progress, player, times),
+        input_of_project=_input_fields(config, player),
+        **_state_arguments(progress, player, times),
     )
 
 
-def _scene_of(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+def _scene_fields(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """Return the fields of a game that is drawn by objects; None for other games."""
     if config.scene is None:
         return None
@@ -195,7 +192,7 @@ def _scene_of(config: TrialSection, assets: Sequence[Mapping[str, Any]]) -> Mapp
     return {"scene": scene, "assets": list(assets)}
 
 
-def _input(config: TrialSection, player: str) -> dict[str, Any]:
+def _input_fields(config: TrialSection, player: str) -> dict[str, Any]:
     """Return the fields about the project's `keys`, `labels` and `input`, as far as the project has them."""
     keys, labels = config.keys_of(player), config.labels_of(player)
     fields = {"keys": dict(keys), "labels": dict(labels), "input": "single" if config.input == "single" else ""}

@@ -262,7 +262,7 @@ def controls(
             **_turn(to_act, turn_ends_in),
             **(scene or {}),
             **(input_of_project or {}),
-            **_times(starts_in, time_left),
+            **seconds(startsIn=starts_in, timeLeft=time_left),
             **(session or {}),
         }
     )
@@ -289,26 +289,26 @@ def state(
     `turn_ends_in`: the time until that turn ends. `session`: in a session, the fields about its members.
     """
     scores = _scores(score, episode_score, next_in)
-    turn, times = _turn(to_act, turn_ends_in), _times(starts_in, time_left)
+    turn, times = _turn(to_act, turn_ends_in), seconds(startsIn=starts_in, timeLeft=time_left)
     fields = {"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times}
     return json.dumps({**fields, **session} if session else fields)
 
 
-def _times(starts_in: float | None, time_left: float | None) -> dict[str, float]:
-    if starts_in is None and time_left is None:
-        return {}
-    times = {"startsIn": starts_in, "timeLeft": time_left}
-    return {name: round(seconds, 3) for name, seconds in times.items() if seconds is not None}
+def seconds(**times: float | None) -> dict[str, float]:
+    """Return the fields of a message that hold times in seconds, rounded to milliseconds, without those that are None.
+
+    An infinite time is left out, too.
+    """
+    return {name: round(time, 3) for name, time in times.items() if time is not None and time < math.inf}
 
 
 def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:
     fields: dict[str, Any] = {} if to_act is None else {"toAct": to_act}
-    return fields if ends_in is None else fields | {"turnEndsIn": round(ends_in, 3)}
+    return fields | seconds(turnEndsIn=ends_in)
 
 
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:
-    scores = {"score": tidy(score), "episodeScore": tidy(episode_score)}
-    return scores if next_in is None or math.isinf(next_in) else scores | {"nextIn": round(next_in, 3)}
+    return {"score": tidy(score), "episodeScore": tidy(episode_score), **seconds(nextIn=next_in)}
 
 
 def done(episodes: int, score: float, outcome: str | None = None) -> str:

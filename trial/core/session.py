@@ -394,8 +394,7 @@ class TrialSession:
         reads = progress.on_break and math.isinf(self._config.between_seconds)
         fields: dict[str, Any] = {"people": presence.people(self._vacant, reads=reads, plays_on=self._plays_on)}
         if not progress.over:
-            times = {"beginsIn": presence.begins_in(now), "heldFor": presence.held_for(now, reads=reads)}
-            fields |= {name: round(left, 3) for name, left in times.items() if left is not None}
+            fields |= messages.seconds(beginsIn=presence.begins_in(now), heldFor=presence.held_for(now, reads=reads))
             if progress.turns is not None and progress.playing:
                 fields["turnOf"] = list(progress.choices.waits_for)
         return fields

@@ -131,7 +131,6 @@ class Trial:
         self._participants: Participants = Alone(self.progress, trial_id)
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
-        self._closing = False
         self._have_come: set[str] = set()  # players whose participants have connected at least once
 
     @property
@@ -331,7 +330,7 @@ class Trial:
             self._recording.agent_failed(error, self.progress.episode, self.progress.steps)
             self._fail(fatal=hangs)
             if isinstance(call, ReplayCall):
-                self._beginning.repeat_feedback(call.unfinished, self._ns())
+                self._messages.repeat(call.unfinished.unheard, self._ns())
         return self.advance(now)
 
     # ---- events: policies
@@ -375,7 +374,7 @@ class Trial:
             self.phase = Phase.CLOSED
             return []
         self.phase = Phase.FINISHED
-        for human, client in self._clients.by_human():
+        for human, client in self._clients.by_human.items():
             if not self._participants.has_answered(human):
                 self._send_done(human, client)
         text = f"trial over: {self.progress.outcome} after {self.progress.episodes_played} episodes"
@@ -385,9 +384,9 @@ class Trial:
         """Let a member whose answer is stored go on to the next step, even if the others still play."""
         self._now = now
         self._participants.saved(human)
-        for each, client in self._clients.by_human():
-            if each == human and not self.finished:
-                self._send_done(human, client)
+        client = self._clients.by_human.get(human)
+        if client is not None and not self.finished:
+            self._send_done(human, client)
         return self.advance(now)
 
     # ---- events: time
@@ -401,7 +400,7 @@ class Trial:
             pass
         if self._agent.call is not None:
             self.wake_at = self._agent.give_up_at
-        elif self.phase is Phase.PLAYING and not self._closing:
+        elif self.phase is Phase.PLAYING and not self._ending.closing:
             wake_at = self._participants.wake_at(now)
             if wake_at is not None:
                 self.wake_at = wake_at if self.wake_at is None else min(wake_at, self.wake_at)
@@ -414,7 +413,7 @@ class Trial:
 
         Only a trial that is over has an answer.
         """
-        self._closing = self._commands.closed = self._ending.closing = True
+        self._commands.closed = self._ending.closing = True
         if self._agent.call is not None:
             self._agent.give_up_at = now + LAST_CALL_SECONDS
         if self.phase is Phase.STARTING:
@@ -432,14 +431,14 @@ class Trial:
         return False
 
     def _play(self) -> bool:
-        progress = self.progress
-        if not self._closing:
+        progress, closing = self.progress, self._ending.closing
+        if not closing:
             self._participants.attend(self._now, self._timing.seconds)
             if self._commands.waiting:
                 self._commands.carry_out_waiting(progress, self._participants, self._timing)
             if progress.ended:
                 return self._write_end()
-        if progress.over or self._closing:
+        if progress.over or closing:
             self.phase = Phase.SAVING
             self.ready = True
             return True
@@ -463,7 +462,7 @@ class Trial:
         self._steps.show(replayed, self.progress, self._now)
         self.ready = True
         self._emit(WriteLog(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
-        self._beginning.repeat_feedback(unfinished, self._ns())
+        self._messages.repeat(unfinished.unheard, self._ns())
 
     def _paused_by_stalled(self) -> bool:
         """Hold the game if a page has stopped answering; return whether one has."""
@@ -502,7 +501,7 @@ class Trial:
 
     def _left(self, client: Client) -> None:
         self._note("disconnected", client)
-        self._participants.go(client.player, self._now, closing=self._closing)
+        self._participants.go(client.player, self._now, closing=self._ending.closing)
         self._tell_moved("on_leave", client.player)
 
     def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
