@@ -34,6 +34,9 @@ Reply = tuple[int, bytes]
 class StoreError(OSError):
     """The store does not answer, or refuses a request. The message contains no key, address or credential."""
 
+    transient = True
+    """Whether the same request may succeed later."""
+
     def __init__(self, words: str) -> None:
         super().__init__(0, words)
 
@@ -54,23 +57,28 @@ class PresignedStore:
 
     def get(self, key: str) -> bytes | None:
         """Return the document; None if there is none. Retries transient errors for some seconds. Raises StoreError."""
-        return self._with_retries(lambda: self._get(key))
+        for pause in PAUSES:
+            try:
+                return self._get(key)
+            except StoreError as error:
+                if not error.transient:
+                    raise
+            self._pause(pause)
+        return self._get(key)
 
     def look(self, key: str) -> bytes | None:
         """Return a document that is read again and again; None if there is none. Raises StoreError.
 
         Its presigned request is used until S3 refuses it. Errors are not retried.
         """
-        earlier = self._gets.pop(key, None)
-        for request in (earlier, None) if earlier else (None,):
-            signed = request or self._signed({"method": "GET", "key": key})
-            status, body = _send(signed, None)
-            if status in (200, 404):
-                self._gets[key] = signed
-                return body if status == 200 else None
-            if request is None:
-                raise _UnexpectedStatus(status)
-        raise AssertionError
+        signed = self._gets.pop(key, None)
+        reply = None if signed is None else _send(signed, None)
+        if signed is None or reply is None or reply[0] not in (200, 404):
+            signed = self._signed({"method": "GET", "key": key})
+            reply = _send(signed, None)
+        document = _document(reply)
+        self._gets[key] = signed
+        return document
 
     def create(self, key: str, data: bytes | Path) -> bool:
         """Create a document; return False if it exists. Raises OSError.
@@ -91,12 +99,7 @@ class PresignedStore:
         return True
 
     def _get(self, key: str) -> bytes | None:
-        status, body = _send(self._signed({"method": "GET", "key": key}), None)
-        if status == 404:
-            return None
-        if status != 200:
-            raise _UnexpectedStatus(status)
-        return body
+        return _document(_send(self._signed({"method": "GET", "key": key}), None))
 
     def _signed(self, wish: Mapping[str, Any]) -> dict[str, Any]:
         """Return the presigned request for a method and a key; for a PUT also of a size in bytes. Raises StoreError."""
@@ -111,23 +114,23 @@ class PresignedStore:
         except (ValueError, KeyError, TypeError):
             raise StoreError("sign_requests gave an answer that cannot be read") from None
 
-    def _with_retries(self, attempt: Callable[[], bytes | None]) -> bytes | None:
-        for pause in PAUSES:
-            try:
-                return attempt()
-            except StoreError as error:
-                if not getattr(error, "transient", True):
-                    raise
-            self._pause(pause)
-        return attempt()
-
 
 class _UnexpectedStatus(StoreError):
-    """The answer has an unexpected status. `transient`: the same request may succeed later."""
+    """The answer has an unexpected status."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"the answer was HTTP {status}")
         self.transient = status in _TRANSIENT or status >= 500
+
+
+def _document(reply: Reply) -> bytes | None:
+    """Return the document in the answer to a GET; None if there is none. Raises StoreError."""
+    status, body = reply
+    if status == 404:
+        return None
+    if status != 200:
+        raise _UnexpectedStatus(status)
+    return body
 
 
 def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int | None = None) -> Reply:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import sys
 import threading
@@ -73,7 +74,7 @@ class Lifetime:
             self.end(verdict)
             return
         expires = self._watchdog.expires() if verdict is None else now + _LOOK_AGAIN_SECONDS
-        if expires < float("inf"):
+        if expires < math.inf:
             self._timer = self._loop.call_at(expires + 0.01, self.watch)
 
 

@@ -82,7 +82,9 @@ class Listener:
     async def renew_certificate(self) -> None:
         """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled. Without TLS, return at once."""
         certificate = self._certificate
-        while certificate is not None:
+        if certificate is None:
+            return
+        while True:
             await asyncio.sleep(RELOAD_SECONDS)
             try:
                 renewed = await asyncio.to_thread(certificate.fetch)

@@ -128,11 +128,9 @@ class TrialLoop:
         return self._places.busy or self._callbacks.busy
 
     def begin(self, agent_ready: Awaitable[StartedAgent | None]) -> asyncio.Future[None]:
-        """Begin the trial once the agent is ready.
+        """Begin the trial once the agent is ready. If `agent_ready` returns None, the agent cannot be started.
 
-        The future is done when the trial is; it fails if an error ends the trial.
-
-        If `agent_ready` returns None, the agent cannot be started.
+        The returned future is done when the trial is done. It fails if an error ends the trial.
         """
         self._starting = asyncio.create_task(self._start(agent_ready))
         self._starting.add_done_callback(self._started)
@@ -209,10 +207,16 @@ class TrialLoop:
         self._calls = self._calls_of(started, playing)
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
         self._use_callbacks(started, playing.players)
-        now = self._loop.time()
-        places, vacant, erased = playing.places, playing.vacant, playing.erased
-        start = partial(self.core.start, places=places, vacant=vacant, erased=erased, answered=answered)
-        self._apply(start(playing.players, recorded, now))
+        effects = self.core.start(
+            playing.players,
+            recorded,
+            self._loop.time(),
+            places=playing.places,
+            vacant=playing.vacant,
+            erased=playing.erased,
+            answered=answered,
+        )
+        self._apply(effects)
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
         """Return the stored answers: first, if the step is over; second, those of some members, if it is not.

@@ -244,9 +244,9 @@ class TrialServer:
         self._connections[connection] = sender
         self._lifetime.connected()
         try:
-            human = hello.user_id if self.settings.session else self.settings.user_id
-            await self._connect(trial, human or "", connection)
-            async with self._measured(trial, human or "", connection):
+            human = (hello.user_id or "") if self.settings.session else self.settings.user_id
+            await self._connect(trial, human, connection)
+            async with self._measured(trial, human, connection):
                 await self._receive(trial, connection)
         except CloseConnection as closing:
             connection.close(closing.code, messages.error(closing.words))

@@ -181,7 +181,6 @@ class Connection:
 
     async def run(self) -> None:
         """Send until the connection is closed."""
-        loop = asyncio.get_running_loop()
         timer: asyncio.TimerHandle | None = None
         try:
             while True:
@@ -192,19 +191,19 @@ class Connection:
                     text, self._state = self._state, None
                     await self.websocket.send(text)
                 if self._closing is not None:
-                    await self._end(loop, *self._closing)
+                    await self._end(*self._closing)
                     return
                 if timer is not None:
                     timer.cancel()
                 if self._wanted:
                     await self._send_part()
                     self._wake.set()
-                wait = self._wait(loop.time())
+                wait = self._wait(self._loop.time())
                 if wait > 0.0:
                     if wait < math.inf:
-                        timer = loop.call_later(wait, self._wake.set)
+                        timer = self._loop.call_later(wait, self._wake.set)
                     continue
-                await self._send_picture(loop)
+                await self._send_picture()
                 self._wake.set()
         except ConnectionClosed:
             pass
@@ -243,14 +242,14 @@ class Connection:
             self._wanted.popleft()
         await self.websocket.send(ASSET_HEADER.pack(ASSET, number, offset) + part)
 
-    async def _end(self, loop: asyncio.AbstractEventLoop, code: int, last_words: str) -> None:
+    async def _end(self, code: int, last_words: str) -> None:
         """Send the last message and close.
 
         If the trial is over, send a picture that waits first, since it shows the end.
         """
         if code == _DONE and self._picture is not None:
             try:
-                await self._send_picture(loop)
+                await self._send_picture()
             except ConnectionClosed:
                 raise
             except Exception:
@@ -258,7 +257,7 @@ class Connection:
         await self.websocket.send(last_words)
         await self.websocket.close(code)
 
-    async def _send_picture(self, loop: asyncio.AbstractEventLoop) -> None:
+    async def _send_picture(self) -> None:
         """Send the picture that waits; if none does, the next rows that make the last picture exact."""
         pack: Callable[[], bytes | str]
         if self._picture is not None:
@@ -269,7 +268,7 @@ class Connection:
             frame_id, large = self._sent
             pack, rest = partial(self._encoder.sharpen, frame_id), 1.0 / max(self.rate, _ROWS_RATE)
         data: bytes | str = await asyncio.to_thread(pack) if large else pack()
-        self._note_sent(frame_id, loop.time(), rest)
+        self._note_sent(frame_id, self._loop.time(), rest)
         await self.websocket.send(data)  # returns when the write buffer is empty
 
     def _rest(self) -> float:
