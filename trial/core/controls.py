@@ -158,7 +158,6 @@ class Controls:
             return self._combined_with(name, ())
         if not held:
             self.release(name)
-            self._tapped.clear()
             return None
         if name in self._held:
             return None

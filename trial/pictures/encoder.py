@@ -30,7 +30,6 @@ class Encoder:
 
     def __init__(self, *, lossy: bool = False) -> None:
         self.lossy = lossy
-        self._jpeg = b""
         self._begin()
 
     def forget(self) -> None:
@@ -43,7 +42,7 @@ class Encoder:
         self._exact: Frame | None = None  # the last picture that the client has without loss
         self._exact_rows = 0  # the number of rows of `_shown` that the client has without loss
         self._bytes_a_row = 0.0  # the size of such a row, as sent last
-        self._jpeg_bytes = 0  # the size of the last JPEG
+        self._jpeg = b""  # the last JPEG
         self._unmeasured = 0  # bytes of lossless frames since that JPEG
         self._jpegs_left = 0  # JPEGs to send until the lossless codings are tried again
         self._keys_first = 0  # frames for which a key frame is tried before a difference
@@ -83,8 +82,8 @@ class Encoder:
         shown = self._shown
         assert shown is not None
         first, left = self._exact_rows, len(shown) - self._exact_rows
-        count = min(max(1, int(self._jpeg_bytes / (self._bytes_a_row or shown[0].nbytes))), left)
-        while (body := frames.packed(shown[first : first + count], limit=self._jpeg_bytes)) is None and count > 1:
+        count = min(max(1, int(len(self._jpeg) / (self._bytes_a_row or shown[0].nbytes))), left)
+        while (body := frames.packed(shown[first : first + count], limit=len(self._jpeg))) is None and count > 1:
             count //= 2
         if body is None:
             body = _whole(shown[first : first + 1])
@@ -97,15 +96,15 @@ class Encoder:
         """Return a lossless coding that takes no more bytes than a JPEG. If it is None, `_jpeg` is the frame's JPEG."""
         data, measured = None, False
         trying = self.exact or self._jpegs_left == 0
-        if not self._jpeg_bytes or self._unmeasured > _MEASURE_AFTER * self._jpeg_bytes:
+        if not self._jpeg or self._unmeasured > _MEASURE_AFTER * len(self._jpeg):
             self._measure(frame)
             measured = True
         if trying:
             data = self._lossless(frame, frame_id)
         if data is None and not measured:
-            before = self._jpeg_bytes
+            before = len(self._jpeg)
             self._measure(frame)
-            if trying and self._jpeg_bytes > _GROWN * before:
+            if trying and len(self._jpeg) > _GROWN * before:
                 data = self._lossless(frame, frame_id)
         if trying and data is None:
             data = self._key_that_pays(frame, frame_id)
@@ -115,7 +114,6 @@ class Encoder:
 
     def _measure(self, frame: Frame) -> None:
         self._jpeg = frames.jpeg(frame)
-        self._jpeg_bytes = len(self._jpeg)
         self._unmeasured = 0
 
     def _lossless(self, frame: Frame, frame_id: int) -> bytes | None:
@@ -125,7 +123,7 @@ class Encoder:
             self._keys_first -= 1
             bases.reverse()
         for base in bases:
-            body = frames.packed(frame, base, self._jpeg_bytes)
+            body = frames.packed(frame, base, len(self._jpeg))
             if body is not None:
                 if base is None and bases[0] is not None:
                     self._keys_first = _RETRY_AFTER
@@ -136,8 +134,8 @@ class Encoder:
         """Return a key frame of any size if differences have been small for long: it makes them possible again."""
         if self._shown is None or self.exact:
             return None
-        body = frames.packed(frame, self._shown, self._jpeg_bytes // 2)
-        self._saved = self._saved + _RETRY_AFTER * (self._jpeg_bytes - len(body)) if body is not None else 0
+        body = frames.packed(frame, self._shown, len(self._jpeg) // 2)
+        self._saved = self._saved + _RETRY_AFTER * (len(self._jpeg) - len(body)) if body is not None else 0
         if self._saved < _SAVINGS * frame.nbytes:
             return None
         self._saved = 0

@@ -50,7 +50,7 @@ class Places:
         self._acted = acted
         self._policies: dict[str, PolicyThread | InlinePolicy] = {}
         self.described: dict[str, Mapping[str, Any]] = {}
-        """The description of each player, for the head of a recording."""
+        """The description of each player, for the header of a recording."""
 
     @property
     def busy(self) -> bool:
@@ -71,11 +71,9 @@ class Places:
         """
         for player in players:
             policy, stand_in = policies.get(player.name), stand_ins.get(player.name)
-            self.described[player.name] = _described(player, policy)
-            if stand_in is not None:
-                self.described[player.name] = {"kind": "human", "substitute": stand_in.description()}
+            self.described[player.name] = described = _described(player, policy, stand_in)
             if player.name in seats:
-                self.described[player.name] = {**self.described[player.name], "seat": seats.index(player.name)}
+                described["seat"] = seats.index(player.name)
             either = policy or stand_in
             if either is not None:
                 self._policies[player.name] = self._running(player, either)
@@ -106,7 +104,9 @@ class Places:
             policy.close()
 
 
-def _described(player: Player, policy: Policy | None) -> dict[str, Any]:
+def _described(player: Player, policy: Policy | None, stand_in: Policy | None) -> dict[str, Any]:
+    if stand_in is not None:
+        return {"kind": "human", "substitute": stand_in.description()}
     if player.human:
         return {"kind": "human"}
     if policy is None:

@@ -1,6 +1,6 @@
 // The WebSocket to the participant's server (docs/wire.md): handshake, acknowledgements, and finding out that it is dead.
 import { startDrawing } from "./drawing.js";
-import { canDecode, canInflate, decodeJpeg, HEADER, readHeader, unpack } from "./frames.js";
+import { canDecode, canInflate, decodeJpeg, readHeader, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { data } from "./page.js";
 
@@ -47,7 +47,7 @@ function receive(own, raw, hear) {
   if (typeof raw !== "string") {
     const special = hooks.kinds[new Uint8Array(raw)[0]];
     if (special) return special(raw, own.show);
-    const header = raw.byteLength >= HEADER ? readHeader(raw) : {};
+    const header = readHeader(raw);
     return own.show(header, unpack(header, raw));
   }
   if (raw === "done") return own.end("done");

@@ -1,6 +1,6 @@
 // Binary frames (docs/wire.md): the header, and the pixels or the picture that follow it.
 
-export const HEADER = 10; // bytes before the pixels
+const HEADER = 10; // bytes before the pixels
 export const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
 const PART = 2 ** 14; // bytes that are unpacked at a time; they become at most 17 MB
 const LARGEST = 2 ** 24; // pixels of a picture: 4096 x 4096; trial/pictures/frames.py sends no more
@@ -8,7 +8,9 @@ const LARGEST = 2 ** 24; // pixels of a picture: 4096 x 4096; trial/pictures/fra
 export const canInflate = typeof DecompressionStream === "function";
 export const canDecode = typeof createImageBitmap === "function";
 
+// An object without fields, which `unpack` refuses, if the message is too short for a header.
 export function readHeader(buffer) {
+  if (buffer.byteLength < HEADER) return {};
   const view = new DataView(buffer);
   return {
     kind: view.getUint8(0),

@@ -1,6 +1,6 @@
 // Games that are drawn by objects (docs/wire.md, "A scene"): puts the server's changes together, and shows the scene.
 import { SUBPROTOCOLS } from "./connection.js";
-import { canDecode, DIFFERENCE, HEADER, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
+import { canDecode, DIFFERENCE, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { askForSprites, takeSpritePart } from "./sprites.js";
 import { find, make, setText } from "./page.js";
@@ -111,7 +111,7 @@ for (const kind of [4, 5]) {
 }
 for (const kind of [KEY, DIFFERENCE, JPEG, ROWS]) {
   hooks.kinds[kind] = (buffer, take) => {
-    const header = buffer.byteLength < HEADER ? {} : readHeader(buffer);
+    const header = readHeader(buffer);
     take(header, unpack(header, buffer).finally(putAway));
   };
 }
