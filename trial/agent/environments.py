@@ -18,7 +18,6 @@ class PlayersUnknown(ValueError):
 class Players:
     """The players of an environment. All mappings are by the player's name."""
 
-    env: Any
     names: tuple[str, ...]
     keys: Mapping[str, Any]
     """The environment's own name of each player: a text, a number …"""
@@ -28,19 +27,6 @@ class Players:
     """The environment's number of each player's first action."""
     counts: Mapping[str, int | None]
     """The number of each player's actions in the environment; None if it is not known."""
-    of_env: bool
-    """Whether `env` is an environment, whose `agents` are the players still in the game. If not, `env` is the agent."""
-
-
-class AecTurns:
-    """The turns of a PettingZoo `AECEnv` in which one player after another acts."""
-
-    def __init__(self, aec: Any) -> None:
-        self._aec = aec
-
-    def selected(self) -> Any:
-        """Return the environment's own name of the player who is to act; an empty list if no player is left."""
-        return self._aec.agent_selection if self._aec.agents else []
 
 
 def is_module(game: str) -> bool:
@@ -87,10 +73,15 @@ def playable(env: Any) -> Any:
     return conversions.turn_based_aec_to_parallel(env)
 
 
-def turns(env: Any) -> AecTurns | None:
-    """Return the turns of an `AECEnv`, also if `playable` has made a `ParallelEnv` of it; None if all act at once."""
+def turn(env: Any) -> Any:
+    """Return the environment's own name of the player whose turn it is; an empty list if no player is left.
+
+    Only an `AECEnv` has turns, also if `playable` has made a `ParallelEnv` of it. Return None if all act at once.
+    """
     aec = env if is_aec(env) else getattr(env, "aec_env", None)
-    return None if aec is None or not is_aec(aec) or _at_once(aec) else AecTurns(aec)
+    if not is_aec(aec) or _at_once(aec):
+        return None
+    return aec.agent_selection if aec.agents else []
 
 
 def is_aec(env: Any) -> bool:
@@ -112,26 +103,25 @@ def player_keys(owner: Any) -> list[Any]:
     return []
 
 
-def players_of(env: Any, keys: Sequence[Any], configured: Sequence[str], *, of_env: bool, stepped: bool) -> Players:
+def players_of(owner: Any, keys: Sequence[Any], configured: Sequence[str], *, stepped: bool) -> Players:
     """Return the players with these keys, and the names of their actions.
 
-    `configured` are the names in config.yml. `of_env` is as in `Players`. `stepped` says that the environment's own
-    `step` gets the actions: then each player has as many actions as their action space, and these are numbered as
-    there. Raises PlayersUnknown if two keys are the same text, or if a player's actions are not known.
+    `owner` has the players' spaces: it is the environment, or an agent without one. `configured` are the actions' names
+    in config.yml. `stepped` says that the environment's own `step` gets the actions: then each player has as many
+    actions as their action space, and these are numbered as there. Raises PlayersUnknown if two keys are the same text,
+    or if a player's actions are not known.
     """
     by_name = {str(key): key for key in keys}
     if len(by_name) != len(keys):
         raise PlayersUnknown(f"two players have the same name: {', '.join(map(str, keys))}")
-    spaces = {name: _space(env, "action_space", key) for name, key in by_name.items()}
+    spaces = {name: _space(owner, "action_space", key) for name, key in by_name.items()}
     return Players(
-        env=env,
         names=tuple(by_name),
         keys=by_name,
-        action_names={name: _action_names(env, spaces[name], configured, stepped) for name in by_name},
-        observation_spaces={name: _space(env, "observation_space", key) for name, key in by_name.items()},
+        action_names={name: _action_names(owner, spaces[name], configured, stepped) for name in by_name},
+        observation_spaces={name: _space(owner, "observation_space", key) for name, key in by_name.items()},
         starts={name: int(getattr(space, "start", 0)) if stepped else 0 for name, space in spaces.items()},
         counts={name: getattr(space, "n", None) for name, space in spaces.items()},
-        of_env=of_env,
     )
 
 

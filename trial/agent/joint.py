@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from trial.agent import environments
 from trial.agent.agent import AgentAdapter, AgentError
-from trial.agent.environments import AecTurns, Players
+from trial.agent.environments import Players
 from trial.core.players import ACTION_MASK, ALL
 from trial.pictures.picture import Picture
 
@@ -55,12 +56,11 @@ class Joint(NamedTuple):
 class JointAdapter:
     """Calls an agent with several players. All methods run on the agent's thread (`trial/agent/worker.py`)."""
 
-    def __init__(self, adapter: AgentAdapter, players: Players, turns: AecTurns | None) -> None:
-        """`adapter` has started its agent. `turns` says whose turn it is in a PettingZoo `AECEnv`."""
+    def __init__(self, adapter: AgentAdapter, players: Players) -> None:
+        """`adapter` has started its agent."""
         self._adapter = adapter
         self._reader = adapter.reader
         self._players = players
-        self._turns = turns
         self._ended: set[str] = set()  # players for whom the episode is over
         self._first_legal: dict[str, int] = {}  # the first legal action of each player with a mask
         self._terminated: dict[str, bool] = {}
@@ -134,8 +134,7 @@ class JointAdapter:
         self._end(returned.truncated, self._truncated)
         if True in self._terminated.values() or True in self._truncated.values():
             self._ended |= {player for player in self.players if self._terminated[player] or self._truncated[player]}
-        if self._players.of_env:
-            self._ended |= self._no_agents()
+        self._ended |= self._no_agents()
         over = len(self._ended) == len(self.players)
         return self._joint(
             "step", returned.observations, returned.infos, returned.rewards, over=over, extra=returned.extra
@@ -212,12 +211,16 @@ class JointAdapter:
     def _shown(self) -> str:
         return ", ".join(self.players)
 
-    def _no_agents(self) -> set[str]:
-        """Return the players whose episode is over: PettingZoo has removed them from the environment's `agents`."""
-        agents = getattr(self._players.env, "agents", None)
+    def _no_agents(self) -> frozenset[str]:
+        """Return the players whose episode is over: PettingZoo has removed them from the environment's `agents`.
+
+        An attribute `agents` that holds anything but players is not PettingZoo's.
+        """
+        agents = getattr(self.env, "agents", None)
         if not isinstance(agents, list | tuple):
-            return set()
-        return set(self.players) - {str(key) for key in agents}
+            return frozenset()
+        in_game = {str(key) for key in agents}
+        return self._names - in_game if in_game <= self._names else frozenset()
 
     def _to_act(self, infos: Mapping[str, Mapping[str, Any]]) -> frozenset[str]:
         """Return the players who choose an action now.
@@ -226,11 +229,7 @@ class JointAdapter:
         """
         in_game = [player for player in self.players if player not in self._ended]
         method = getattr(self._adapter.agent, TO_ACT, None)
-        named: Any = None
-        if callable(method):
-            named = method()
-        elif self._turns is not None:
-            named = self._turns.selected()
+        named = method() if callable(method) else environments.turn(self.env)
         if named is not None:
             several = isinstance(named, Iterable) and not isinstance(named, str)
             names = {str(name) for name in (named if several else (named,))}

@@ -29,12 +29,8 @@ def start(adapter: AgentAdapter, players: Sequence[str] = ()) -> AgentAdapter | 
         return adapter
     try:
         found = environments.players_of(
-            adapter.agent if env is None else env,
-            keys,
-            adapter.configured_actions,
-            of_env=env is not None,
-            stepped=not adapter.steps_itself,
+            adapter.agent if env is None else env, keys, adapter.configured_actions, stepped=not adapter.steps_itself
         )
     except environments.PlayersUnknown as error:
         raise AgentError(str(error)) from None
-    return JointAdapter(adapter, found, environments.turns(env))
+    return JointAdapter(adapter, found)

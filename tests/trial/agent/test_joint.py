@@ -390,6 +390,65 @@ class Agent:
     assert adapter.env.taken == {"a": 1}
 
 
+NEW_IN_EACH_EPISODE = """
+import numpy
+{imported}
+class Agent:
+    def start(self, game):
+        self.env = {made}
+    def reset(self, seed=None):
+        self.env = {made}
+        self.env.reset(seed=seed)
+        return dict.fromkeys(self.env.possible_agents, 0), {{}}
+    def step(self, actions):
+{step}
+    def render(self):
+        return numpy.zeros((2, 2, 3), numpy.uint8)
+    def close(self):
+        pass
+"""
+
+PARALLEL = """
+class Env:
+    possible_agents = ["a", "b"]
+    def __init__(self):
+        self.agents = []
+    def reset(self, seed=None):
+        self.agents = list(self.possible_agents)
+    def step(self, actions):
+        self.agents = ["a"]
+        return {}, {}, {}, {}, {}
+"""
+
+
+def test_the_players_in_the_game_are_those_of_the_environment_that_reset_has_made(tmp_path: Path) -> None:
+    source = NEW_IN_EACH_EPISODE.format(imported=PARALLEL, made="Env()", step="        return self.env.step(actions)")
+    adapter = joint_adapter(tmp_path, source, names=("left", "right"), players=("a", "b"))
+    for seed in (1, 2):
+        assert adapter.reset(seed)[0].to_act == {"a", "b"}
+        step = adapter.step({})
+        assert (step.over, step.to_act) == (False, {"a"})
+
+
+def test_agents_that_are_no_names_of_players_do_not_end_the_episode(tmp_path: Path) -> None:
+    imported = PARALLEL.replace('self.agents = ["a"]', "self.agents = [object(), object()]")
+    source = NEW_IN_EACH_EPISODE.format(imported=imported, made="Env()", step="        return self.env.step(actions)")
+    adapter = joint_adapter(tmp_path, source, names=("left", "right"), players=("a", "b"))
+    assert not begin_and_step(adapter).over
+
+
+def test_the_turn_is_that_of_the_environment_that_reset_has_made(tmp_path: Path) -> None:
+    source = NEW_IN_EACH_EPISODE.format(
+        imported="from pettingzoo.classic import tictactoe_v3",
+        made="tictactoe_v3.raw_env()",
+        step="        self.env.step(actions[self.env.agent_selection])\n        return {}, {}, {}, {}, {}",
+    )
+    names = tuple(map(str, range(9)))
+    adapter = joint_adapter(tmp_path, source, names=names, players=("player_1", "player_2"))
+    assert adapter.reset(1)[0].to_act == {"player_1"}
+    assert adapter.step({"player_1": 3}).to_act == {"player_2"}
+
+
 DICT_SPACES = """
 import numpy
 from gymnasium import spaces
