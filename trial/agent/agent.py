@@ -226,8 +226,8 @@ class AgentAdapter:
             self._unusual_step = lambda action: self._call("step", action=action)
         elif "step" in self._env_methods:
             self._unusual_step = self._env_methods["step"]
-        if self._signatures["render"] != signatures.usual("render") or "render" in self._env_methods:
-            self._unusual_render = True
+        usual_render = self._signatures["render"] == signatures.usual("render")
+        self._unusual_render = not usual_render or "render" in self._env_methods
 
     def name_actions(self) -> None:
         """Set `action_space` for an environment with one player: the names in config.yml, or the environment's.
@@ -252,7 +252,7 @@ class AgentAdapter:
         Raises AgentError if the method takes the environment, and `env` is None.
         """
         env = self.env
-        if env is None and self._signatures[method].needs_env:
+        if env is None and signatures.ENV in self._signatures[method].order:
             raise AgentError(f"{method}() takes the environment; return it from start(game), or keep it in self.env")
         given = {
             signatures.ENV: env,
@@ -416,14 +416,10 @@ def _outcome(
 
 
 def _action_names(env: Any) -> tuple[str, ...]:
-    inner = getattr(env, "unwrapped", env)
-    for candidate in (env, inner):
-        meanings = getattr(candidate, "get_action_meanings", None)
-        if callable(meanings):
-            return tuple(str(name).strip().lower() for name in meanings())
+    names = environments.action_meanings(env)
+    if names:
+        return tuple(names)
     count = getattr(getattr(env, "action_space", None), "n", None)
     if count is None:
-        raise AgentError(
-            "list the game's actions as trial.actionSpace in config.yml; the environment does not name them"
-        )
+        raise AgentError(environments.ACTIONS_UNKNOWN)
     return tuple(str(index) for index in range(int(count)))

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+ACTIONS_UNKNOWN = "list the game's actions as trial.actionSpace in config.yml; the environment does not name them"
+
 
 class PlayersUnknown(ValueError):
     """The environment does not exist, or its players or actions are not known. The message is for the researcher."""
@@ -146,18 +148,17 @@ def _action_names(env: Any, space: Any, configured: Sequence[str], stepped: bool
     if configured and not stepped:
         return tuple(configured)
     count = getattr(space, "n", None)
-    names = list(configured) or _meanings(env)
+    names = list(configured) or action_meanings(env)
     if count is None:
         if not names:
-            raise PlayersUnknown(
-                "list the game's actions as trial.actionSpace in config.yml; the environment does not name them"
-            )
+            raise PlayersUnknown(ACTIONS_UNKNOWN)
         return tuple(names)
     more = (str(index) for index in range(len(names), int(count)))
     return (*names[: int(count)], *more)
 
 
-def _meanings(env: Any) -> list[str]:
+def action_meanings(env: Any) -> list[str]:
+    """Return the actions' names by `get_action_meanings` of the environment; empty if it does not name them."""
     for one in (env, getattr(env, "unwrapped", env)):
         meanings = getattr(one, "get_action_meanings", None)
         if callable(meanings):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 from typing import Any
@@ -32,7 +32,7 @@ def in_class(agent: Any) -> bool:
 
 def candidates(question: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Build the argument of `match`: a dict for each participant who waits, in the order in which they came."""
-    return [{"waited": 0, "group": None, "answers": {}} | each for each in json.loads(json.dumps(question["waiting"]))]
+    return [{"waited": 0, "group": None, "answers": {}} | each for each in copy.deepcopy(question["waiting"])]
 
 
 def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[list[list[str]], str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
@@ -52,25 +52,20 @@ class UnfitSignature(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """The arguments of a method: positional ones in `order`, others by name. Each is of a kind such as GAME or SEED."""
+    """The kinds of a method's arguments, such as GAME or SEED."""
 
     order: tuple[str, ...]
-    named: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def needs_env(self) -> bool:
-        """Whether one of the positional arguments is the environment."""
-        return ENV in self.order
+    """The kinds of the positional arguments."""
+    named: tuple[str, ...] = ()
+    """The kinds of the arguments that are given by name. The name is the kind: `seed`, `options`."""
 
     def call(self, function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
         """Call the function with its arguments; `given` has a value for each kind."""
-        return function(
-            *[given[kind] for kind in self.order], **{name: given[kind] for name, kind in self.named.items()}
-        )
+        return function(*[given[kind] for kind in self.order], **{kind: given[kind] for kind in self.named})
 
 
 def usual(method: str) -> Signature:
-    """Return the usual signature of a method, which also counts if its parameters cannot be read."""
+    """Return the usual signature of a method. It also counts if the method's parameters cannot be read."""
     return Signature(_FORMS[method][0])
 
 
@@ -81,7 +76,7 @@ def read(method: str, function: Callable[..., Any]) -> Signature:
     """
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):  # such as one written in C
+    except (TypeError, ValueError):  # a function in C may have no signature
         return usual(method)
     named, rest = _by_name(method, parameters)
     needed, possible = _positional(rest)
@@ -100,35 +95,39 @@ def names(function: Callable[..., Any], parameter: str) -> bool:
         return False
 
 
-def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[dict[str, str], list[inspect.Parameter]]:
-    """Return the arguments that `reset` takes by name, and the other parameters."""
+def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[tuple[str, ...], list[inspect.Parameter]]:
+    """Return the kinds of the arguments that `reset` takes by name, and the other parameters."""
     if method != "reset":
-        return {}, parameters
-    named: dict[str, str] = {}
+        return (), parameters
+    named: set[str] = set()
     rest: list[inspect.Parameter] = []
     for p in parameters:
         if p.kind is p.VAR_KEYWORD or (p.name == SEED and p.kind is not p.POSITIONAL_ONLY):
-            named[SEED] = SEED
+            named.add(SEED)
         elif p.name == OPTIONS and p.kind is not p.POSITIONAL_ONLY:
             if p.default is p.empty:
-                named[OPTIONS] = OPTIONS
+                named.add(OPTIONS)
         else:
             rest.append(p)
-    return named, rest
+    return tuple(sorted(named)), rest
 
 
 def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[str]]:
-    """Return the names of the positional parameters: of those without a default, and of all."""
+    """Return the names of the positional parameters without a default, and the names of all positional parameters.
+
+    If there is only `*args`, the action stands for it.
+    """
     in_order = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     possible = [p.name.lower() for p in in_order]
-    possible += [ACTION] * any(p.kind is p.VAR_POSITIONAL for p in parameters) * (not possible)
+    if not possible and any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        possible = [ACTION]
     return [p.name.lower() for p in in_order if p.default is p.empty], possible
 
 
 def _order(method: str, needed: list[str], possible: list[str]) -> tuple[str, ...] | None:
-    """Choose the form of the method that has as many arguments as it needs, and most of them under their names.
+    """Choose the form of the method that has as many arguments as `needed`, and most of them under the same names.
 
-    Return None if no form has as many arguments.
+    `possible` are the names of all positional parameters. Return None if no form has as many arguments.
     """
     if not needed and method in ("start", "step"):
         needed = possible[:1]
