@@ -289,9 +289,10 @@ def _single(count: int, found: Sequence[GymRun], bare: Sequence[GymRun], step: f
 def batched_steps() -> Iterator[Row]:
     """Measure 64 steps in a request, by the binary subprotocol."""
     from trial.gym import arrays, spaces
+    from trial.gym.forms import SUBPROTOCOL
 
     with ours() as (url, pid):
-        connection = FrameConnection(url, arrays.SUBPROTOCOL)
+        connection = FrameConnection(url, SUBPROTOCOL)
         made = json.loads(connection.ask(frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')))
         actions = arrays.layout(spaces.build(made["action_space"]), action=True)
         connection.ask(frame(arrays.reset_request(made["handle"], _SEED, None)))

@@ -80,7 +80,7 @@ def turn(env: Any) -> Any:
 
     Only an `AECEnv` has turns, also if `playable` has made a `ParallelEnv` of it. Return None if all act at once.
     """
-    aec = env if is_aec(env) else getattr(env, "aec_env", None)
+    aec: Any = env if is_aec(env) else getattr(env, "aec_env", None)
     if not is_aec(aec) or _at_once(aec):
         return None
     return aec.agent_selection if aec.agents else []

@@ -18,8 +18,6 @@ from gymnasium import spaces
 from trial.gym import exact, values
 from trial.gym.spaces import CodecError, Space
 
-SUBPROTOCOL = "hippodrome.gym.1"
-
 STEP, STEP_MANY, RESET = 1, 2, 3
 """Kinds of messages. A reply has the kind of its request."""
 

@@ -8,15 +8,14 @@ import os
 import ssl
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 from urllib.parse import quote, urlsplit, urlunsplit
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
 
 from trial.gym import values
-from trial.gym.arrays import SUBPROTOCOL
+from trial.gym.forms import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
 TIMEOUT = 90.0
@@ -56,7 +55,7 @@ class GymClient:
             opened = connect(
                 address,
                 ssl=context,
-                subprotocols=[Subprotocol(SUBPROTOCOL)],
+                subprotocols=[SUBPROTOCOL],
                 compression=None,
                 max_size=_LARGEST_REPLY,
                 open_timeout=timeout,
@@ -69,7 +68,7 @@ class GymClient:
             # `from None`, since the error may show the token.
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
         if self._connection.subprotocol != SUBPROTOCOL:
-            self._end("it does not speak hippodrome.gym.1")
+            self._end(f"it does not speak {SUBPROTOCOL}")
             raise ConnectionLost(f"The server at {self.url} does not speak {SUBPROTOCOL}.")
 
     @property
@@ -88,7 +87,7 @@ class GymClient:
         if isinstance(answer, str):
             self.read(_result, answer)  # raises the error that a text should be
             self._confused()
-        return answer  # type: ignore[return-value]
+        return answer
 
     def read(self, reader: Callable[..., Any], *arguments: Any) -> Any:
         """Read an answer by `reader`. If it raises CodecError, end the connection and raise ConnectionLost."""
@@ -120,7 +119,7 @@ class GymClient:
                 raise
             raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 
-    def _confused(self) -> None:
+    def _confused(self) -> NoReturn:
         """End the connection, and raise ConnectionLost: the server's answer does not fit the request."""
         self._end("it answered something else than what it was asked")
         raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")

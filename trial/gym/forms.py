@@ -14,9 +14,12 @@ client. All other clients keep their connection.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from urllib.parse import parse_qs, urlsplit
 
-from trial.gym import values
-from trial.gym.errors import GymError
+from websockets.typing import Subprotocol
+
+SUBPROTOCOL = Subprotocol("hippodrome.gym.1")
+"""The subprotocol of connections that have the form ARRAYS."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +37,18 @@ class MessageForm:
     """Whether `make` answers with a description of the environment, and binary messages are read."""
 
 
-def error_message(error: GymError) -> str:
-    """Build the message for an error, in all forms except Gymie's."""
-    return values.to_text({"error": {"type": type(error).__name__, "message": str(error)}})
-
-
 GYMIE = MessageForm("gymie", five=False, bare_id=True, closes=True)
 DOCUMENTED = MessageForm("documented", five=False)
 GYMNASIUM = MessageForm("gymnasium", five=True)
 ARRAYS = MessageForm("arrays", five=True, arrays=True)
 
-NAMES = {form.name: form for form in (GYMIE, DOCUMENTED, GYMNASIUM)}
+BY_NAME = {form.name: form for form in (GYMIE, DOCUMENTED, GYMNASIUM)}
+"""The forms that an address may ask for."""
+
+UNKNOWN_FORM = f"form must be one of {', '.join(BY_NAME)}.\n"
+"""The HTTP answer to a handshake that asks for another form."""
+
+
+def form_of(address: str) -> MessageForm | None:
+    """Return the form that an address asks for, by default Gymie's; None if there is no such form."""
+    return BY_NAME.get(parse_qs(urlsplit(address).query).get("form", [GYMIE.name])[0])

@@ -14,8 +14,8 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
-from urllib.parse import parse_qs, urlsplit
+from typing import Any, NoReturn, Protocol
+from urllib.parse import urlsplit
 
 from websockets.datastructures import Headers
 from websockets.exceptions import ProtocolError
@@ -26,12 +26,11 @@ from websockets.typing import Subprotocol
 
 from trial.gym import handover
 from trial.gym.errors import reason
+from trial.gym.forms import ARRAYS, GYMIE, SUBPROTOCOL, UNKNOWN_FORM, MessageForm, form_of
 from trial.gym.limits import Limits
 from trial.gym.wakeup import Wakeup
 
 PATH = "/gym"
-SUBPROTOCOL = "hippodrome.gym.1"
-FORMS = ("gymie", "documented", "gymnasium")
 _HANDSHAKE_SECONDS = 10.0  # for a handshake
 _HANDSHAKE_BYTES = 16 * 1024  # of a handshake
 _CLOSE_SECONDS = 2.0  # for a client to close its end
@@ -86,7 +85,7 @@ class GymServer:
         self._last_number = 0
         self._from_spawner = bytearray()  # the beginning of a message that is not complete yet
 
-    def run(self) -> None:
+    def run(self) -> NoReturn:
         """Serve until a signal raises KeyboardInterrupt, which passes on. Raises EOFError if the spawner has ended."""
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -98,7 +97,7 @@ class GymServer:
             finally:
                 self._selector.unregister(wakeup)
 
-    def _serve(self) -> None:
+    def _serve(self) -> NoReturn:
         checked = time.monotonic()
         while True:
             for key, _ in self._selector.select(1.0 if self._timed() else None):
@@ -163,16 +162,16 @@ class GymServer:
             if len(head) > _HANDSHAKE_BYTES:
                 self._drop(connection)
             return
-        protocol = ServerProtocol(subprotocols=[Subprotocol(SUBPROTOCOL)], select_subprotocol=_subprotocol)
+        protocol = ServerProtocol(subprotocols=[SUBPROTOCOL], select_subprotocol=_subprotocol)
         protocol.receive_data(head + end)
         events = protocol.events_received()
-        form: str | None = None
+        form: MessageForm | None = None
         if not events or not isinstance(events[0], Request):
             response = _response(http.HTTPStatus.BAD_REQUEST, "This is no request of HTTP.\n")
         else:
             request = events[0]
             try:
-                form = _form(request)
+                form = form_of(request.path)
                 response = self._refused(request) or protocol.accept(request)
             except (ValueError, LookupError):  # a malformed address or origin, or a header that is there twice
                 response = _response(http.HTTPStatus.BAD_REQUEST, "This is no handshake of a WebSocket.\n")
@@ -183,7 +182,7 @@ class GymServer:
             self._close_soon(connection)
             return
         connection.deadline = None
-        connection.form = "arrays" if protocol.subprotocol == SUBPROTOCOL else form or FORMS[0]
+        connection.form = (ARRAYS if protocol.subprotocol == SUBPROTOCOL else form or GYMIE).name
         if connection.socket.family != socket.AF_UNIX:
             connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             _keep_alive(connection.socket)
@@ -199,8 +198,8 @@ class GymServer:
             return _response(
                 http.HTTPStatus.FORBIDDEN, "Pages of this origin may not connect; start the server with --origin.\n"
             )
-        if _form(request) is None:
-            return _response(http.HTTPStatus.BAD_REQUEST, f"form must be one of {', '.join(FORMS)}.\n")
+        if form_of(request.path) is None:
+            return _response(http.HTTPStatus.BAD_REQUEST, UNKNOWN_FORM)
         if len(self._connections) > self._limits.connections:
             return _response(
                 http.HTTPStatus.SERVICE_UNAVAILABLE, f"There are {self._limits.connections} connections already.\n"
@@ -212,13 +211,7 @@ class GymServer:
         while len(connection.received) >= 2:
             first, second = connection.received[:2]
             opcode, length = first & 0x0F, second & 0x7F
-            if (
-                opcode not in tuple(map(int, CTRL_OPCODES))
-                or not first & 0x80
-                or first & 0x70
-                or not second & 0x80
-                or length > 125
-            ):
+            if opcode not in CTRL_OPCODES or not first & 0x80 or first & 0x70 or not second & 0x80 or length > 125:
                 self._hand_over(connection)  # also for a malformed frame: the worker answers as the protocol demands
                 return
             if len(connection.received) < 6 + length:
@@ -310,13 +303,7 @@ def _close_answer(payload: bytes) -> bytes:
 
 def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:
     """Return SUBPROTOCOL if the client offers it; None for Gymie's clients and others that speak JSON."""
-    return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in offered else None
-
-
-def _form(request: Request) -> str | None:
-    """Return the name of the form that the address asks for, by default Gymie's; None if there is no such form."""
-    asked = parse_qs(urlsplit(request.path).query).get("form", [FORMS[0]])[0]
-    return asked if asked in FORMS else None
+    return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
 def _response(status: http.HTTPStatus, text: str) -> Response:

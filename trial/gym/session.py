@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import time
@@ -27,7 +28,7 @@ from trial.gym.errors import (
     WrongParameters,
     short,
 )
-from trial.gym.forms import MessageForm
+from trial.gym.forms import SUBPROTOCOL, MessageForm
 from trial.gym.instance import CUT_OFF, MODES, Instance, InstanceStep, as_dict, guarded, number
 from trial.gym.instance import make as make_instance
 from trial.gym.limits import Limits, Rate
@@ -50,17 +51,14 @@ class HeldEnvironment:
         """A function that reads an action from JSON data. It raises CodecError."""
         self.bytes = _bytes(instance.single_observation_space) * instance.size
         """The size of one step's observations in bytes, without parts whose size varies."""
-        self._layouts: tuple[ArrayLayout, ArrayLayout] | None = None
 
-    @property
+    @functools.cached_property
     def layouts(self) -> tuple[ArrayLayout, ArrayLayout]:
         """The layouts of observations and of actions in binary messages. Raises CodecError."""
-        if self._layouts is None:
-            self._layouts = (
-                arrays.layout(self.instance.single_observation_space),
-                arrays.layout(self.instance.single_action_space, action=True),
-            )
-        return self._layouts
+        return (
+            arrays.layout(self.instance.single_observation_space),
+            arrays.layout(self.instance.single_action_space, action=True),
+        )
 
 
 class GymSession:
@@ -117,7 +115,7 @@ class GymSession:
     def answer_arrays(self, data: bytes) -> bytes:
         """Carry out a binary request, and return the reply. Raises GymError."""
         if not self.form.arrays:
-            raise InvalidMessage(f"Binary messages are for the subprotocol {arrays.SUBPROTOCOL}.")
+            raise InvalidMessage(f"Binary messages are for the subprotocol {SUBPROTOCOL}.")
         try:
             request = arrays.read_request(data)
         except CodecError as error:

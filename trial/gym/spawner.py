@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trial.gym import handover, linux
-from trial.gym.forms import ARRAYS, NAMES
+from trial.gym.forms import ARRAYS, BY_NAME
 from trial.gym.handover import Ended, NewConnection
 from trial.gym.limits import Limits
 from trial.gym.wakeup import Wakeup
@@ -129,7 +129,7 @@ class Spawner:
             signal.set_wakeup_fd(-1)
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             self._control.close()
-            form = NAMES.get(start.form, ARRAYS)
+            form = BY_NAME.get(start.form, ARRAYS)
             work(start.connection, start.received, form, self._limits, state, output=self._output, record=self._record)
             status = 0
         finally:

@@ -24,9 +24,9 @@ from websockets.frames import CloseCode, Opcode
 from websockets.protocol import Protocol, Side
 from websockets.protocol import State as Connected
 
-from trial.gym import linux
+from trial.gym import linux, values
 from trial.gym.errors import EnvironmentFailed, GymError, TooSlow, described, reason
-from trial.gym.forms import MessageForm, error_message
+from trial.gym.forms import MessageForm
 from trial.gym.limits import Limits
 from trial.gym.recordings import ConnectionRecorder
 from trial.gym.session import GymSession
@@ -152,33 +152,36 @@ class ConnectionWorker:
 
     def _answer(self, text: bool, data: bytes) -> None:
         self._state.work()
-        self._in_request = True
         try:
-            reply = self._session.answer(data.decode()) if text else self._session.answer_arrays(data)
-            self._in_request = False
+            reply = self._carry_out(text, data)
         except GymError as error:
-            self._in_request = False
             self._failed(error)
             return
         except UnicodeDecodeError:
-            self._in_request = False
             self._protocol.fail(CloseCode.INVALID_DATA, "The message is not UTF-8.")
             self._flush()
             return
         except BaseException as error:  # noqa: BLE001 - raised by a value that the environment returned
-            self._in_request = False
             self._failed(EnvironmentFailed(f"What the environment returned cannot be sent: {described(error)}"))
             return
         finally:
             self._state.rest()
         self._send(reply)
 
+    def _carry_out(self, text: bool, data: bytes) -> str | bytes:
+        """Carry out a request and return the reply. Only meanwhile does `_too_slow` interrupt."""
+        self._in_request = True
+        try:
+            return self._session.answer(data.decode()) if text else self._session.answer_arrays(data)
+        finally:
+            self._in_request = False
+
     def _failed(self, error: GymError) -> None:
         if self._form.closes:
             self._protocol.send_close(error.code, reason(error.brief))
             self._flush()
         else:
-            self._send(error_message(error))
+            self._send(values.to_text({"error": {"type": type(error).__name__, "message": str(error)}}))
 
     def _send(self, reply: str | bytes) -> None:
         if isinstance(reply, str):

@@ -15,23 +15,19 @@ import os
 import socket
 import sys
 from pathlib import Path
-from urllib.parse import parse_qs, quote, urlsplit
 
 from websockets.asyncio.client import connect
 from websockets.asyncio.connection import Connection
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
-from websockets.typing import Subprotocol
 
 from protocol import environment
 from trial.gym.errors import reason
-from trial.gym.server import FORMS
-from trial.gym.server import SUBPROTOCOL as _NAME
+from trial.gym.forms import GYMIE, SUBPROTOCOL, UNKNOWN_FORM, form_of
 
 log = logging.getLogger("trial")
 
-SUBPROTOCOL = Subprotocol(_NAME)
 MAX_PROGRAMS = 4
 """The most programs that may be connected at a time."""
 LARGEST_REQUEST = 2**20
@@ -51,8 +47,8 @@ _GONE = "The process of the environments has ended."
 
 def prepare(websocket: ServerConnection, request: Request) -> Response | None:
     """Set a program's connection up as `make gym` does. Return a refusal if its address names an unknown form."""
-    if _form(request.path) not in FORMS:
-        return websocket.respond(http.HTTPStatus.BAD_REQUEST, f"form must be one of {', '.join(FORMS)}.\n")
+    if form_of(request.path) is None:
+        return websocket.respond(http.HTTPStatus.BAD_REQUEST, UNKNOWN_FORM)
     websocket.protocol.max_message_size = LARGEST_REQUEST
     websocket.ping_timeout = None  # while requests wait for an environment, its pong waits behind them
     return None
@@ -94,12 +90,12 @@ class Environments:
                     process.kill()
 
     async def _serve(self, websocket: ServerConnection) -> None:
-        path = websocket.request.path if websocket.request is not None else ""
+        form = (form_of(websocket.request.path) if websocket.request is not None else None) or GYMIE
         ours: socket.socket | None = None
         try:
             ours = await self._connection()
             connecting = connect(
-                f"ws://localhost/gym?form={quote(_form(path))}",
+                f"ws://localhost/gym?form={form.name}",
                 sock=ours,
                 subprotocols=[SUBPROTOCOL] if websocket.subprotocol == SUBPROTOCOL else None,
                 compression=None,
@@ -186,8 +182,3 @@ class Environments:
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
             )
-
-
-def _form(path: str) -> str:
-    """Return the form of messages that an address asks for; without one, the first of FORMS, as `make gym` does."""
-    return parse_qs(urlsplit(path).query).get("form", [FORMS[0]])[0]

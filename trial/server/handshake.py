@@ -17,6 +17,7 @@ from protocol.keys import NAME
 from protocol.session import member_token
 from trial.core import messages
 from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
+from trial.gym import forms
 from trial.programs import environments, watch
 from trial.settings import TrialSettings
 from trial.wire import notice, plain
@@ -71,7 +72,7 @@ def select_subprotocol(
 ) -> Subprotocol | None:
     """Return the preferred one of the subprotocols that the client offers; None for clients of HIPPO and Gymie."""
     if gym == "environments" and is_program(websocket):
-        return environments.SUBPROTOCOL if environments.SUBPROTOCOL in offered else None
+        return forms.SUBPROTOCOL if forms.SUBPROTOCOL in offered else None
     return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
 
 

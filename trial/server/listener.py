@@ -11,7 +11,7 @@ from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
-from trial.programs.environments import SUBPROTOCOL
+from trial.gym.forms import SUBPROTOCOL
 from trial.recordings.store import Store
 from trial.server.certificate import RELOAD_SECONDS, Certificate
 from trial.server.handshake import process_request, select_subprotocol

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from websockets.sync.server import ServerConnection, serve
-from websockets.typing import Subprotocol
 
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, arrays
+from trial.gym.forms import SUBPROTOCOL
 from trial.gym.spaces import describe
 
 SPACE = spaces.Box(-1, 1, (2,), np.float32)
@@ -40,7 +40,7 @@ def server_answering(*answers: str | bytes) -> Iterator[str]:
             connection.send(answer)
         connection.recv()
 
-    with serve(handle, "127.0.0.1", 0, subprotocols=[Subprotocol(arrays.SUBPROTOCOL)]) as server:
+    with serve(handle, "127.0.0.1", 0, subprotocols=[SUBPROTOCOL]) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
