@@ -13,17 +13,24 @@ import pytest
 TESTS = Path(__file__).resolve().parents[1]
 PAGE = TESTS.parent / "docs" / "security.md"
 NAMED = re.compile(r"`([\w/]+\.py)::(\w+)`")
-ITEM = re.compile(r"\* \*(Protection|Accepted|Tests)\*: (.+)")
+ITEM = re.compile(r"\* \*\*(.+?)\.\*\*(?: (.+))?\[\^([\w-]+)\]")
+ACCEPTED = re.compile(r"  \* \*Accepted\*: (.+)")
+NOTE = re.compile(r"^\[\^([\w-]+)\]: (.+)$", re.MULTILINE)
 
 
 def threats() -> Iterator[list[str]]:
     """Each threat, its protection, what is accepted, and the tests; an empty text for what the page does not say."""
-    for block in PAGE.read_text(encoding="utf-8").split("\n\n"):
-        head, *items = block.strip().splitlines()
-        if found := re.fullmatch(r"\*\*(.+)\*\*", head):
-            said = [match.groups() for item in items if (match := ITEM.fullmatch(item))]
-            assert len(said) == len(items) == len(dict(said)), f"{found[1]}: each part is one line, and stands once"
-            yield [found[1], *(dict(said).get(part, "") for part in ("Protection", "Accepted", "Tests"))]
+    text = PAGE.read_text(encoding="utf-8")
+    notes = dict(NOTE.findall(text))
+    assert len(notes) == len(NOTE.findall(text)), "each threat has a note of its own"
+    lines = text.splitlines()
+    for line, after in zip(lines, [*lines[1:], ""], strict=True):
+        if re.match(r"\* \*\*.+?\.\*\*", line):
+            said = ITEM.fullmatch(line)
+            assert said, f"a threat is one line, and ends with its note: {line}"
+            accepted = ACCEPTED.fullmatch(after)
+            yield [said[1], said[2] or "", accepted[1] if accepted else "", notes.pop(said[3], "")]
+    assert not notes, "each note belongs to a threat"
 
 
 THREATS = list(threats())
