@@ -97,7 +97,7 @@ def game_page(
         state |= {"session": True, "players": players, "members": players}
     game = Step(step, "game")
     project = Project(id="bench", name="Bench", steps=[game], researcher="Bench", trial=trial or {}, players=players)
-    view = pages.GameView(project, game, user, state, "/?poll=1", "/", "/", "", "ws://127.0.0.1:*")
+    view = pages.GameView(project, game, user, state, "/?poll=1", "/", "", "ws://127.0.0.1:*")
     page = pages.game_page(view)
     with html_page(page.html, page.headers, {"/?poll=1": json.dumps(state)}) as address:
         yield address

@@ -166,7 +166,6 @@ _PARTS = {
     "progress": '<label class="progress">TEXT.step <progress max="$all" value="$done"></progress></label>',
     "footer": "<footer><p>TEXT.studyBy</p></footer>",
     "data": ' data-project="$project" data-user="$user" data-step="$step"',
-    "problem": '<p class="problem" role="alert">$text</p>\n',
     "named": """<input type="hidden" name="hippodrome-step" value="$step">
 <input type="hidden" name="hippodrome-ticket" value="$ticket">
 """,

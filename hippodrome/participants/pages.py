@@ -40,9 +40,7 @@ class StepView:
     ticket: str
     action: str  # the address to which the form is sent: the page's own
     final: bool  # whether it is the last step
-    has_form: bool = False  # whether a form answers the step even if the file has no fields
     answered: bool = False  # whether it is a final step whose form was sent before
-    problem: str | None = None  # a sentence at the top
     files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 
 
@@ -55,8 +53,7 @@ class GameView:
     user_id: str
     state: Mapping[str, Any]  # the same as the response of `poll`, see docs/pages.md
     poll: str  # the address of the state
-    page: str  # the page's own address
-    action: str  # the address to which its form is sent
+    page: str  # the page's own address, to which its form is sent too
     ticket: str
     sources: str  # the sources in the Content-Security-Policy to which the game may connect
     # the researcher's pages that the game page shows, each with its values, by the key of `trial` that names it
@@ -73,8 +70,7 @@ def step_page(view: StepView) -> Page:
     texts = Texts(view.project.texts)
     prepared = _prepare(view.project, view.source, view.files)
     content = Html(prepared.render(view.values, nonce))
-    problem = fill("problem", text=view.problem) if view.problem else Html()
-    is_asked = prepared.has_fields or view.has_form
+    is_asked = prepared.has_fields
     if not view.final or (is_asked and not view.answered):
         main = fill(
             "form",
@@ -83,7 +79,7 @@ def step_page(view: StepView) -> Page:
             content=content,
             button=Html() if prepared.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
         )
-    elif view.answered and prepared.has_fields:
+    elif is_asked:
         main = fill("answered", texts, content=content)
     else:
         main = Html(f'<div class="page">\n{content}\n</div>')
@@ -92,7 +88,7 @@ def step_page(view: StepView) -> Page:
         view.step,
         view.user_id,
         nonce,
-        main=Html(problem + main),
+        main=main,
         script=script("step.js", nonce, texts=texts),
         title=prepared.title,
         lang=prepared.lang,
@@ -148,7 +144,7 @@ def game_page(view: GameView) -> Page:
         button=_button(state, texts),
         again=Html() if view.state.get("again") else Html(" hidden"),
         gone=Html(" hidden") if view.state.get("again") else Html(),
-        action=view.action,
+        action=view.page,
         step=view.step.key,
         ticket=view.ticket,
         data=script_json(data),

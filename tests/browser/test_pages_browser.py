@@ -94,7 +94,7 @@ class World:
         if step.type.on_server:
             study = msgspec.structs.replace(PROJECT, trial=self.trial, **self.more)
             texts: dict[str, tuple[str, dict[str, Any]]] = {key: (text, {}) for key, text in self.texts.items()}
-            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "/", "T", "ws://127.0.0.1:*", texts)
+            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "T", "ws://127.0.0.1:*", texts)
             page = pages.game_page(view)
             return page if self.joined else page._replace(html=MODULES.sub(r'\1 src="/game/main.js">\2', page.html))
         return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))

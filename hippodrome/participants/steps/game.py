@@ -52,7 +52,6 @@ class GameStep:
             state=state,
             poll=request.url(poll=step.key, **proof),
             page=request.url(),
-            action=request.url(),
             ticket=ticket,
             sources=self._services.platform.settings.game_sources,
         )

@@ -83,7 +83,6 @@ def game(project: Project | None = None, **state: Any) -> Page:
         present,
         "/next?poll=1",
         "/next",
-        "/next?x=1",
         "TICKET",
         "wss://*.example.org:*",
     )
@@ -171,13 +170,6 @@ def test_a_page_without_a_button_gets_one(source: str, ours: int) -> None:
     assert len(Elements(html).named("button")) == 1
 
 
-def test_a_final_step_of_a_type_with_a_form_has_a_button_even_without_fields() -> None:
-    asked = step("<p>Take a break.</p>", at=4, has_form=True)
-    assert (">Send<" in asked.html, 'data-done=""' in asked.html) == (True, False)
-    answered = step("<p>Take a break.</p>", at=4, has_form=True, answered=True)
-    assert (">Send<" in answered.html, 'data-done=""' in answered.html) == (False, True)
-
-
 def test_the_final_page_has_a_form_only_if_it_has_questions() -> None:
     assert "<form" not in step("<h1>Bye</h1>", at=4).html
     asking = step("<input name=a>", at=4).html
@@ -187,12 +179,6 @@ def test_the_final_page_has_a_form_only_if_it_has_questions() -> None:
     assert "Your answers are saved" in saved.text
     assert "CODE" in saved.text
     assert "disabled" in saved.named("fieldset")[0]
-
-
-def test_a_problem_is_shown_as_an_alert() -> None:
-    found = Elements(step("<h1>Q</h1>", problem="Too <long>.").html)
-    assert [attrs for _, attrs in found.all if attrs.get("role") == "alert"]
-    assert "Too <long>." in found.text
 
 
 def test_the_frame_names_study_step_and_researcher() -> None:
