@@ -20,27 +20,18 @@ STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-actio
 
 
 class BadForm(Exception):
-    """The form is refused. `status` is the HTTP status, `text` the reason in English."""
+    """The form is refused. `status` is the HTTP status, `text` the reason in English.
 
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status, self.text = status, text
+    `name` is the name of that text, if studies may have their own words for it (`model/texts.py`).
+    """
 
-    def reason(self, texts: Texts) -> str:
-        """Return the reason as a participant reads it in a study with these texts. Here it is always in English."""
-        return self.text
-
-
-class BadPageForm(BadForm):
-    """The refusal of a form that a page of ours may send. `name`: the text that gives the reason (`model/texts.py`)."""
-
-    def __init__(self, status: int, name: str) -> None:
-        super().__init__(status, ENGLISH[name])
-        self._name = name
+    def __init__(self, status: int, text: str = "", *, name: str = "") -> None:
+        self.status, self.text, self._name = status, text or ENGLISH[name], name
+        super().__init__(self.text)
 
     def reason(self, texts: Texts) -> str:
-        """Return the reason in the study's own words."""
-        return texts[self._name]
+        """Return the reason in the study's own words if it has a name, otherwise in English."""
+        return texts[self._name] if self._name else self.text
 
 
 @dataclass(frozen=True)
@@ -56,9 +47,9 @@ class PostedForm:
 def read(request: Request) -> PostedForm:
     """Read the form in a request's body. Raises `BadForm`."""
     if request.body is None:
-        raise BadPageForm(400, "formUnread")
+        raise BadForm(400, name="formUnread")
     if len(request.body) > MAX_BODY:
-        raise BadPageForm(413, "formTooLong")
+        raise BadForm(413, name="formTooLong")
     if request.content_type == FORM:
         fields = _urlencoded(request.body)
     elif request.content_type == JSON:
