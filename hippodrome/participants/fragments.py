@@ -93,7 +93,7 @@ class _Preparation:
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
         self._out: list[str] = []
-        self._seen: dict[str, bool] = {}
+        self._seen: set[str] = set()  # of "field", "submit" and "h1"
         self._title = self._lang = ""
         self._drawings = 0  # open <svg> elements, whose <title> is their own
 
@@ -113,9 +113,9 @@ class _Preparation:
         self._out.append(self._source[at:])
         return Fragment(
             text=self._restore("".join(self._out)),
-            has_fields=self._seen.get("field", False),
-            has_submit=self._seen.get("submit", False),
-            has_heading=self._seen.get("h1", False),
+            has_fields="field" in self._seen,
+            has_submit="submit" in self._seen,
+            has_heading="h1" in self._seen,
             title=self._title,
             lang=self._lang,
         )
@@ -192,13 +192,13 @@ class _Preparation:
         """Note the facts about this tag that the frame needs."""
         kind = given.get("type", "").strip().lower()
         if name in ("input", "select", "textarea", "button") and given.get("name", "").strip():
-            self._seen["field"] = True
+            self._seen.add("field")
         if name == "input" and kind in ("submit", "image"):
-            self._seen["submit"] = True
+            self._seen.add("submit")
         if name == "button" and kind not in ("button", "reset"):
-            self._seen["submit"] = True
+            self._seen.add("submit")
         if name == "h1":
-            self._seen["h1"] = True
+            self._seen.add("h1")
         if name == "html" and not self._lang and re.fullmatch(r"[A-Za-z0-9-]{2,35}", given.get("lang", "")):
             self._lang = given["lang"]
 
