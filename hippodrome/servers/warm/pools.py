@@ -89,15 +89,15 @@ class Pools:
     def repair(self, repository: Repository) -> Collection[str]:
         """Repair all pools after lost messages; return the ids of all warm servers in them.
 
-        AWS calls: two reads of the master list and a listing; for each project with a pool or `warmServers` at most two
+        AWS calls: a read of the master list and a listing; for each project with a pool or `warmServers` at most two
         reads, a write and a message; for each warm server a read, and a message if it is started again or stopped. A
         write that meets another one is repeated. If a pool cannot be read, the others are repaired before the error is
         raised.
         """
-        configured = self._projects_with_warm_servers()
+        configured, with_pool = self._projects()
         known: set[str] = set()
         unread: list[Exception] = []
-        for project_id in sorted(configured | self._projects_with_pool()):
+        for project_id in sorted(configured | with_pool):
             try:
                 pool = self._shared.read(warm_pool.pool_key(project_id), Pool)
             except (ValueError, RecursionError) as error:
@@ -118,9 +118,10 @@ class Pools:
     def handovers(self) -> Iterator[tuple[str, str]]:
         """Yield the project's id and the server's name of each handover document.
 
-        AWS calls: two reads of the master list and a listing; a listing for each project with a pool or `warmServers`.
+        AWS calls: a read of the master list and a listing; a listing for each project with a pool or `warmServers`.
         """
-        for project_id in sorted(self._projects_with_warm_servers() | self._projects_with_pool()):
+        configured, with_pool = self._projects()
+        for project_id in sorted(configured | with_pool):
             for entry in self._platform.documents.list(handovers_folder(project_id)):
                 name = entry.key.rpartition("/")[2].removesuffix(".json")
                 if ids.parse_server_name(name) and entry.key == handover_key(project_id, name):
@@ -130,15 +131,13 @@ class Pools:
         """Delete the handover document of the warm server of this name."""
         self._platform.documents.delete(handover_key(project_id, name))
 
-    def _projects_with_warm_servers(self) -> set[str]:
-        """The live projects with `warmServers`."""
-        return {p.id for p in self._project_cache.projects(fresh=timedelta(0)) if p.live and p.warm_servers}
-
-    def _projects_with_pool(self) -> set[str]:
-        """The registered projects that have a pool document, even an empty one."""
-        registered = {warm_pool.pool_key(p.id): p.id for p in self._project_cache.projects(fresh=timedelta(0))}
+    def _projects(self) -> tuple[set[str], set[str]]:
+        """The ids of live projects with `warmServers`, and of projects that have a pool document, even an empty one."""
+        projects = self._project_cache.projects(fresh=timedelta(0))
+        configured = {project.id for project in projects if project.live and project.warm_servers}
+        registered = {warm_pool.pool_key(project.id): project.id for project in projects}
         found = (entry.key for entry in self._platform.documents.list(warm_pool.POOLS))
-        return {registered[key] for key in found if key in registered}
+        return configured, {registered[key] for key in found if key in registered}
 
     def _repair(self, project_id: str, pool: Pool, repository: Repository) -> None:
         def state_of(warm_id: str) -> ServerState:
