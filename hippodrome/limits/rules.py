@@ -176,10 +176,7 @@ class ServerSlots(Record, frozen=True):
     def without(self, label: str) -> ServerSlots:
         """Release the slot of a server whose used seconds are not known: all that it reserved count as used."""
         mine = self.slots.get(label)
-        if mine is None:
-            return self
-        others = {other: held for other, held in self.slots.items() if other != label}
-        return ServerSlots(others, self.used + mine.reserved)
+        return self.without_all({label: (mine.attempt, None)}) if mine else self
 
     def without_all(self, ended: Mapping[str, tuple[int, int | None]]) -> ServerSlots:
         """Release the slots of servers: `ended` has, by label, the attempt and the seconds used (None: not known).

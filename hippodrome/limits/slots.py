@@ -12,7 +12,6 @@ from hippodrome.limits.rules import SHARDS, ParticipantSlots, ServerSlots
 from hippodrome.log import failure
 from hippodrome.model import ids
 from hippodrome.model.project import Project
-from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.storage.compare_and_swap import SharedDocuments
@@ -161,11 +160,9 @@ class Slots:
         """
         found = {}
         for project in projects:
-            if project.limits_servers and (
-                document := self._platform.documents.get(limits.server_slots_key(project.id))
-            ):
+            if project.limits_servers:
                 try:
-                    found[project.id] = from_json(document.body, ServerSlots)
+                    found[project.id] = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
                 except (ValueError, RecursionError) as error:
                     failure("a project's slots cannot be read", error, project=project.id)
         return found
@@ -175,18 +172,16 @@ class Slots:
 
         `forgotten` maps a server's name to its closed record; None if the server has no record any more.
         """
-        ended = dict(filter(None, (_end(name, record) for name, record in forgotten.items())))
+        ended = {}
+        for name, record in forgotten.items():
+            if (parsed := ids.parse_server_name(name)) is not None:
+                label, attempt = parsed
+                ended[label] = attempt, _seconds_used(record, attempt)
         self._shared.change(limits.server_slots_key(project_id), ServerSlots, lambda slots: slots.without_all(ended))
 
 
-def _end(name: str, record: Server | None) -> tuple[str, tuple[int, int | None]] | None:
-    """Return label, attempt and used seconds of the server of this name; None if it is no server's name.
-
-    The seconds are None if the record is missing, of another attempt, or not closed.
-    """
-    label, attempt = ids.parse_server_name(name) or ("", 0)
-    if not label:
-        return None
+def _seconds_used(record: Server | None, attempt: int) -> int | None:
+    """The seconds that this attempt used; None if there is no record, or if it is at another attempt or not closed."""
     if record is None or record.attempt != attempt or record.closed is None or record.reason is None:
-        return label, (attempt, None)
-    return label, (attempt, limits.seconds_used(record, record.reason, record.closed))
+        return None
+    return limits.seconds_used(record, record.reason, record.closed)
