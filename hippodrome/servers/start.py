@@ -78,7 +78,8 @@ class Start:
     def _for_session(self, project: Project, message: StartServer) -> Project:
         """The project as it was registered last for this session's number of players.
 
-        One read of the session's server record if the message does not say the number, as messages of replacements.
+        The start message of a replacement does not say the number. Then it is read from the record of the session's
+        server, which is one AWS call.
         """
         players = message.players
         if not players:
@@ -198,7 +199,7 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
     """The environment variables of a trial server (`protocol/environment.py`)."""
     certificate = location(record.domain, settings.root_domain)
     return {
-        **_own_environment(project, record, settings),
+        **_owner_environment(project, record, settings),
         **({environment.MATCHING: MATCH} if project.asks_match else {}),
         **_plain_environment(project, record, settings),
         environment.PROJECT_ID: record.project_id,
@@ -212,28 +213,26 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
     }
 
 
-def _own_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """The variables that name the server's owner and deadline."""
+def _owner_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
+    """The variables that name the server's owner and deadline. A warm server has no owner yet."""
+    deadline = record.deadline
     if record.is_warm_server:
-        return _warm_environment(project, record, settings)
-    deadline = {environment.DEADLINE: str(int(record.deadline.timestamp()))}
-    if record.is_sessions:
-        return {environment.SESSION: record.user_id, **deadline}
-    group = environment.group_text(project.group(record.user_id))
-    return {environment.USER_ID: record.user_id, environment.GROUP: group, **deadline}
+        owner = {environment.WARM_SERVER: "on"}
+        # Whoever is assigned the server at the last moment still gets all of maxRuntime, and a session also the time to
+        # wait for its members.
+        deadline += lifetime_asked_for(project, settings)
+    elif record.is_sessions:
+        owner = {environment.SESSION: record.user_id}
+    else:
+        group = environment.group_text(project.group(record.user_id))
+        owner = {environment.USER_ID: record.user_id, environment.GROUP: group}
+    return {**owner, environment.DEADLINE: str(int(deadline.timestamp()))}
 
 
 def _plain_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """The origins of the front end that needs no token, if project and installation allow one; none if warm."""
+    """The variable with the origins of a front end that needs no token (`plainClients`), if there is such a front end.
+
+    The project and the installation must both allow it. A warm server gets no such variable.
+    """
     allowed = project.plain_clients and settings.plain_clients and not record.is_warm_server
     return {environment.PLAIN_ORIGINS: " ".join(project.front_end)} if allowed and project.front_end else {}
-
-
-def _warm_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:
-    """The variables of a server without an owner.
-
-    The deadline leaves all of maxRuntime to a participant who gets the server at the last moment, and to a session the
-    time to wait for its members as well.
-    """
-    last = record.deadline + lifetime_asked_for(project, settings)
-    return {environment.WARM_SERVER: "on", environment.DEADLINE: str(int(last.timestamp()))}
