@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -63,9 +62,8 @@ class Route53Dns:
         added = {record.name: record for record in add}
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
         changes += [_change("UPSERT", record) for record in added.values()]
-        rest = iter(changes)
         refused: _Refused = []
-        made = [self._change_batch(batch, refused) for batch in iter(lambda: [*islice(rest, BATCH)], [])]
+        made = [self._change_batch(changes[at : at + BATCH], refused) for at in range(0, len(changes), BATCH)]
         change = ",".join(change for change in made if change)
         if refused:
             raise RefusedDnsRecords([added[name] for name in refused], change)

@@ -22,7 +22,7 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -247,8 +247,7 @@ def client_token(request: TaskRequest) -> str:
     return hashlib.sha256(f"{request.name}\0{kind}\0{request.nonce}".encode()).hexdigest()
 
 
-def _described(ecs: Any, cluster: str, tasks: Iterable[str]) -> Iterator[RunningTask]:
-    arns: list[str] = [*tasks]
+def _described(ecs: Any, cluster: str, arns: Sequence[str]) -> Iterator[RunningTask]:
     if not arns:  # DescribeTasks takes 1 to 100; ListTasks gives at most 100 a page
         return
     for task in ecs.describe_tasks(cluster=cluster, tasks=arns)["tasks"]:

@@ -38,7 +38,7 @@ class SchedulerTimers:
         if at.tzinfo is None:
             raise ValueError("a timer's time needs a time zone")
         schedule = self._schedule(name, max(at, self._now() + MIN_DELAY), message)
-        for last in [False] * (MAX_TRIES - 1) + [True]:
+        for attempt in range(MAX_TRIES):
             try:
                 self._client().create_schedule(**schedule)
             except ClientError as error:
@@ -49,7 +49,7 @@ class SchedulerTimers:
             try:
                 self._client().update_schedule(**schedule)
             except ClientError as error:
-                if last or errors.code(error) != "ResourceNotFoundException":
+                if attempt + 1 == MAX_TRIES or errors.code(error) != "ResourceNotFoundException":
                     raise
             else:
                 return

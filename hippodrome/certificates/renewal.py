@@ -215,10 +215,9 @@ class Renewal:
         if not isinstance(error, Exception):  # Ctrl-C is no failure
             self._record_result(token, rules.unclaimed)
             return
-        reason = error.reason if isinstance(error, OrderFailed) else FailureReason.BROKEN
-        text = str(error) if isinstance(error, OrderFailed) else type(error).__name__
-        until = error.until if isinstance(error, OrderFailed) else None
-        failure = rules.FailedOrder(self._now(), wanted.directory, reason, text, until)
+        if not isinstance(error, OrderFailed):
+            error = OrderFailed(FailureReason.BROKEN, type(error).__name__)
+        failure = rules.FailedOrder(self._now(), wanted.directory, error.reason, str(error), error.until)
         self._record_result(token, lambda state: rules.failed(state, failure))
 
     # ---- the order
