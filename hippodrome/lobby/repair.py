@@ -55,8 +55,8 @@ class Repair:
         servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
         entries = self._store.entries(project)  # with the marks of what has just been carried out
         run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=StartedAhead(servers))
-        closed = [each for each in servers.values() if each and each.closed]
-        over = [each.user_id for each in closed if each.closed and run.now - each.closed > CLOSED_FOR_GOOD]
+        closed = {name: each.closed for name, each in servers.items() if each and each.closed}
+        over = [name for name, since in closed.items() if run.now - since > CLOSED_FOR_GOOD]
         wanted = servers_ahead.sessions_wanted(known, entries, project)
         ended = servers_ahead.surplus(known, wanted, over, run.now, players=project.players, open_for=run.open_for)
 

@@ -95,7 +95,7 @@ class DnsRecords:
         """
         unregistered: list[Server] = []
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
-            named = [ServerAttempt(record.label, record.attempt) for record in batch]
+            named = [_attempt_of(record) for record in batch]
             try:
                 change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
             except ServiceBusy:
@@ -104,14 +104,11 @@ class DnsRecords:
                 unmade = DnsChanged("", named, looked + 1, unmade=True)
                 self._platform.bus.send_delayed(to_message(unmade), RETRY_PAUSE)
             except RefusedDnsRecords as refused:
-                others = [record for record in batch if record.dns_record not in refused.records]
-                if others:
-                    self._after_change(
-                        DnsChanged(refused.change, [ServerAttempt(one.label, one.attempt) for one in others])
-                    )
-                unregistered += self._rename(
-                    [record for record in batch if record.dns_record in refused.records], looked
-                )
+                created = [_attempt_of(record) for record in batch if record.dns_record not in refused.records]
+                if created:
+                    self._after_change(DnsChanged(refused.change, created))
+                to_rename = [record for record in batch if record.dns_record in refused.records]
+                unregistered += self._rename(to_rename, looked)
             else:
                 self._after_change(DnsChanged(change, named))
         return unregistered
@@ -188,22 +185,19 @@ class DnsRecords:
 
     def _retry_create(self, unmade: Sequence[DnsChanged]) -> list[DnsChanged]:
         """Create the DNS records for which the zone was busy, with one change; return the messages to deliver again."""
-        wanted = {(named.label, named.attempt): named for message in unmade for named in message.servers}
         waiting, failed = for_each(
             self._platform,
-            wanted.values(),
+            dict.fromkeys(named for message in unmade for named in message.servers),
             self._waiting_record,
             "a DNS record is not created yet",
             lambda named: ids.server_name(named.label, named.attempt),
         )
         try:
-            made = self._create(
-                [record for _, record in waiting], max((message.looked for message in unmade), default=0)
-            )
+            unregistered = self._create([record for _, record in waiting], max(message.looked for message in unmade))
         except Exception as error:  # noqa: BLE001 - the checks of other changes must not come twice
             failure("DNS records are not created yet", error)
             return list(unmade)
-        failed += [ServerAttempt(record.label, record.attempt) for record in made]
+        failed += map(_attempt_of, unregistered)
         return [message for message in unmade if any(named in failed for named in message.servers)]
 
     def _waiting_record(self, named: ServerAttempt) -> Server | None:
@@ -263,9 +257,8 @@ class DnsRecords:
         if found is None or found.server.name != name:
             return None
         record = found.server
-        if (
-            record.is_warm_server and record.state is ServerState.READY
-        ):  # also if an earlier call ended before this line
+        # Even if `ready` was written before: that call may have been interrupted before it changed the pool.
+        if record.is_warm_server and record.state is ServerState.READY:
             self._pools.mark_ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
@@ -277,6 +270,10 @@ class DnsRecords:
             stored,
             lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is ServerState.NAMING else None,
         )
+
+
+def _attempt_of(record: Server) -> ServerAttempt:
+    return ServerAttempt(record.label, record.attempt)
 
 
 def pause(looked: int) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 from hippodrome.limits.slots import Slots
 from hippodrome.lobby.lobby import Lobby
 from hippodrome.ports import Platform
@@ -27,8 +25,8 @@ class ServerServices:
         self.slots = Slots(platform)
         self.pools = Pools(platform, self.project_cache)
         self.handovers = Handovers(platform, self.repository, self.slots, self.pools)
-        self.written: dict[tuple[str, int], Versioned] = {}  # records last written as `naming`, by label and attempt
-        self._failures: deque[Cause] = deque()
+        self.written: dict[tuple[str, int], Versioned] = {}  # by label and attempt: records in state `naming`
+        self._failures: list[Cause] = []
 
     def failed(self, cause: Cause) -> None:
         """Note that a server was closed because it failed."""
@@ -36,7 +34,5 @@ class ServerServices:
 
     def failures(self) -> list[Cause]:
         """Return the causes of the failed servers that were closed since the last call, one per server."""
-        found: list[Cause] = []
-        while self._failures:
-            found.append(self._failures.popleft())
+        found, self._failures = self._failures, []
         return found

@@ -132,11 +132,11 @@ class SigningRefusal(Exception):
 
 @dataclass(frozen=True)
 class ServerAccess:
-    """The facts about a server from which the documents follow that it may read and create.
+    """The facts about a server that decide which documents it may read and create. Pure.
 
     `name` is the server's own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id`
     and `certificate` are set. `user_id` may be a session's id; then `members` are the ids of the session's members,
-    once it is formed. Pure.
+    once it is formed.
     """
 
     name: str
@@ -233,12 +233,13 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
 
     The result is None if the record has no server of this name.
     """
-    common = {"project_id": record.project_id, "user_id": record.user_id, "label": record.label}
     for run in (server.past_attempt(record), *record.earlier):
         if (run.warm_server_name or ids.server_name(record.label, run.attempt)) == name:
             return ServerAccess(
                 name,
-                **common,
+                record.project_id,
+                record.user_id,
+                record.label,
                 attempt=run.attempt,
                 game_steps=run.game_steps,
                 closed=run.closed,

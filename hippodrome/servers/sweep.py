@@ -122,9 +122,8 @@ class Sweep:
         Both are empty if the list of projects cannot be read.
         """
         try:
-            return self._slots.server_slots(self._project_cache.projects(fresh=timedelta(0))), list(
-                self._pools.handovers()
-            )
+            slots = self._slots.server_slots(self._project_cache.projects(fresh=timedelta(0)))
+            return slots, list(self._pools.handovers())
         except (ValueError, RecursionError) as error:
             failure("the list of projects cannot be read", error)
             self._result.failed += 1
