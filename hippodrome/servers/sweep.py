@@ -166,8 +166,8 @@ class Sweep:
 
     def _record_of(self, name: str) -> Server | None:
         """The server's own record; None if there is none, or if the server was assigned to a participant."""
-        known, (label, _) = self._owners.get(name), ids.parse_server_name(name) or ("", 0)
-        return known.server if known and known.server.label == label else None
+        owner = self._owners.get(name)
+        return owner.server if owner and owner.server.warm_server_name != name else None
 
     def _check_states(self, tasks: Mapping[str, RunningTask]) -> None:
         """Act on the servers that stay in a state for too long (`overdue.py`)."""
