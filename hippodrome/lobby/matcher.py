@@ -74,7 +74,7 @@ class Matcher:
         if change(question) == question:
             return chosen
         try:
-            changed = self._shared.change(key, Question, change, renew=True)
+            changed = self._shared.change(key, Question, change, anew=Question())
         except RetryLater:  # many participants come at once; the next request tries again
             logger.info("the question to match keeps changing", extra={"project": project.id})
             return ()

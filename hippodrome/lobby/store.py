@@ -56,7 +56,7 @@ class LobbyStore:
             return decisions.next_version(document, change(document))
 
         anew = Decisions(renewed=self._platform.now())
-        return self._shared.change(decisions.key(project.id), Decisions, counted, renew=True, anew=anew).after
+        return self._shared.change(decisions.key(project.id), Decisions, counted, anew=anew).after
 
     # Entries
 

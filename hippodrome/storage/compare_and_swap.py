@@ -36,15 +36,13 @@ class SharedDocuments:
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
 
-    def change(
-        self, key: str, kind: type[R], change: Callable[[R], R], *, renew: bool = False, anew: R | None = None
-    ) -> Changed[R]:
+    def change(self, key: str, kind: type[R], change: Callable[[R], R], *, anew: R | None = None) -> Changed[R]:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
         If `change` returns an equal record, nothing is written. AWS calls: two; one if nothing is written. Raises
         `RetryLater` after `TRIES` conflicts. If the document cannot be read as such a record, this raises ValueError or
-        RecursionError and writes nothing. But with `renew`, which is for data that can be rebuilt, `change` is then
-        applied to `anew` (by default an empty record), and the result replaces the document.
+        RecursionError and writes nothing. With `anew`, which is for data that can be rebuilt, `change` is applied to
+        `anew` instead, and the result replaces the document.
         """
         for _ in range(TRIES):
             found = self._documents.get(key)
@@ -53,9 +51,9 @@ class SharedDocuments:
                 try:
                     before = from_json(found.body, kind)
                 except (ValueError, RecursionError) as error:
-                    if not renew:
+                    if anew is None:
                         raise
-                    before, unreadable = anew or before, True
+                    before, unreadable = anew, True
                     failure("a document cannot be read and is made anew", error, kind=kind.__name__)
             after = change(before)
             if after == before and not unreadable:

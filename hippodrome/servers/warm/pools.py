@@ -162,7 +162,7 @@ class Pools:
         )
 
     def _change(self, project_id: str, change: Callable[[Pool], Pool]) -> Changed[Pool]:
-        return self._shared.change(warm_pool.pool_key(project_id), Pool, change, renew=True)
+        return self._shared.change(warm_pool.pool_key(project_id), Pool, change, anew=Pool())
 
     def _start_servers(self, project_id: str, warm_ids: Collection[str]) -> None:
         for warm_id in warm_ids:
