@@ -78,11 +78,6 @@ def may_use_aws(folder: Path) -> bool:
     return _value_of(folder, "useAWS") is None and _value_of(folder, "awsSetup") is not None
 
 
-def keeps_off_aws(config: Config) -> bool:
-    """Whether config.yml says `useAWS: false`. Without the key, `register` puts the study on AWS."""
-    return config.project.given("useAWS") and not config.project.use_aws
-
-
 def _value_of(folder: Path, key: str) -> Any:
     """Return the value of this key in the section `project` of config.yml; None if the key is missing."""
     try:
@@ -124,7 +119,7 @@ def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
     """Yield the missing keys that only AWS needs. With `useAWS: true` the servers' size has been checked already."""
     setup = config.project.aws_setup
     missing = [key for key in ("cpu", "memory") if not setup.given(key)]
-    if keeps_off_aws(config):
+    if config.project.keeps_off_aws:
         yield ("project", "useAWS"), "is false, which keeps this study on one machine; write true"
     if missing:
         yield (

@@ -52,7 +52,7 @@ def study_in(folder: Path) -> project_folder.ProjectFolder | None:
         config = read_project(folder)
     except ConfigErrors:
         return project_folder.read(folder)  # raises `Problem` with all of them
-    if project_folder.keeps_off_aws(config):
+    if config.project.keeps_off_aws:
         screen.warning(
             f"The study {config.project.id} stays on one machine, as its config.yml says (useAWS: false); "
             "to put it on AWS, write true."

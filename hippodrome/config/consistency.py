@@ -109,10 +109,9 @@ _AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the ins
 
 def _aws(checked: Checked) -> Iterator[Mistake]:
     """`useAWS: true` needs a size of servers, and Fargate must offer this size."""
-    setup = checked.root.project.aws_setup
-    path: Keys = ("project", "awsSetup")
-    project = checked.root.project
-    if not checked.valid(("project", "useAWS")) or (project.given("useAWS") and not project.use_aws):
+    project, path = checked.root.project, ("project", "awsSetup")
+    setup = project.aws_setup
+    if not checked.valid(("project", "useAWS")) or project.keeps_off_aws:
         return
     for key, needed in _AWS_NEEDS.items():
         if project.use_aws and not setup.given(key) and checked.valid((*path, key)):

@@ -329,6 +329,11 @@ class ProjectKeys(Model):
     """The study's own words for Hippodrome's texts (docs/texts.md). Default: English."""
 
     @property
+    def keeps_off_aws(self) -> bool:
+        """Whether config.yml says `useAWS: false`. Without the key, `register` puts the study on AWS."""
+        return self.given("useAWS") and not self.use_aws
+
+    @property
     def has_sessions(self) -> bool:
         """Whether several participants share a server."""
         return self.players > 1

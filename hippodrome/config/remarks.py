@@ -141,8 +141,7 @@ def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[R
 def _names_a_certificate(config: Config) -> bool:
     """Whether a study that may run on AWS has the section `ssl`."""
     project = config.project
-    local_only = project.given("useAWS") and not project.use_aws
-    return not local_only and any(value is not None for value in project.ssl.model_dump().values())
+    return not project.keeps_off_aws and any(value is not None for value in project.ssl.model_dump().values())
 
 
 def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:

@@ -60,9 +60,9 @@ def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]
     if games:
         start = default_start(games) if start is None else start
         stop = default_stop(games) if stop is None else stop
-    return EventsKeys.model_validate(
-        {
-            "startServerStep": None if start is None else keys[start],
-            "stopServerStep": None if stop is None else keys[stop],
+    return events.model_copy(
+        update={
+            "start_server_step": None if start is None else keys[start],
+            "stop_server_step": None if stop is None else keys[stop],
         }
     )
