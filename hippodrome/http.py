@@ -221,5 +221,5 @@ def see_other(url: str) -> Response:
 
 
 def found(url: str) -> Response:
-    """Return a response with status 302: the client repeats its request at `url`."""
+    """Return a response with status 302: the client continues at `url`, a browser with a GET."""
     return Response(302, "", {"Location": url})

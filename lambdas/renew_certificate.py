@@ -11,7 +11,7 @@ from hippodrome.log import failure, logger
 from lambdas import installed
 
 MAX_ORDER_SECONDS = 480.0  # an order usually takes one to two minutes
-MARGIN = 60.0  # seconds after an order to end its last request, remove the TXT record and write the state
+MARGIN = 60.0  # seconds kept for the end of an order: its last request, removing the TXT record, writing the state
 
 
 def handler(event: dict[str, Any], context: Any) -> dict[str, str]:

@@ -10,7 +10,8 @@ from hippodrome.http import Request, Response
 from hippodrome.log import failure
 
 _NO_STEP = '<input type="hidden" name="hippodrome-step" value="">'
-"""A front end puts a button below the page. With this field its form answers no step, and gets the due step's page."""
+"""HIPPO's front end puts a button below the page. With this field, the button's form answers no step: the page of
+the due step follows."""
 
 
 def respond(event: Mapping[str, Any], respond: Callable[[Request], Response]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The answer to a step: `{projectId}/users/{userId}/answers/{step}.json`, created once and never written again.
 
-The control plane writes the answer to a page, and the trial server that to a game step. Both sides read answers.
+The control plane writes the answers to pages, and the trial server writes the answers to game steps. If the lobby finds
+no other participants, the control plane writes the answers to game steps, too. Both sides read answers.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ _NO_FSYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF)  # some network file syst
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in the folder to the disk. Raises OSError."""
+    """Bring the names of the folder's files to the disk. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -31,7 +31,7 @@ def sync_folder(folder: Path) -> None:
 def make_folder(folder: Path) -> None:
     """Make the folder and the missing folders above it, and bring their names to the disk. Raises OSError."""
     missing = []
-    while not _is_folder(folder):
+    while not _exists(folder):
         missing.append(folder)
         folder = folder.parent
     for path in reversed(missing):
@@ -42,7 +42,7 @@ def make_folder(folder: Path) -> None:
 def write_new(path: Path, data: bytes | Path) -> None:
     """Write a new file with these bytes, or with the content of another file, and bring it to the disk.
 
-    Raises FileExistsError if there is such a file, and other OSErrors, after which there is no file or a part of it.
+    Raises FileExistsError if the file exists already. After another OSError the file is missing or incomplete.
     """
     with path.open("xb") as out:
         if isinstance(data, Path):
@@ -58,7 +58,7 @@ def create(path: Path, data: bytes | Path, scratch: Path | None = None) -> None:
     """Create a whole file with these bytes, or with the content of another file, and bring it to the disk.
 
     `scratch` is a folder of the same file system for the unfinished file; by default it lies in the file's own folder.
-    Raises FileExistsError if there is such a file (its name is on the disk then, too), and other OSErrors.
+    Raises FileExistsError if the file exists already; then its name is on the disk, too. Raises other OSErrors.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
@@ -75,7 +75,7 @@ def create(path: Path, data: bytes | Path, scratch: Path | None = None) -> None:
 def move(file: Path, path: Path) -> None:
     """Move a finished file to `path`, perhaps on another file system, and bring it to the disk there.
 
-    Raises FileExistsError if there is such a file, and other OSErrors; then `file` is still at its old place.
+    Raises FileExistsError if `path` exists already, and other OSErrors; then `file` is still at its old place.
     """
     with file.open("rb") as content:
         os.fsync(content.fileno())
@@ -92,8 +92,8 @@ def move(file: Path, path: Path) -> None:
 def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, durable: bool = True) -> None:
     """Create or replace the file, with these bytes or with the content of another file.
 
-    With `durable`, the new file is on the disk when this returns. Otherwise a power cut may bring the earlier file back
-    (or none), but always a whole one. `scratch` is as in `create`. Raises OSError.
+    With `durable`, the new file is on the disk when this returns. Otherwise a power cut may restore the earlier file,
+    or leave no file, but never a part of one. `scratch` is as in `create`. Raises OSError.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
@@ -112,8 +112,8 @@ def remove_if_possible(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _is_folder(path: Path) -> bool:
-    """Unlike `Path.is_dir`, this does not take a path that cannot be accessed for a missing one."""
+def _exists(path: Path) -> bool:
+    """Return whether the path exists. Unlike `Path.exists`, raise OSError if the path cannot be accessed."""
     try:
         os.stat(path)
     except FileNotFoundError:

@@ -27,8 +27,8 @@ GROUP = "GROUP"
 WARM_SERVER = "SPARE"
 """`on` for a warm server, which has no participant when it starts."""
 SESSION = "SESSION"
-"""The session's id, if several participants play on this server. The server has no USER_ID and no GROUP then: it reads
-its members and the group in the session's document."""
+"""The session's id, if several participants play on this server. Such a server has no USER_ID and no GROUP: it reads
+its members and their groups in the session's document."""
 
 # Given by the control plane
 
@@ -62,9 +62,9 @@ STOP_SECONDS = "STOP_SECONDS"
 # For tests and slow agents
 
 IDLE_SECONDS = "IDLE_SECONDS"
-"""Seconds for which the server waits while no participant is connected, before it ends; 600 by default."""
+"""Seconds for which no participant is connected before the server ends; 600 by default."""
 GRACE_SECONDS = "GRACE_SECONDS"
-"""The least seconds for which the server waits for a participant who was connected before; 60 by default."""
+"""Seconds for which the server waits at least for a participant who was connected before; 60 by default."""
 START_SECONDS = "START_SECONDS"
 """Seconds in which the agent must start; 300 by default."""
 STEP_SECONDS = "STEP_SECONDS"
@@ -72,11 +72,12 @@ STEP_SECONDS = "STEP_SECONDS"
 HELLO_SECONDS = "HELLO_SECONDS"
 """Seconds in which a client that has connected must send its first message; 10 by default."""
 RECORDINGS_FIRST_SECONDS = "RECORDINGS_FIRST_SECONDS"
-"""The most seconds for which an answer waits until the recordings before it are stored; 120 by default."""
+"""Seconds for which an answer waits at most until the recordings before it are stored; 120 by default."""
 LINGER_SECONDS = "LINGER_SECONDS"
 """Seconds from when the answer is stored until the process ends; 2 by default."""
 WARM_SERVER_SECONDS = "SPARE_SECONDS"
-"""Seconds between two looks of a warm server for its handover; 20 by default."""
+"""Seconds after which a server without participants looks again for the document that names them (its handover, or its
+session's document); 20 by default."""
 
 SECRETS = (TOKEN, CREDENTIAL)
 PARTICIPANT = (USER_ID, GROUP)

@@ -20,7 +20,7 @@ SCHEMA = 1
 
 
 class BadHandover(ValueError):
-    """The document is no valid handover. The message holds nothing of its content."""
+    """The document is not a valid handover. The message quotes nothing from the document."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from protocol import keyboard, values
 from protocol.values import LONGEST_NAME, Keys, SectionProblem, checked
 
 MAX_KEYS = 100
-"""Entries of one map: keys of one player, labels, or names."""
+"""The largest number of entries in one map: keys of one player, labels, or names."""
 _LABEL = values.text("the text of a button", LONGEST_NAME)
 _NAME = values.text("what participants read", LONGEST_NAME)
 

@@ -11,7 +11,7 @@ from protocol.similar import nearest
 from protocol.values import printable, show
 
 MAX_TOGETHER = 4
-"""Keys that may be joined by `+`."""
+"""The largest number of keys that may be joined by `+`."""
 
 _SPACE = " "
 _NAMED = frozenset(

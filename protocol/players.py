@@ -22,7 +22,7 @@ action with the highest output."""
 ONNXRUNTIME = "onnxruntime==1.32.0"
 """The package that runs policies' files, in the version that was tested (requirements/dev.txt)."""
 ALL_KINDS = "human, random, idle, agent:Class, a file such as policies/partner.onnx, or gym://name"
-"""All kinds of values of a player, for messages."""
+"""The values that a player may have, for messages."""
 
 MAX_PLAYERS = 64
 _MAX_FILES_NAMED = 5

@@ -6,8 +6,8 @@ formed. The trial server reads it, and lets in only the members:
     {"schema": 1, "id": "s.…", "players": 2, "group": null, "formed": "…",
      "members": [{"userId": "…", "group": null, "seat": 0}, …]}
 
-A member plays the human player with the number of their seat, in the order of the environment. `trial.substitute` plays
-in the seats that no member has.
+The human players of the environment are numbered from 0, in the environment's order. A member plays the one with the
+number of their seat. `trial.substitute` plays in the seats that no member has.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SESSION_ID = re.compile(r"s\.[0-9a-f]{20}")
 
 
 class BadSession(ValueError):
-    """The document is no valid session. The message holds nothing of its content."""
+    """The document is not a valid session. The message quotes nothing from the document."""
 
 
 @dataclass(frozen=True, slots=True)

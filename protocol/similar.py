@@ -9,10 +9,7 @@ SIMILAR = 0.65
 """How similar an unknown name must be to a known one for a message to suggest it: difflib's ratio, from 0 to 1."""
 
 SIMILAR_FILES = 0.75
-"""How similar the name of a file must be, for the same purpose as `SIMILAR`.
-
-It is higher than `SIMILAR`, because different names of files have words and endings in common.
-"""
+"""The same for names of files. It is higher, because different names of files have words and endings in common."""
 
 
 def nearest(name: str, known: Iterable[str], similar: float = SIMILAR) -> str | None:

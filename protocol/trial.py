@@ -1,4 +1,4 @@
-"""The `trial` section of config.yml: its keys, and the values of each. `protocol/trial_check.py` checks it."""
+"""The `trial` section of config.yml: its keys, and their values. `protocol/trial_check.py` checks a section."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _CONTROL = values.text("the name of a control", LONGEST_NAME)
 
 
 def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
-    """Return the values of a `trial` section, and all its problems. Raises nothing.
+    """Return the values of a `trial` section, and all its problems. Never raises.
 
     `section` holds JSON values, or texts and `values.Plain`. A key without a value counts as not given. The default
     takes the place of a wrong value. Unknown keys are ignored.

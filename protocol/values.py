@@ -36,7 +36,7 @@ class Plain:
 
 
 class SectionProblem(NamedTuple):
-    """A mistake in the section: the path of the key below `trial`, and a sentence that says what to write.
+    """A mistake in the section `trial`: the path of the key below `trial`, and a sentence that says what to write.
 
     `compared` has the keys that a rule compares (`trial_rules.py`); it is empty if the value is wrong by itself.
     """
@@ -194,7 +194,7 @@ def one_of(*choices: str) -> Check:
 def items(item: str, limit: int, single: bool = False) -> Callable[[object], list[object]]:
     """Return a check for a list of at most `limit` items; `item` names one in messages.
 
-    With `single`, the check takes one text for a list of one.
+    With `single`, the check also accepts a single text, and returns a list with this text.
     """
 
     def check(value: object) -> list[object]:

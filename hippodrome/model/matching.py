@@ -6,13 +6,15 @@ from collections.abc import Mapping
 
 MATCH = "match"
 MATCHINGS = ("arrival", "group", "mixed", MATCH)
-"""In the order of arrival; people of one group; people of different groups; as the function `match` has chosen."""
+"""Who plays together: participants in the order of their arrival, of one group, of different groups, or those whom the
+function `match` chooses."""
 MATCHED_BY = ("same", "different")
-"""The keys of a `matching` that is a map: people with the same answer, or with different ones, in a field of a page."""
+"""The keys of a `matching` that is a map. They mean participants with the same answer, or with different answers, in a
+field of a page."""
 
 SEATS = ("lot", "group", "match")
-"""Which member of a session plays which player: by lot; by the number of the group; in the order in which `match` names
-the members."""
+"""What decides which player a member of a session plays: the lot, the number of the member's group, or the order in
+which `match` names the members."""
 
 
 def field_of(matching: str | Mapping[str, str]) -> str | None:

@@ -35,7 +35,7 @@ class StartServer(Record, frozen=True):
 
     `user_id` may also be a warm server's id, or a session's. In a project with several players a participant's message
     starts no server of their own: it says that they are under way to the game. `players` is the number of players of a
-    session; 0 means the number in its server's record, or without a record the registered one.
+    session; 0 means the number in its server's record, or the registered number if there is no record.
     """
 
     project_id: str
@@ -79,9 +79,9 @@ class ServerAttempt(Record, frozen=True):
 
 
 class DnsChanged(Record, frozen=True):
-    """A message from `task_changed` to itself: look whether this DNS change is INSYNC. Then these servers are ready.
+    """A message from `task_changed` to itself: check whether this DNS change is INSYNC. If so, the servers are ready.
 
-    `looked` counts the checks before this one. With `unmade`, the zone was busy, and the change must still be made.
+    `looked` counts the earlier checks. With `unmade`, the zone was busy, and the change must still be made.
     """
 
     change: str
@@ -226,7 +226,7 @@ def to_message(record: Record) -> Message:
 
 
 def _read(body: Any, kind: type[R]) -> R | None:
-    """Read a record of this kind; None if the body is none."""
+    """Read a record of this kind; None if the body is no such record."""
     try:
         return from_data(body, kind)
     except (msgspec.ValidationError, RecursionError):

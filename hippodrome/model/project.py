@@ -12,6 +12,7 @@ from hippodrome.model.matching import MATCH
 from hippodrome.model.records import Record, from_data, from_json, to_json
 from hippodrome.model.step_types import StepType, type_of
 
+MASTER_LIST = "project_master_list.json"
 STEPS_FOLDER: Literal["steps"] = "steps"
 GAME_PAGES = ("instructions", "betweenEpisodes")
 """The keys of `trial` that may name a page."""
@@ -118,12 +119,10 @@ class Project(Record, frozen=True):
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
     server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
-    game_pages: Mapping[str, int] = msgspec.field(
-        default_factory=dict
-    )  # variants, by the key of trial that names a page
-    page_folder: Literal["steps", ""] = (
-        STEPS_FOLDER  # where the pages lie below {id}/; "" is where HIPPO's script puts them
-    )
+    game_pages: Mapping[str, int] = msgspec.field(default_factory=dict)
+    """The number of variants of each page that the game page shows, by the key of `trial` that names the page."""
+    page_folder: Literal["steps", ""] = STEPS_FOLDER
+    """The folder of the pages below {id}/. HIPPO's script puts them into {id}/ itself, which is ""."""
     other_numbers: tuple[ForPlayers, ...] = ()  # the last registrations for other numbers of players
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
@@ -364,9 +363,6 @@ def _without_secret(raw: bytes) -> bytes:
         return raw
     entry = from_json(raw, dict[str, msgspec.Raw])
     return msgspec.json.encode({key: value for key, value in entry.items() if key != "secret"})
-
-
-MASTER_LIST = "project_master_list.json"
 
 
 def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:

@@ -89,7 +89,7 @@ class Server(Record, frozen=True):
     user_id: str
     attempt: int
     state: ServerState
-    token: str  # empty except in records of earlier versions (`secret.py`), which require the key
+    token: str  # "" except in records of earlier versions; they require the key, so it is always written (`secret.py`)
     requested: datetime
     deadline: datetime
     cluster: str
@@ -107,10 +107,9 @@ class Server(Record, frozen=True):
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
     counted: bool = False  # whether it holds one of its project's slots until it is closed
-    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # of the warm server assigned to it
-    assigned_to: str | None = msgspec.field(
-        default=None, name="takenBy"
-    )  # of a warm server: the label of the participant's record that owns its resources now
+    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # the name of its assigned warm server
+    assigned_to: str | None = msgspec.field(default=None, name="takenBy")
+    """For a warm server: the label of the record that owns its resources now."""
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # the steps whose answers it may store: the project's when it was started
     may_match: bool = False  # with `matching: match`: whether it answers questions to `match` while it has no members

@@ -1,7 +1,7 @@
 """How long servers live, and how long the server of a session (`project.players`) may wait for its members. Pure.
 
-A session owns its server's record, as otherwise a participant does. Its server may be started ahead of its members'
-matching.
+The record of a session's server belongs to the session, and not to a participant. The server may be started before the
+members are matched.
 """
 
 from __future__ import annotations

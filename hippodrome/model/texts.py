@@ -24,7 +24,7 @@ _LANGUAGE = re.compile(
 """Language, script, region, variant. With other tags, such as `zh-cmn` and `en-GB-UK`, the browser's functions raise
 RangeError (ECMA-402, section 6.2)."""
 LANGUAGE = "language"
-"""The name of the entry that has no text but the language of all texts, as in `<html lang>`."""
+"""The name of the entry that holds the language of all texts, as in `<html lang>`, and not a text."""
 
 _PAGES = {
     "language": "en",
@@ -379,7 +379,10 @@ def places(text: str) -> tuple[str, ...]:
 
 
 class Texts:
-    """The texts of one study: its own words, and the English text for any other name. Equal if the own words are."""
+    """The texts of one study: its own words, and the English text for any other name.
+
+    Two objects are equal if their own words are equal.
+    """
 
     __slots__ = ("_hash", "_own")
 

@@ -15,8 +15,8 @@ from hippodrome.ports import Settings
 
 POOLS = "_spares/"
 LONGEST_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
-COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, of which a warm server reserves its waiting time
-MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for less, none is started
+COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, from which the waiting time is reserved
+MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for a shorter time, none is started
 
 
 def pool_key(project_id: str) -> str:

@@ -124,7 +124,9 @@ def test_the_pinned_packages_are_installed(somewhere: Path) -> None:
     assert code == 0, said
     assert installed(somewhere)["ale-py"] == "ale-py==0.12.1"
     calls = (somewhere / "pip.log").read_text().splitlines()
-    assert all("-c requirements/constraints.txt" in call and "--only-binary ale-py,cryptography," in call for call in calls)
+    assert all(
+        "-c requirements/constraints.txt" in call and "--only-binary ale-py,cryptography," in call for call in calls
+    )
 
 
 def pinned(*names: str) -> dict[str, str]:
