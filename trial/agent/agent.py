@@ -171,11 +171,11 @@ class AgentAdapter:
         """The names of the actions in config.yml; empty if it has none."""
         self.reader = reader or PictureReader()
         self._agent: Any = None
-        self._returned: Any = None  # by start()
+        self._returned: Any = None  # the result of start()
         self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
         self._unusual_step: Callable[[Any], Any] | None = None
-        self._unusual_render = False  # `render` has parameters, or is the environment's
-        self._env_methods: dict[str, Callable[..., Any]] = {}  # the environment's, for those that the agent lacks
+        self._unusual_render = False  # `render` has parameters, or it is the environment's method
+        self._env_methods: dict[str, Callable[..., Any]] = {}  # methods of the environment that the agent lacks
         self._feedback: tuple[Callable[..., Any], bool] | None = None  # the agent's method; whether it takes the player
         self._word = signatures.NO_WORD  # the newest word of feedback since the last step
         self._env_reports_action = False
@@ -238,7 +238,7 @@ class AgentAdapter:
 
     @property
     def steps_itself(self) -> bool:
-        """Whether the researcher has written `step`. Otherwise the environment's `step` gets the actions."""
+        """Whether the researcher's agent has a method `step`. Otherwise the environment's `step` gets the actions."""
         return not isinstance(self._agent, Agent) and "step" not in self._env_methods
 
     @property
@@ -342,7 +342,7 @@ def _signatures(
 
 
 def _env_methods(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
-    """Return the environment's methods for those that the agent lacks. Raises AgentError if it lacks one, too."""
+    """Return the environment's methods for those that the agent lacks. Raises AgentError if both lack a method."""
     lacking = [name for name in missing if not callable(getattr(returned, name, None))]
     if lacking:
         why = "" if returned is None else f", and neither has what start() returned ({type(returned).__name__})"
@@ -382,7 +382,7 @@ def _read_dict(result: Mapping[str, Any]) -> StepResult:
     extra = {key: value for key, value in result.items() if key not in _KNOWN_KEYS}
     if "done" in result and "terminated" in result:
         extra["done"] = result["done"]
-    if action is not None and outcome.action is None:  # it is no index: record it as it is
+    if action is not None and outcome.action is None:  # no number of an action: record it as it is
         extra["action"] = action
     return replace(outcome, extra=extra) if extra else outcome
 

@@ -67,7 +67,7 @@ class Session:
     why: str | None
     """The end of the episode: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
     replaying: bool
-    """Whether steps of an earlier server are taken again. Values are not recorded then: its recording has them."""
+    """Whether steps of an earlier server are taken again. Then `record` does nothing: that recording has the values."""
     env: Any
     record: Record
     """`record(name, value)` writes the value into the recording, under this name."""
@@ -85,8 +85,8 @@ class TrialFacts:
 
 
 @dataclass(slots=True)
-class _Standing:
-    """The present facts about the episode for callbacks."""
+class _EpisodeState:
+    """The state of the episode after its last step."""
 
     episode: int = 1
     ticks: int = 0
@@ -105,11 +105,11 @@ def listening(agent: Any) -> dict[str, Callable[..., Any]]:
 
 
 class Callbacks:
-    """Calls an agent's callbacks. All methods are for the agent's thread, except those that say otherwise.
+    """Calls an agent's callbacks. Methods are for the agent's thread, unless their docstring names another one.
 
-    `stamp` returns the first fields of each line. `hide` removes from a text what must not stand in the recording. The
-    callbacks' thread calls `failed` with the name and the error of a callback that raised, and `late` with the number
-    of lines so far when a callback returns for which the agent's thread has not waited any longer.
+    `stamp` returns the first fields of each line. `hide` removes private words from a text for the recording. The
+    callbacks' thread calls `failed` with the name and the error of a callback that raised. It calls `late` with the
+    number of lines so far, when a callback returns after the agent's thread has given up waiting for it.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Callbacks:
         self._seconds = seconds
         self._late = late
         self._notes = _Notes(stamp, failed, hide)
-        self._now = _Standing()
+        self._now = _EpisodeState()
         self._started = False
         self._thread: _Thread | None = None
         self.replaying = False
@@ -155,8 +155,8 @@ class Callbacks:
 
     def episode_began(self, episode: int, observations: Mapping[str, Any], infos: Mapping[str, Any]) -> None:
         """Call `on_episode_start`, after the environment has been reset."""
-        self._now = _Standing(episode, observations=observations, infos=infos)
-        self._now.scores = dict.fromkeys(self.facts.players, 0.0)
+        scores = dict.fromkeys(self.facts.players, 0.0)
+        self._now = _EpisodeState(episode, observations=observations, infos=infos, scores=scores)
         self._call(EPISODE_START)
 
     def stepped(
@@ -201,7 +201,7 @@ class Callbacks:
     def take(self, recorded: int | None = None) -> list[bytes]:
         """Return the lines for the recording that were not returned before. For the event loop's thread.
 
-        With `recorded`, return only those among the first `recorded` lines, counted with the lines returned before.
+        With `recorded`, return only lines among the first `recorded` ones of the session.
         """
         return self._notes.take(recorded)
 
@@ -260,7 +260,7 @@ class Callbacks:
 
 
 class _Notes:
-    """Collects the lines that callbacks record, and gives each different warning about callbacks once."""
+    """Collects the lines that callbacks record, and remembers which warnings about callbacks were given."""
 
     def __init__(
         self,
@@ -356,13 +356,13 @@ class _Thread:
     def __init__(self, late: Callable[[], None]) -> None:
         self._late = late
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._deciding = threading.Lock()  # whether a callback is late: the two threads must agree on it
+        self._deciding = threading.Lock()  # held to decide whether a callback is late: both threads must agree
         self.running: str | None = None
         """The name of the callback that has not returned yet; None if there is none."""
         threading.Thread(target=self._run, name="callbacks", daemon=True).start()
 
     def run(self, name: str, work: Callable[[], None], seconds: float) -> bool:
-        """Start the work, and wait at most `seconds`; return whether it is done. No other work may be running."""
+        """Start the work, wait at most `seconds`, and return whether it is done. No other work may be running."""
         job = _Job(work, threading.Event())
         self.running = name
         self._jobs.put(job)

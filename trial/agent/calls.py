@@ -32,7 +32,7 @@ class Calls:
         self.callbacks: Callbacks | None = None
         """The agent's callbacks, if it has any."""
         self._warned_of: set[str] = set()
-        self._cut = False  # a value in an info of the line before was too large
+        self._cut = False  # in the previous line, a value of an info was too large
 
     def run(self, call: Call) -> Any:
         """Run the call, and return the result that the docstring of its class names.
@@ -102,7 +102,7 @@ class Calls:
         if line is not None and len(line) <= recording.MAX_EXTRA_BYTES:
             return line
         cut = self._cut_infos(fields)
-        self._cut = bool(cut)  # then the next line is not written before its infos are cut: 50 MB would take seconds
+        self._cut = bool(cut)  # then the next line's infos are cut first: to write 50 MB as JSON takes seconds
         return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
 
     def _is_settled(self, fields: Mapping[str, Any]) -> bool:
@@ -146,7 +146,7 @@ class Calls:
 
 
 class AgentCalls(Calls):
-    """Runs calls of an agent with one player. With `views`, the results say which actions the player may take now."""
+    """Runs calls of an agent with one player. With `views`, the results say which actions are legal now."""
 
     def __init__(
         self,

@@ -47,7 +47,7 @@ class Joint(NamedTuple):
 
     @property
     def why(self) -> str:
-        """`truncated` if the episode was truncated for players and terminated for none, else `terminated`."""
+        """`truncated` if the episode was truncated for some player and terminated for none, else `terminated`."""
         ended = [player for player in self.terminated if self.terminated[player] or self.truncated[player]]
         cut = bool(ended) and not any(self.terminated[player] for player in ended)
         return "truncated" if cut else "terminated"
@@ -105,7 +105,7 @@ class JointAdapter:
     def reset(self, seed: int) -> tuple[Joint, bool]:
         """Begin an episode. Return its first observations and infos, and whether `reset` took the seed.
 
-        Raises AgentError if `reset` returns something else than observations by player.
+        Raises AgentError if `reset` returns anything but observations by player.
         """
         observations, infos, seeded = self._adapter.reset(seed)
         self._ended = set()
@@ -186,10 +186,10 @@ class JointAdapter:
         )
 
     def _end(self, returned: Mapping[Any, Any], ended: dict[str, bool]) -> None:
-        """Set `ended` for the players whose episode `step` says is over; by ALL, for all who are still in the game."""
+        """Set `ended` for the players whose episode is over by `returned`. ALL means all who are still in the game."""
         values = returned.values()
         if returned.keys() == self._names and _FLAGS.issuperset(map(type, values)) and True not in values:
-            return  # for none of them: the usual case
+            return  # over for none of them: the usual case
         for player, value in self._by_player("step", returned).items():
             ended[player] = ended[player] or _truth(value, "step() returned for %s, as its end,", player)
         if _truth(returned.get(ALL), "step() returned for %s", ALL):
@@ -204,12 +204,11 @@ class JointAdapter:
             player = str(key)
             if player in self._players.keys:
                 found[player] = value
-            elif player not in (ALL, "__common__"):
-                raise AgentError(f"{method}() returned something of {player[:64]!r}; the players are {self._shown()}")
+            elif player not in (ALL, "__common__"):  # RLlib's key of an info for all players
+                raise AgentError(
+                    f"{method}() returned something of {player[:64]!r}; the players are {', '.join(self.players)}"
+                )
         return found
-
-    def _shown(self) -> str:
-        return ", ".join(self.players)
 
     def _no_agents(self) -> frozenset[str]:
         """Return the players whose episode is over: PettingZoo has removed them from the environment's `agents`.
@@ -235,7 +234,7 @@ class JointAdapter:
             names = {str(name) for name in (named if several else (named,))}
             unknown = sorted(names - self._names)
             if unknown:
-                raise AgentError(f"to_act() returned {unknown[0]!r}; the players are {self._shown()}")
+                raise AgentError(f"to_act() returned {unknown[0]!r}; the players are {', '.join(self.players)}")
             return frozenset(player for player in in_game if player in names)
         if not infos:
             return frozenset(in_game)

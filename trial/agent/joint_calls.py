@@ -25,8 +25,8 @@ _NONE: frozenset[str] = frozenset()
 class JointCalls(Calls):
     """Runs calls of an agent with several players. `players` are all of them, in the environment's order.
 
-    A line of the recording has the same fields as in a game with one player. There they are about the first human.
-    Its field `players` is about all players.
+    A line of the recording has the same fields as in a game with one player: they are about the first human. The
+    further field `players` is about all players.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class JointCalls(Calls):
         return Begun(self._line("reset", **self._stamp(), **fields), pictures, self._view(joint))
 
     def _view(self, joint: Joint) -> View:
-        """Build the players' view for the core. It holds copies: policies read it while the environment takes steps."""
+        """Build the players' view for the core, with copies: policies read it while the environment takes steps."""
         watching = self._policies & joint.to_act
         if not watching:
             return View(joint.to_act, masks=joint.masks)
@@ -210,7 +210,7 @@ class _Observations:
 
 
 def snapshot(observation: Any) -> Any:
-    """Copy an observation, so that the environment cannot change it. One that contains itself is not copied."""
+    """Copy an observation, so that the environment cannot change it. Return one that contains itself as it is."""
     try:
         return _copied(observation)
     except RecursionError:

@@ -26,7 +26,7 @@ def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> s
 
 
 def where(error: BaseException, folder: Path) -> str | None:
-    """Return the innermost line of the researcher's own code in the traceback, as `agent.py:30`; None without one."""
+    """Return the innermost line of the researcher's code in the traceback, as `agent.py:30`; None if it has none."""
     for each in _chain(error):
         places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(each.__traceback__)]
         if isinstance(each, SyntaxError) and each.filename:

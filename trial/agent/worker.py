@@ -23,7 +23,7 @@ Done = Callable[[Any, Exception | None], None]
 
 @dataclass(eq=False, slots=True)
 class _Job:
-    """A function that was given to the thread. `done` gets its result. `until` is a time of the event loop's clock."""
+    """A function that was given to the thread. `done` gets its result. It is late at `until`, by the loop's clock."""
 
     done: Done
     until: float
@@ -74,9 +74,9 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         self._unfinished = 0  # functions that have not returned
-        self._waiting: dict[_Job, None] = {}  # those of them that are not late; a dict keeps the order
+        self._waiting: dict[_Job, None] = {}  # unfinished functions that are not late; a dict keeps the order
         self._timer: asyncio.TimerHandle | None = None  # one for all functions: most return before their limit
-        self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each
+        self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each result
         self._notifier: _Notifier | None = None
 
     @property

@@ -48,7 +48,7 @@ class WrongParameters(GymError):
 
 
 class _Named(GymError):
-    """An error about an id or an action. That is the exception's first argument; further arguments are reasons.
+    """An error about an id or an action, which is the exception's first argument. Further arguments are reasons.
 
     A program's own `get_env` may raise it as in Gymie, also without arguments.
     """

@@ -67,7 +67,7 @@ class Instance:
 
     @property
     def first(self) -> Any:
-        """The environment, or the first one of a vector."""
+        """The environment itself; of a vector, its first environment."""
         return self.env
 
     @property

@@ -31,8 +31,7 @@ def limit_memory(megabytes: int) -> None:
     """
     if not _LINUX:
         return
-    now = _status_kilobytes("VmData:") * 1024
-    most = now + megabytes * 2**20
+    most = _private_bytes() + megabytes * 2**20
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
         most = min(most, hard)
@@ -76,10 +75,11 @@ def private_megabytes(pid: int) -> float:
     return (int(resident) - int(shared)) * resource.getpagesize() / 2**20
 
 
-def _status_kilobytes(name: str) -> int:
+def _private_bytes() -> int:
+    """Return the size of this process's private writable mappings (VmData in /proc/self/status, proc(5))."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith(name):
-            return int(line.split()[1])
+        if line.startswith("VmData:"):
+            return int(line.split()[1]) * 1024
     return 0
 
 

@@ -120,7 +120,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     connection has ended: then the environment is closed, and a new RemoteEnv makes a new one.
     """
 
-    # Those of any environment, for `gymnasium.make`, which reads the class's. An instance has its own.
+    # `gymnasium.make` reads the modes of the class, so it has those of most environments. An instance has its own.
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"]}  # noqa: RUF012
 
     def __init__(

@@ -31,8 +31,8 @@ from trial.gym.limits import Limits
 from trial.gym.wakeup import Wakeup
 
 PATH = "/gym"
-_HANDSHAKE_SECONDS = 10.0  # for a handshake
-_HANDSHAKE_BYTES = 16 * 1024  # of a handshake
+_HANDSHAKE_SECONDS = 10.0
+_HANDSHAKE_BYTES = 16 * 1024  # the most bytes of a handshake
 _CLOSE_SECONDS = 2.0  # for a client to close its end
 _NO_FILES_SECONDS = 0.05  # to wait if no file can be opened
 WITHOUT_HANDSHAKE = 100
@@ -60,7 +60,7 @@ class ListeningSocket(Protocol):
 class _Connection:
     socket: socket.socket
     deadline: float | None
-    """The time by which its handshake, or the client's close, must have come, or it is dropped; None: no limit."""
+    """The time when it is dropped, unless its handshake or the client's close has come before; None: no limit."""
     received: bytes = b""
     form: str = ""
     """The name of the form of its messages; empty until the handshake is done."""

@@ -1,4 +1,4 @@
-"""The process that starts a worker for each connection, watches the workers, and ends all that they leave behind.
+"""The process that starts a worker for each connection, watches the workers, and kills processes that they leave.
 
 It imports the modules for environments once. A worker is a fork of it, so it has them after milliseconds, in shared
 memory. The spawner holds no connection and runs no environment. The server sends it sockets (`handover.py`).
@@ -31,10 +31,10 @@ from trial.gym.worker import main as work
 TICK_SECONDS = 0.25
 """The time between two looks at how long the workers have been busy or idle."""
 _GRACE_SECONDS = 2.0  # between the interruption of Python code and the end of the process
-_ROUNDS = 1000  # of waiting for killed processes, at a time
+_ROUNDS = 1000  # the most attempts of `_reap` to collect killed processes
 _USAGE_SECONDS = 1.0  # between two looks at memory and processes
 
-_AWAY, _FAILED = 1001, 1011  # close codes
+_AWAY, _FAILED, _TRY_LATER = 1001, 1011, 1013  # close codes (RFC 6455, 7.4.1, and IANA's registry)
 
 
 @dataclass(slots=True)
@@ -105,7 +105,9 @@ class Spawner:
             self._reap()  # a worker may have ended meanwhile
         if not self._free:
             start.connection.close()
-            self._tell(start.number, 1013, f"{self._limits.workers} connections use environments already; try later.")
+            self._tell(
+                start.number, _TRY_LATER, f"{self._limits.workers} connections use environments already; try later."
+            )
             return
         slot = min(self._free)
         state = WorkerState(self._memory, slot)
@@ -113,7 +115,7 @@ class Spawner:
             pid = os.fork()
         except OSError as error:
             start.connection.close()
-            self._tell(start.number, 1013, f"No process can be started ({error.strerror}); try later.")
+            self._tell(start.number, _TRY_LATER, f"No process can be started ({error.strerror}); try later.")
             return
         if pid == 0:
             self._become_worker(start, state, wakeup)
@@ -122,7 +124,7 @@ class Spawner:
         self._workers[pid] = _Watched(start.number, slot, state)
 
     def _become_worker(self, start: NewConnection, state: WorkerState, wakeup: Wakeup) -> None:
-        """Be the worker, in the new process. This call does not return."""
+        """Serve the connection, in the new process. This call does not return."""
         status = 1
         try:
             wakeup.close()
@@ -235,13 +237,14 @@ def _kill(pid: int) -> None:
 
 
 def _how(status: int) -> str:
+    """Describe how a process has ended, by its wait status."""
     if os.WIFSIGNALED(status):
         return f"signal {signal.Signals(os.WTERMSIG(status)).name}"
     return f"exit status {os.WEXITSTATUS(status)}"
 
 
 def main(control: socket.socket, limits: Limits, modules: Sequence[str], *, output: bool, record: Path | None) -> int:
-    """Import `modules`, which register environments, then be the spawner. Return the exit status."""
+    """Import `modules`, which register environments, and start workers until the server ends. Return the status."""
     sys.path.insert(0, os.getcwd())
     try:
         for module in modules:

@@ -156,7 +156,7 @@ def _numbers(space: Any, action: bool, batch: bool = False) -> Decode:
 
 
 def _without_numbers(array: np.ndarray[Any, Any], shape: tuple[int, ...], batch: bool) -> np.ndarray[Any, Any]:
-    """Give an array without numbers the shape that is needed: JSON's lists have no axes after an empty one."""
+    """Reshape an array without numbers to the needed shape: an empty list in JSON does not show further axes."""
     whole = (len(array), *shape) if batch else shape
     known = whole[: whole.index(0) + 1] if 0 in whole else whole
     return array.reshape(whole) if array.shape == known else array

@@ -33,12 +33,15 @@ from trial.gym.session import GymSession
 from trial.wire import websocket_frames as frames
 
 _READ = 256 * 1024  # bytes of one read
-_SEND_SECONDS = 30  # for which a client may leave a reply unread
-_CLOSE_SECONDS = 2  # in which a client must answer a close
+_SEND_SECONDS = 30  # a client may leave a reply unread for this time
+_CLOSE_SECONDS = 2  # a client must answer a close within this time
 
 
 class WorkerState:
-    """Holds the time since which a worker is busy, or negated the time since which it is idle. The spawner reads it."""
+    """Holds the time when the present request began, or, negated, the time when the last one was answered.
+
+    The worker writes it into shared memory, and the spawner reads it.
+    """
 
     def __init__(self, memory: Any, at: int) -> None:
         self._memory = memory
@@ -199,7 +202,7 @@ class ConnectionWorker:
             raise ConnectionGone
 
     def _drain(self) -> None:
-        """Read on for a moment after a close: if bytes stay unread, the system discards those that it is sending."""
+        """Read on for a moment after a close: if received bytes stay unread, the system discards bytes to be sent."""
         self._socket.shutdown(socket.SHUT_WR)
         self._socket.settimeout(_CLOSE_SECONDS)
         until = time.monotonic() + _CLOSE_SECONDS
@@ -225,7 +228,7 @@ def main(
     output: bool,
     record: Path | None,
 ) -> None:
-    """Be the worker of this connection, in a new process, which must end afterwards. `record` is a folder."""
+    """Serve this connection in this new process, which must end afterwards. `record` is a folder for recordings."""
     os.setsid()
     linux.become_subreaper()
     linux.die_with_parent()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from trial.interactive_gym.object_contexts import fields_of
 from trial.interactive_gym.remote_config import RemoteConfig
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
@@ -15,18 +16,18 @@ IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 def asset_files(
     config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """Return the files of `assets/` by their paths. `remark` is called with a sentence on each image left out."""
+    """Return the files of `assets/` by their paths. Call `remark` with a sentence about each image that is left out."""
     files: dict[str, bytes] = {}
-    given = "assets_dir" in config.given
-    folder = locate(config.assets_dir)
-    if given and folder is None:
-        remark(f"assets_dir: there is no folder {config.assets_dir}")
-    if folder is not None and folder.is_dir() and given:
-        for path in sorted(folder.rglob("*")):
-            if path.suffix.lower() in (*IMAGES, ".json") and path.is_file():
-                files[path.relative_to(folder).as_posix()] = path.read_bytes()
+    if "assets_dir" in config.given:
+        folder = locate(config.assets_dir)
+        if folder is None:
+            remark(f"assets_dir: there is no folder {config.assets_dir}")
+        elif folder.is_dir():
+            for path in sorted(folder.rglob("*")):
+                if path.suffix.lower() in (*IMAGES, ".json") and path.is_file():
+                    files[path.relative_to(folder).as_posix()] = path.read_bytes()
     for spec in [*config.assets_to_preload, *(config.preload_specs or ())]:
-        _add(_plain(spec), locate, remark, files)
+        _add(fields_of(spec), locate, remark, files)
     _animate(config, files, remark)
     return files
 
@@ -72,7 +73,7 @@ def _single(atlas: bytes, name: str, remark: Callable[[str], None]) -> bytes:
 def _animate(config: RemoteConfig, files: dict[str, bytes], remark: Callable[[str], None]) -> None:
     """Write the animations into the atlases of their sprite sheets."""
     for each in config.animation_configs:
-        spec = _plain(each)
+        spec = fields_of(each)
         key, sheet = str(spec.get("key")), f"{spec.get('sprite_sheet_key')}.json"
         if sheet not in files:
             remark(f"the animation {key!r} is left out: its sprite sheet {spec.get('sprite_sheet_key')!r} has no atlas")
@@ -83,9 +84,3 @@ def _animate(config: RemoteConfig, files: dict[str, bytes], remark: Callable[[st
             animation["frameRate"] = spec["frameRate"]
         atlas.setdefault("animations", {})[key] = animation
         files[sheet] = json.dumps(atlas).encode()
-
-
-def _plain(spec: Any) -> Mapping[str, Any]:
-    """Return the fields of a description of images by name."""
-    fields: Mapping[str, Any] = spec.as_dict() if hasattr(spec, "as_dict") else spec
-    return fields

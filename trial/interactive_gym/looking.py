@@ -22,8 +22,6 @@ _WORDS = re.compile(r"_+|(?<=[a-z0-9])(?=[A-Z])")  # between the words of a name
 class Look:
     """The facts that were found about an experiment."""
 
-    players: tuple[Any, ...]
-    """The keys of `policy_mapping`."""
     several: bool
     """Whether the environment has several players."""
     actions: int
@@ -37,7 +35,10 @@ class Look:
     human: Any
     """The first human player."""
     joined_as_sorted: bool
-    """Whether the last player's observation is no dictionary, or one whose keys are in their sorted order."""
+    """False if the last player's observation is a dictionary whose keys are not sorted.
+
+    Interactive Gym joins its parts in the dictionary's order; Hippodrome's policies join them in the sorted order.
+    """
     objects: bool
     """Whether the game is drawn by objects, and not by pixels."""
     game: Any
@@ -59,7 +60,6 @@ def look(config: RemoteConfig) -> Look:
         by_player = observation if agent.several and isinstance(observation, Mapping) else None
         last = observation if by_player is None else by_player.get(players[-1])
         return Look(
-            players=players,
             several=agent.several,
             actions=max(counts.values()),
             counts=counts,

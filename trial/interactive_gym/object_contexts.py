@@ -11,6 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 
+def fields_of(value: Any) -> Any:
+    """Return the fields of an object or of a description of an image by name. A map is returned as it is."""
+    return value.as_dict() if hasattr(value, "as_dict") else value
+
+
 class _Context:
     def as_dict(self) -> dict[str, Any]:
         """Return the fields by name."""

@@ -21,7 +21,7 @@ def is_loading() -> bool:
 
 
 class Experiment:
-    """An experiment in the folder of the project that was made of it."""
+    """An experiment, and the folder of the project that was made from it."""
 
     def __init__(self, folder: Path, config: RemoteConfig) -> None:
         self._config = config

@@ -1,4 +1,4 @@
-"""Makes the pages of steps/ of an experiment's texts."""
+"""Makes the pages of steps/ from an experiment's texts."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def instructions(config: RemoteConfig, game: Any, human: Any, locate: Locate, re
 def between(config: RemoteConfig, remark: Callable[[str], None]) -> str:
     """Make the page between two episodes; empty if there is none.
 
-    `remark` is called if `reset_timeout`, which has no effect beside a page, is set, too.
+    With such a page, `reset_timeout` has no effect: if the experiment sets it, `remark` is called.
     """
     if not (config.between_episode_header or config.between_episode_text):
         return ""
@@ -102,7 +102,7 @@ def final(config: RemoteConfig) -> str:
 
 
 def _redirect(config: RemoteConfig, address: str | None) -> str:
-    """Return a link to this address, and a script that opens it after `redirect_timeout`; empty without an address."""
+    """Make a link to this address, and a script that opens it after `redirect_timeout`; empty without an address."""
     if not address:
         return ""
     appended = config.append_subject_id_to_redirect or config.append_subject_name_to_redirect

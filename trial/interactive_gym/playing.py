@@ -1,6 +1,6 @@
-"""The agent and the policies of the project that `server_app.run` makes of an experiment.
+"""The agent and the policies of the project that `server_app.run` makes from an experiment.
 
-The generated agent.py gets them by `on_server.py`.
+The project's agent.py gets them from `on_server.py`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 from protocol import environment as variables
 from trial.interactive_gym.configuration_constants import PolicyTypes
+from trial.interactive_gym.object_contexts import fields_of
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.remote_game import RemoteGame
 
@@ -114,7 +115,7 @@ class ExperimentAgent:
         """Begin an episode. Return its observation and infos."""
         game = self._game
         alone = len(game.human_players) == 1
-        for key in game.human_players:  # with several participants, no code of the researcher's gets their ids
+        for key in game.human_players:  # with several participants, the researcher's code gets no participant's id
             game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
         observation, infos = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
@@ -140,13 +141,13 @@ class ExperimentAgent:
                 return drawn
         else:
             drawn = config.env_to_state_fn(self._raw, config)
-        objects = [each.as_dict() if hasattr(each, "as_dict") else each for each in drawn]
+        objects = [fields_of(each) for each in drawn]
         pixels = next((each for each in objects if _kind(each) == "rendered_env_rgb"), None)
         if pixels is not None:
             return _pixels(pixels)
         if self._first:
             self._first = False
-            objects = [*({**_fields(each), "permanent": True} for each in config.state_init), *objects]
+            objects = [*({**fields_of(each), "permanent": True} for each in config.state_init), *objects]
         return {"objects": objects, "hud": hud}
 
     def close(self) -> None:
@@ -164,8 +165,8 @@ class ExperimentAgent:
 class ListeningAgent(ExperimentAgent):
     """The agent of an experiment with a callback, which it calls as Interactive Gym does.
 
-    `on_game_tick_start` gets the state before a step. That is the state after the step before, so it is called at the
-    end of that one, or after the reset.
+    `on_game_tick_start` gets the state before a step. Nothing changes between two steps, so it is called after the
+    previous step, or after the reset.
     """
 
     def on_episode_start(self, session: Any) -> Any:
@@ -173,7 +174,7 @@ class ListeningAgent(ExperimentAgent):
         self._tell(session, "on_episode_start", "on_game_tick_start")
 
     def on_tick(self, session: Any) -> Any:
-        """Call the experiment's callbacks of a step, and `on_game_tick_start` for the next one."""
+        """Call the experiment's callbacks of a step, and `on_game_tick_start` for the next step."""
         more = () if self._game.over else ("on_game_tick_start",)
         self._tell(session, "on_game_tick_end", "on_graphics_start", "on_graphics_end", *more)
 
@@ -258,10 +259,6 @@ def located(folder: Path) -> Callable[[Any], Any]:
 def _has_players(env: Any) -> bool:
     spaces = getattr(env, "action_spaces", None)
     return isinstance(spaces, Mapping) or bool(getattr(env, "possible_agents", None))
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    return dict(value.as_dict() if hasattr(value, "as_dict") else value)
 
 
 def _kind(value: Any) -> Any:

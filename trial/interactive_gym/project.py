@@ -1,4 +1,4 @@
-"""Makes a project of an experiment: config.yml, steps/, agent.py, and copies of the experiment's own files."""
+"""Makes a project from an experiment: config.yml, steps/, agent.py, and copies of the experiment's own files."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _MADE_BY = "made by `python {file}`; change that file and run it again"
 
 @dataclass(frozen=True, slots=True)
 class MadeProject:
-    """The project that was made of an experiment."""
+    """The project that was made from an experiment."""
 
     folder: Path
     remarks: list[str] = field(default_factory=list)
-    """Sentences about options that have no effect, or another effect than in Interactive Gym."""
+    """Sentences for the researcher: on what was left out, and on options that have no effect or another one."""
 
 
 def make(config: RemoteConfig, folder: Path | None = None, candidates: tuple[Any, ...] = ()) -> MadeProject:
@@ -124,7 +124,7 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
         "minFrameRate": 1,
         "maxFrameRate": max(90, round(config.fps)),
         "actionSpace": names,
-        "betweenEpisodes": config.reset_timeout / 1000 if config.reset_timeout % 1000 else config.reset_timeout // 1000,
+        "betweenEpisodes": _number(config.reset_timeout / 1000),
     }
     if config.default_action is not None:
         trial["idleAction"] = names[int(config.default_action)]
@@ -168,10 +168,10 @@ def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
 
 
 def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a project, and remove files of the project's earlier version that it does not have any more.
+    """Write the files of a project, and remove the files that only its earlier version had.
 
-    A file that was changed by hand stays; return a sentence about each. Raises Unplayable if the folder has files in it
-    and none of them was made here, and OSError.
+    A file that was changed by hand stays as it is. Return a sentence about each file that was not written for
+    this reason. Raises Unplayable if the folder has files in it and none of them was made here, and OSError.
     """
     hashes = folder / HASHES
     if folder.exists() and any(folder.iterdir()) and not hashes.is_file():
@@ -238,9 +238,13 @@ def _project(config: RemoteConfig, source: ConfigModule, steps: list[str]) -> di
         project["players"] = humans
         if config.waitroom_timeout is not None:
             seconds = round(config.waitroom_timeout / 1000, 3)
-            seconds = max(LEAST_PATIENCE, min(MOST_PATIENCE, seconds))
-            project["patience"] = int(seconds) if seconds == int(seconds) else seconds
+            project["patience"] = _number(max(LEAST_PATIENCE, min(MOST_PATIENCE, seconds)))
     return project
+
+
+def _number(value: float) -> float:
+    """Return a whole number as an int, so that config.yml has 5 and not 5.0."""
+    return int(value) if value == int(value) else value
 
 
 def _id(name: str) -> str:

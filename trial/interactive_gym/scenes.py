@@ -33,7 +33,7 @@ class _Scene:
 
 
 class GymScene(_Scene, RemoteConfig):
-    """The scene of a game: a `RemoteConfig` in which some options of texts have other names."""
+    """The scene of a game: a `RemoteConfig` in which the options for some texts have other names."""
 
     def __init__(self, scene_id: str | None = None, **_more: Any) -> None:
         super().__init__()
@@ -129,9 +129,10 @@ class ExperimentConfig:
 
 
 def game_of(config: Any) -> Any:
-    """Return the game of an experiment of scenes, with the pages before and after it. Return anything else as it is.
+    """Return the game of an experiment that consists of scenes. Its `before` and `after` get the pages around it.
 
-    Raises Unplayable if there is not exactly one game, or if a page cannot be shown.
+    A `config` without scenes is returned as it is. Raises Unplayable if there is not exactly one game, or if a page
+    cannot be shown.
     """
     stager = config.stager if isinstance(config, ExperimentConfig) else config
     if not isinstance(stager, Stager):

@@ -1,4 +1,4 @@
-"""`server_app.run(config)`: makes a project of an experiment, and runs it on this machine."""
+"""`server_app.run(config)`: makes a project from an experiment, and runs it on this machine."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ def _interrupt(*_: Any) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """End the local run, and wait while it stores the last data. A second Ctrl-C does not interrupt that at once.
+    """End the local run by signals, and wait while it stores the last data. Each further Ctrl-C sends the next signal.
 
-    Return 0; 1 if the run has not ended even by SIGKILL.
+    Return 0, or 1 if the run has not ended even after SIGKILL.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if process.poll() is None:

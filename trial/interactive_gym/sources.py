@@ -27,14 +27,14 @@ _HIPPODROME = Path(__file__).resolve().parents[2]
 _SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's assets are in its server's folder
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
 _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
-_TAKEN = {"agent", "trial", "protocol"}
+_TAKEN = {"agent", "trial", "protocol"}  # modules on a server that no module of an experiment may hide
 _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
 """Modules that Python imports when it starts. Debian and Ubuntu have theirs outside Python's folders, below /etc."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigModule:
-    """The module of the researcher's that holds a config, and the name of its `variable`."""
+    """The researcher's module that holds a config, and the name of the config's `variable`."""
 
     module: str
     variable: str
@@ -46,10 +46,10 @@ class ConfigModule:
 
 
 def find(*configs: Any) -> ConfigModule:
-    """Find the module of the researcher's that has one of these objects as a variable.
+    """Find the researcher's module in which one of these objects is a variable.
 
-    If there are several, the last object counts: an earlier one may be a variable only below
-    `if __name__ == "__main__"`, which does not run on a server. Raises Unplayable if there is none.
+    If several objects are variables, the last one counts: an earlier one may be a variable only below
+    `if __name__ == "__main__"`, which does not run on a server. Raises Unplayable if none is a variable.
     """
     for config in reversed(configs):
         if config is not None and (source := _find(config)) is not None:
@@ -105,10 +105,10 @@ def locate(source: ConfigModule) -> Any:
 
 
 def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list[str]]:
-    """Find the files for the project, by their paths in it. Return them, and sentences about those left out.
+    """Return the files for the project by their paths in it, and sentences about files that are left out.
 
-    They are the modules that the experiment has imported from folders of the researcher's, and all files in the folder
-    of the experiment's file. Raises Unplayable if these are too large.
+    They are the modules that the experiment has imported from the researcher's folders, and all files in the folder of
+    the experiment's file. Raises Unplayable if all of them together are too large.
     """
     files: dict[str, Path] = {}
     sentences = []
