@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from export import scrub
 from export.page_fields import FieldKind
-from export.recording_columns import when
+from export.recording_columns import as_whole, when
 from export.scrub import clean, texts
 from export.state import ExportedParticipant, ExportState
 from export.table_files import Column, fit, json_text
@@ -100,6 +100,7 @@ class StudyAnswers:
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
+        self._answerable = [step for step in self.steps if not (project and step == project.final.key)]
         self.moved = [
             ChangedPage(step, page, others)
             for step, page in self._present_pages.items()
@@ -152,7 +153,6 @@ class StudyAnswers:
     @property
     def columns(self) -> list[Column]:
         """The columns of the wide table."""
-        shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
         return _distinct(
             Column("participant"),
             Column("group", "whole"),
@@ -163,13 +163,12 @@ class StudyAnswers:
             *([] if self._apart else [Column(f"link.{clean(name)}") for name in self.links]),
             *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
             *(Column(f"page.{moved.step}") for moved in self.moved),
-            *(Column(f"answered.{step}", "time") for step in shown),
+            *(Column(f"answered.{step}", "time") for step in self._answerable),
             *([Column("other")] if self.crowded else []),
         )
 
     def rows(self) -> Iterator[list[Any]]:
         """Yield the rows of the wide table: one per participant."""
-        shown = [step for step in self.steps if not (self._project and step == self._project.final.key)]
         self.scrubbed = self.finished = 0
         for participant, found in self._participants():
             fields = {step: _fields(answers) for step, answers in found.items()}
@@ -178,7 +177,7 @@ class StudyAnswers:
             self.finished += bool(finished)
             row: list[Any] = [
                 participant.number,
-                _group(participant.document),
+                as_whole(participant.document.get("group")),
                 when(participant.document.get("arrived")),
                 finished,
             ]
@@ -191,7 +190,7 @@ class StudyAnswers:
                 for (step, name), column in self.fields.items()
             ]
             row += [self._page(step, found[step]) if step in found else None for step, _, _ in self.moved]
-            row += [when(found[step].get("answered")) if step in found else None for step in shown]
+            row += [when(found[step].get("answered")) if step in found else None for step in self._answerable]
             if self.crowded:
                 row.append(self._rest(fields, {} if self._apart else link))
             yield row
@@ -228,7 +227,7 @@ class StudyAnswers:
                     participant.number,
                     step,
                     clean(page) if isinstance(page, str) else None,
-                    _group(answers),
+                    as_whole(answers.get("group")),
                     when(answers.get("answered")),
                 ]
                 for name, value in _fields(answers).items():
@@ -243,12 +242,16 @@ _MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "
 def _membership(participant: ExportedParticipant) -> list[Any]:
     """The participant's session and seat, whether they were unmatched, and the seconds for which they waited."""
     about = participant.membership
-    session, seat, unmatched = about.get("session"), about.get("seat"), about.get("unmatched")
-    fits = isinstance(seat, int) and not isinstance(seat, bool) and seat >= 0 and is_session_id(session)
-    truth = unmatched if isinstance(unmatched, bool) else None
-    waited = about.get("waited")
-    number = waited if isinstance(waited, int | float) and not isinstance(waited, bool) and waited >= 0 else None
-    return [session if is_session_id(session) else None, seat if fits else None, truth, number]
+    session = about.get("session") if is_session_id(about.get("session")) else None
+    seat = as_whole(about.get("seat"))
+    unmatched, waited = about.get("unmatched"), about.get("waited")
+    is_number = isinstance(waited, int | float) and not isinstance(waited, bool)
+    return [
+        session,
+        seat if session is not None and seat is not None and seat >= 0 else None,
+        unmatched if isinstance(unmatched, bool) else None,
+        waited if is_number and waited >= 0 else None,
+    ]
 
 
 def _distinct(*columns: Column) -> list[Column]:
@@ -269,12 +272,6 @@ def _fields(answers: Mapping[str, Any]) -> Mapping[str, Any]:
     """The fields of an answer's document that have a value."""
     found = answers.get("answers")
     return {str(n): value for n, value in found.items() if value is not None} if isinstance(found, dict) else {}
-
-
-def _group(document: Mapping[str, Any]) -> int | None:
-    group = document.get("group")
-    fits = isinstance(group, int) and not isinstance(group, bool) and abs(group) < 2**63
-    return group if fits else None
 
 
 _SENT_NUMBERS = ("whole as text", "number as text")

@@ -36,20 +36,11 @@ MAX_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step accepts answers of 256 KB
 class Work:
     """The files of one participant or one session that a worker fetches."""
 
+    user: str  # the id of the participant or of the session; "" for files of neither
     owner: ExportedParticipant | Members | None
     fetch: list[Item]
     unchanged: list[str]  # keys
     then: Unit | None = None  # the session's other files, which are fetched after its document is read
-
-    @property
-    def user(self) -> str:
-        """The id of the participant or of the session."""
-        match self.owner:
-            case ExportedParticipant(user=user):
-                return user
-            case Members(session=session):
-                return session
-        return ""
 
 
 class Fetcher:
@@ -144,7 +135,7 @@ class Fetcher:
         self._listed += len(unit.items)
         self._done += len(unchanged)
         self._progress(self._listed, self._done)
-        return Work(owner, fetch, unchanged, then)
+        return Work(unit.user, owner, fetch, unchanged, then)
 
     def _collect(self, running: dict[Future[list[SourceFile]], Work]) -> list[Work]:
         done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -160,9 +151,8 @@ class Fetcher:
 
     def _save(self, work: Work, files: list[SourceFile]) -> None:
         """Save the files in the state, and remove their earlier versions from the folder."""
-        user = work.user
-        before = self._state.files_of(user) if files else {}
-        self._state.save(user, work.unchanged, files)
+        before = self._state.files_of(work.user) if files else {}
+        self._state.save(work.user, work.unchanged, files)
         for file in files:
             old = before.get(file.key)
             for path, now in ((old.path, file.made), (old.raw, file.raw)) if old else ():
@@ -220,9 +210,9 @@ class Fetcher:
             column, identities, people = {"participant": owner.number}, scrub.identities(owner), None
         else:
             column, identities, people = {"session": owner.session}, dict(owner.identities), owner.people
-        folder, names = _folder(owner), identities | {item.server: place}
-        label = item.server.rpartition("-")[0]
-        hide = scrub.Scrub(names | ({label: "(server)"} if label else {})) if self._wanted.apart else scrub.nothing()
+        folder, label = _folder(owner), item.server.rpartition("-")[0]
+        names = identities | {item.server: place} | ({label: "(server)"} if label else {})
+        hide = scrub.Scrub(names if self._wanted.apart else {})
         packed, made = self._temporary(), self._temporary()
         try:
             self._source.fetch(item.listed, packed)
@@ -240,11 +230,8 @@ class Fetcher:
 
     def _token(self, server: str) -> str:
         """A token in the place of a server's name that Hippodrome has not made, and that may identify someone."""
-        return hashlib.blake2b(server.encode(), key=self._salt, digest_size=5).hexdigest()
-
-    @property
-    def _salt(self) -> bytes:
-        return (self._folder / "private" / "salt").read_bytes()
+        salt = (self._folder / "private" / "salt").read_bytes()
+        return hashlib.blake2b(server.encode(), key=salt, digest_size=5).hexdigest()
 
     def _temporary(self) -> Path:
         return self.incoming / f"{uuid.uuid4().hex}.part"
@@ -273,11 +260,11 @@ def forget_gone(state: ExportState, folder: Path) -> int:
     many there were."""
     count = 0
     with state.in_transactions():
-        for key, user, kind, step, path, raw in state.unseen():
+        for key, user, kind, path, raw in state.unseen():
             for old in filter(None, (path, raw)):
                 (folder / old).unlink(missing_ok=True)
                 remove_empty((folder / old).parent, folder)
-            state.forget(key, user, kind, step)
+            state.forget(key, user, kind)
             count += 1
         state.forget_participants()
     return count

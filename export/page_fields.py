@@ -13,10 +13,9 @@ from enum import StrEnum
 from botocore.exceptions import ClientError
 
 from export.source import FileGone, Source, TooLarge
+from hippodrome.config.step_files import LIMIT_BYTES
 from hippodrome.model.project import Project
 from hippodrome.participants.page_parser import PageParser
-
-_MAX_PAGE = 1024 * 1024  # bytes, as in docs/config.md
 
 
 class FieldKind(StrEnum):
@@ -53,7 +52,7 @@ def fields_of(page: str) -> Mapping[str, FieldKind]:
 
 def _page(source: Source, key: str) -> str:
     try:
-        return source.read(key, _MAX_PAGE).decode("utf-8", "replace")
+        return source.read(key, LIMIT_BYTES).decode("utf-8", "replace")
     except (FileGone, TooLarge, ClientError):  # the types of columns then follow from the answers
         return ""
 

@@ -59,11 +59,10 @@ def convert(
     read = lines(source, done.problems)
     first = list(itertools.islice(read, 1))
     head = first[0] if first and first[0].get("kind") == "header" else {}
-    seats = None if people is None else seats_of(head)
-    playing = {name: people.get(seat) for name, seat in (seats or {}).items()} if people is not None else {}
-    if seats is not None:
+    playing = None if people is None else {name: people.get(seat) for name, seat in seats_of(head).items()}
+    if playing is not None:
         constants = {**constants, **{f"participant.{name}": number for name, number in playing.items()}}
-    rows = Rows(constants, scrub, players_of(head), None if seats is None else tuple(seats))
+    rows = Rows(constants, scrub, players_of(head), None if playing is None else tuple(playing))
     with pq.ParquetWriter(target, rows.schema, compression="zstd") as writer:
         for line in itertools.chain(first, read):
             kind = line.get("kind")
@@ -96,7 +95,7 @@ def convert(
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
         episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}
         episode["players"] = _who_plays(header, scrub)
-        if seats is not None:
+        if playing is not None:
             episode |= {"session": constants.get("session"), "people": playing}
     return done
 
@@ -123,8 +122,7 @@ def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
             done.episodes.append(now)
         now["frames"] += 1
         now["score"] += as_number(line.get("reward")) or 0.0
-        _add_rewards(now["scores"], line.get("players"))
-        _count_policies(now["byPolicy"], line.get("players"))
+        _add_players(now, line.get("players"))
         now["ended"] = as_text(line.get("time"))
     elif kind == "end" and now is not None and now["episode"] == as_whole(number):
         now["why"] = as_text(line.get("why")) or "?"
@@ -147,30 +145,26 @@ def _episode(line: Mapping[str, Any], number: int | None, seed: int | None) -> d
     }
 
 
-def _add_rewards(scores: dict[str, float], players: Any) -> None:
-    """Add the reward of each player of a step. A value that is no number counts as 0, as in `score`."""
-    if isinstance(players, Mapping):
-        for name, part in itertools.islice(players.items(), MAX_PLAYERS):
-            reward = as_number(part.get("reward")) if isinstance(part, Mapping) else None
-            scores[str(name)] = scores.get(str(name), 0.0) + (reward or 0.0)
+def _add_players(episode: dict[str, Any], players: Any) -> None:
+    """Add the reward of each player of a step, and count the step for each player whose action a policy chose.
 
-
-def _count_policies(steps: dict[str, int], players: Any) -> None:
-    """Count the steps at which a policy chose a player's action."""
-    if isinstance(players, Mapping):
-        for name, part in itertools.islice(players.items(), MAX_PLAYERS):
-            if isinstance(part, Mapping) and part.get("by") == "policy":
-                steps[str(name)] = steps.get(str(name), 0) + 1
+    A reward that is no number counts as 0, as in `score`.
+    """
+    if not isinstance(players, Mapping):
+        return
+    scores, by_policy = episode["scores"], episode["byPolicy"]
+    for name, part in itertools.islice(players.items(), MAX_PLAYERS):
+        values = part if isinstance(part, Mapping) else {}
+        scores[name] = scores.get(name, 0.0) + (as_number(values.get("reward")) or 0.0)
+        if values.get("by") == "policy":
+            by_policy[name] = by_policy.get(name, 0) + 1
 
 
 def _who_plays(header: Mapping[str, Any], scrub: Scrub) -> dict[str, str | None]:
     """Who plays each player: `human`, or the policy or program as in config.yml."""
-    players = header.get("players")
-    if not isinstance(players, Mapping):
-        return {}
     kinds = {}
     for name in players_of(header):
-        player = players.get(name)
+        player = header["players"].get(name)
         kind = player.get("policy", player.get("kind")) if isinstance(player, Mapping) else None
         kinds[name] = scrub.text(kind) if isinstance(kind, str) else None
     return kinds

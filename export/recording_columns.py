@@ -33,7 +33,14 @@ def schema(players: tuple[str, ...] = (), humans: tuple[str, ...] | None = None)
     """
     import pyarrow as pa
 
-    when = pa.timestamp("us", tz="UTC")
+    types: dict[Callable[[Any], Any], Any] = {
+        as_whole: pa.int64(),
+        as_number: pa.float64(),
+        _as_truth: pa.bool_(),
+        as_text: pa.string(),
+        json_text: pa.string(),
+        when: pa.timestamp("us", tz="UTC"),
+    }
     return pa.schema(
         [
             ("participant", pa.string()),
@@ -41,30 +48,12 @@ def schema(players: tuple[str, ...] = (), humans: tuple[str, ...] | None = None)
             ("attempt", pa.int64()),
             ("trial", pa.string()),
             ("kind", pa.string()),
-            ("episode", pa.int64()),
-            ("step", pa.int64()),
-            ("frame", pa.int64()),
-            ("time", when),
-            ("ns", pa.int64()),
-            ("action", pa.int64()),
-            ("actionName", pa.string()),
-            ("by", pa.string()),
-            ("human", pa.int64()),
-            ("reward", pa.float64()),
-            ("terminated", pa.bool_()),
-            ("truncated", pa.bool_()),
-            ("info", pa.string()),
-            ("messages", pa.string()),
-            ("seed", pa.int64()),
-            ("steps", pa.int64()),
-            ("score", pa.float64()),
-            ("why", pa.string()),
-            ("error", pa.string()),
+            *((name, types[fit]) for name, fit in _TYPED.items()),
             ("observation", pa.binary()),
             ("observationDtype", pa.string()),
             ("observationShape", pa.list_(pa.int32())),
             ("other", pa.string()),
-            *((f"{name}.{player}", _PLAYERS_COLUMNS[name][0]()) for player in players for name in _PLAYERS_COLUMNS),
+            *((f"{name}.{player}", types[_TYPED[name]]) for player in players for name in _OF_EACH_PLAYER),
             *([] if humans is None else [("session", pa.string())]),
             *((f"participant.{player}", pa.string()) for player in humans or ()),
         ]
@@ -79,9 +68,10 @@ def players_of(header: Mapping[str, Any]) -> tuple[str, ...]:
 
 def humans_of(header: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the human players in the header of a recording; () if the environment has one player."""
-    players = header.get("players")
-    named = ((name, players.get(name)) for name in players_of(header)) if isinstance(players, Mapping) else ()
-    return tuple(name for name, player in named if isinstance(player, Mapping) and player.get("kind") == "human")
+    players = {name: header["players"].get(name) for name in players_of(header)}
+    return tuple(
+        name for name, player in players.items() if isinstance(player, Mapping) and player.get("kind") == "human"
+    )
 
 
 def seats_of(header: Mapping[str, Any]) -> dict[str, int]:
@@ -89,11 +79,11 @@ def seats_of(header: Mapping[str, Any]) -> dict[str, int]:
 
     A player in an older header has no `seat`: then the seat is the player's position among the humans.
     """
-    seats = (as_whole(header["players"][name].get("seat")) for name in humans_of(header))
-    return {
-        name: place if seat is None else seat
-        for place, (name, seat) in enumerate(zip(humans_of(header), seats, strict=True))
-    }
+    seats = {}
+    for place, name in enumerate(humans_of(header)):
+        seat = as_whole(header["players"][name].get("seat"))
+        seats[name] = place if seat is None else seat
+    return seats
 
 
 # Values of the columns. None stands for a value that does not fit; the column `other` has such values
@@ -154,20 +144,9 @@ _TYPED: dict[str, Callable[[Any], Any]] = {
     "why": as_text,
     "error": as_text,
 }
-_PLAYERS_COLUMNS: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
-    "action": (lambda: _arrow("int64"), as_whole),
-    "by": (lambda: _arrow("string"), as_text),
-    "reward": (lambda: _arrow("float64"), as_number),
-}
-"""The columns of each player: the Arrow type, and the function that returns a fitting value or None."""
-
-
-def _arrow(name: str) -> Any:
-    import pyarrow as pa
-
-    return getattr(pa, name)()
-
-
+"""The columns whose values are fields of the lines, in their order. The function returns a value that fits, or None."""
+_OF_EACH_PLAYER = ("action", "by", "reward")
+"""The columns that each player has, if there are several."""
 _TEXTS = ("kind", "actionName", "by", "info", "messages", "why", "error", "other", "trial")
 
 
@@ -225,9 +204,9 @@ class Rows:
         """Add the values of each player, if there are several. `other` has the players' further fields."""
         for player in self._players:
             part = parts.get(player) if isinstance(parts, Mapping) else None
-            for name, (_, fit) in _PLAYERS_COLUMNS.items():
+            for name in _OF_EACH_PLAYER:
                 value = part.get(name) if isinstance(part, Mapping) else None
-                self._columns[f"{name}.{player}"].append(None if value is None else fit(value))
+                self._columns[f"{name}.{player}"].append(None if value is None else _TYPED[name](value))
 
     def _observation(
         self, line: Mapping[str, Any], other: dict[str, Any]

@@ -47,11 +47,6 @@ class Scrub:
         return self._replacements.get(found[0]) or self._replacements.get(found[0].lower(), "(id)")
 
 
-def nothing() -> Scrub:
-    """Return a Scrub that replaces nothing."""
-    return Scrub({})
-
-
 def identities(participant: ExportedParticipant) -> dict[str, str]:
     """Return the texts that identify a participant, each with its replacement: the id, the values of the link, and the
     completion codes in `participant.json` and `session.json`."""

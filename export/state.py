@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import json
 import secrets
 import sqlite3
@@ -257,26 +258,25 @@ class ExportState:
             ((file.key, place, _json(episode)) for place, episode in enumerate(file.episodes)),
         )
 
-    def unseen(self) -> Iterator[tuple[str, str, str, str, str | None, str | None]]:
-        """Yield the files that the last run did not find in the source: key, user, kind, step, path, raw path."""
-        rows = self._db.execute("SELECT key, user, kind, path, raw FROM files WHERE seen<>?", (self.run,)).fetchall()
-        for key, user, kind, path, raw in rows:
-            yield key, user, kind, key.rpartition("/")[2].removesuffix(".json"), path, raw
+    def unseen(self) -> list[tuple[str, str, str, str | None, str | None]]:
+        """Return the files that the last run did not find in the source: key, user, kind, path, raw path."""
+        return self._db.execute("SELECT key, user, kind, path, raw FROM files WHERE seen<>?", (self.run,)).fetchall()
 
-    def forget(self, key: str, user: str, kind: str, step: str) -> None:
+    def forget(self, key: str, user: str, kind: str) -> None:
         """Remove a file that the source does not have any more from the state."""
         self._db.execute("DELETE FROM files WHERE key=?", (key,))
         self._db.execute("DELETE FROM episodes WHERE key=?", (key,))
         if kind == "answer":
+            step = key.rpartition("/")[2].removesuffix(".json")
             self._db.execute("DELETE FROM answers WHERE user=? AND step=?", (user, step))
         if kind == "participant":
             self._db.execute("UPDATE participants SET document=NULL WHERE user=?", (user,))
         if kind in _SESSION_KINDS:
             self._db.execute("DELETE FROM sessions WHERE owner=?", (user,))
 
-    def forget_participants(self) -> int:
-        """Remove the participants without files in the last run, with their numbers; return how many there were."""
-        return self._db.execute("DELETE FROM participants WHERE seen<>?", (self.run,)).rowcount
+    def forget_participants(self) -> None:
+        """Remove the participants without files in the last run, with their numbers."""
+        self._db.execute("DELETE FROM participants WHERE seen<>?", (self.run,))
 
     def file_count(self) -> int:
         """Return the number of files in the state."""
@@ -352,8 +352,6 @@ class ExportState:
 
     def recordings_fingerprint(self) -> str:
         """Return a hash that changes whenever a recording is added, changed or removed."""
-        import hashlib  # noqa: PLC0415 - only for this
-
         digest = hashlib.sha256()
         for file in self.converted_files():
             digest.update(f"{file.path}\0{file.sha256}\n".encode())

@@ -146,11 +146,20 @@ def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> It
         other = _other_fields(row)
         player = other.get("player") if isinstance(other.get("player"), str) else None
         number = participant.number if participant else first.get("people", {}).get(player)
+        value, skipped = other.get("value"), other.get("skipped")
         yield [
             number,
             first["step"],
             first["attempt"],
-            *_callback(row, other),
+            _text(row["trial"]),
+            row["episode"],
+            row["step"],
+            row["time"],
+            _text(other.get("callback")),
+            _text(other.get("name")),
+            None if value is None else fit(value, "text"),
+            _text(row["error"]),
+            skipped if isinstance(skipped, int) else None,
             path,
             *([first.get("session"), None if player is None else clean(player)] if in_sessions else ()),
         ]
@@ -234,21 +243,6 @@ def _other_fields(row: Mapping[str, Any]) -> Mapping[str, Any]:
     return other if isinstance(other, dict) else {}
 
 
-def _callback(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[Any]:
-    """The values of the columns from `trial` to `skipped`."""
-    value, skipped = other.get("value"), other.get("skipped")
-    return [
-        None if row["trial"] is None else clean(row["trial"]),
-        row["episode"],
-        row["step"],
-        row["time"],
-        *(clean(other[name]) if isinstance(other.get(name), str) else None for name in ("callback", "name")),
-        None if value is None else fit(value, "text"),
-        None if row["error"] is None else clean(row["error"]),
-        skipped if isinstance(skipped, int) else None,
-    ]
-
-
 def identities(state: ExportState, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
     """Return the columns and rows of the table of identities, which is kept in `private/`."""
     columns = [Column("participant"), Column("userId"), Column("completionCode")]
@@ -302,14 +296,12 @@ def _without_ids(key: str, participant: ExportedParticipant | None, project: str
         return "(somewhere in users/)"
     parts = key.split("/")
     match parts[1:]:
-        case ["participant.json"]:
-            rest = "participant.json"
+        case ["participant.json" | "session.json" as name]:
+            rest = name
         case ["answers", name] if (
             re.fullmatch(r"[A-Za-z0-9_-]{1,64}\.json", name) and name != f"{participant.user}.json"
         ):
             rest = f"answers/{name}"
-        case ["session.json"]:
-            rest = "session.json"
         case ["trials", _, name] if _RECORDED.fullmatch(name):
             rest = f"trials/(server)/{name}"
         case _:

@@ -22,7 +22,7 @@ from console.problem import Exit
 from deploy.__main__ import main
 from export import recording as converted
 from export import recording_columns
-from export.scrub import Scrub, nothing
+from export.scrub import Scrub
 from testing.exploration import examples
 from tests.export import data_world as made_of
 from tests.export.data_world import PROJECT, arrive, crowd, into_folder, key, record, recording_key, server
@@ -34,7 +34,7 @@ WHO = {"participant": "p1", "studyStep": "3", "attempt": 1}
 
 def convert(tmp: Path, body: bytes, scrub: Scrub | None = None) -> tuple[converted.Converted, list[dict[str, Any]]]:
     (tmp / "in.gz").write_bytes(body)
-    done = converted.convert(tmp / "in.gz", tmp / "out.parquet", WHO, scrub or nothing())
+    done = converted.convert(tmp / "in.gz", tmp / "out.parquet", WHO, scrub or Scrub({}))
     return done, pq.read_table(tmp / "out.parquet").to_pylist()
 
 
