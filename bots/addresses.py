@@ -45,7 +45,6 @@ class AllowedAddresses(Protocol):
         """
 
 
-@dataclass(frozen=True)
 class ThisMachine:
     """Allows all studies on this machine, on any port, and nothing else: bots must not take part in a real study."""
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from datetime import date, datetime, timedelta
-from decimal import ROUND_FLOOR, Decimal, InvalidOperation
+from decimal import Decimal, InvalidOperation
+from math import floor
 from random import Random
 
 from bots.forms import PRESSED, Control, Form
@@ -188,7 +189,7 @@ def _number(control: Control, random: Random) -> str:
         low = Decimal(0) if low is None else low
         base = low
         high = max(low, Decimal(100) if high is None else high)
-    return _digits(_on_grid(low, high, base, step, random))
+    return f"{_on_grid(low, high, base, step, random).normalize():f}"
 
 
 def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Decimal, random: Random) -> Decimal:
@@ -196,22 +197,11 @@ def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Dec
 
     Without one of the limits, it lies at most 40 steps from the other; without both, at most 20 from `base`.
     """
-    first = -20 if low is None else -_floor((base - low) / step)
-    last = first + 40 if high is None else _floor((high - base) / step)
+    first = -20 if low is None else -floor((base - low) / step)
+    last = first + 40 if high is None else floor((high - base) / step)
     if low is None and high is not None:
         first = last - 40
     return base + step * (random.randint(first, last) if first <= last else 0)
-
-
-def _floor(number: Decimal) -> int:
-    """The largest whole number that is not greater. (Decimal's own `//` rounds towards zero.)"""
-    return int(number.to_integral_value(ROUND_FLOOR))
-
-
-def _digits(number: Decimal) -> str:
-    """The number without an exponent, and without zeros at its end."""
-    text = f"{number:f}"
-    return (text.rstrip("0").rstrip(".") if "." in text else text) or "0"
 
 
 def _moment_text(control: Control, random: Random) -> str:
