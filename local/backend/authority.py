@@ -43,15 +43,15 @@ class Authority:
 
     def context(self, *names: str) -> ssl.SSLContext:
         """Return a TLS context for a server, with a new certificate for these names and addresses."""
-        chain, key = self._certify(names)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         with tempfile.TemporaryDirectory(dir=self._folder) as place:  # readable by its owner alone
             file = Path(place) / "both.pem"
-            _write_private(file, chain + key)
+            _write_private(file, self._certify(names))
             context.load_cert_chain(file)
         return context
 
-    def _certify(self, names: Sequence[str]) -> tuple[bytes, bytes]:
+    def _certify(self, names: Sequence[str]) -> bytes:
+        """A new certificate for these names, and its key, as PEM."""
         key = ec.generate_private_key(ec.SECP256R1())
         built = (
             _builder(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, names[0][:64])]), NAME_DAYS)
@@ -62,8 +62,8 @@ class Authority:
             .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
             .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)
         )
-        made = built.sign(self._key, hashes.SHA256())
-        return made.public_bytes(serialization.Encoding.PEM), _pem(key)
+        certificate = built.sign(self._key, hashes.SHA256())
+        return certificate.public_bytes(serialization.Encoding.PEM) + _pem(key)
 
     def _load(self) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None:
         """The authority in the folder; None if there is none, or if it is damaged or expires within NAME_DAYS."""
@@ -72,10 +72,9 @@ class Authority:
             key = serialization.load_pem_private_key(self._key_file.read_bytes(), None)
         except (FileNotFoundError, ValueError):
             return None
-        ends = own.not_valid_after_utc - timedelta(days=NAME_DAYS)
         if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != own.public_key():
             return None
-        if ends < datetime.now(UTC):
+        if own.not_valid_after_utc < datetime.now(UTC) + timedelta(days=NAME_DAYS):
             return None
         self._key_file.chmod(0o600)
         return own, key
@@ -91,9 +90,8 @@ class Authority:
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(x509.NameConstraints(here, None), critical=True)
             .add_extension(SIGNS_CERTIFICATES, critical=True)
-            .add_extension(
-                x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False
-            )  # no e-mail, no code
+            # It signs no certificates for e-mail or code.
+            .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
             .sign(key, hashes.SHA256())
         )

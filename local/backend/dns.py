@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -27,13 +26,13 @@ class FileDns:
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         with files.locked(self._lock):
-            zone = self._zone()
-            before = json.dumps(zone)
+            before = self._zone()
+            zone = dict(before)
             for record in remove:
                 if zone.get(record.name) == record.host:
                     del zone[record.name]
             zone.update({record.name: record.host for record in add})
-            if json.dumps(zone) != before:
+            if zone != before:
                 files.write_json(self._file, zone, durable=False)  # a power cut ends every server, too
         return ""
 

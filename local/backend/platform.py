@@ -27,7 +27,7 @@ from local.backend import files
 from local.backend.bus import FolderBus, Handler
 from local.backend.dns import FileDns
 from local.backend.documents import FolderDocuments, Written
-from local.backend.retry import Retry, start
+from local.backend.retry import Retry, start_thread
 from local.backend.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
 from local.backend.timers import FolderTimers
 from local.publish import NotPublished, publish
@@ -104,8 +104,6 @@ class LocalPlatform:
             named_port=named_port,
         )
         self._closed = threading.Event()
-        self._sweeper = threading.Thread(target=self._sweep, name="sweep", daemon=True)
-        self._guard: threading.Thread | None = None
 
     def publish(self) -> Config:
         """Register the project, and copy its pages to the documents. Raises NotPublished."""
@@ -129,9 +127,13 @@ class LocalPlatform:
         for unfinished in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
             disk.remove_if_possible(unfinished)
         kept = {key: self.documents.get(key) for key in _KEPT}
-        self._guard = threading.Thread(target=self._look_after, args=[kept], name="guard", daemon=True)
-        threads = [partial(start, thread) for thread in (self._sweeper, self._guard)]
-        steps: list[Callable[[], None]] = [self.tasks.start, self.bus.start, self.timers.start, *threads]
+        steps: list[Callable[[], object]] = [
+            self.tasks.start,
+            self.bus.start,
+            self.timers.start,
+            partial(start_thread, self._sweep, name="sweep"),
+            partial(start_thread, self._look_after, kept, name="guard"),
+        ]
         for step in steps:
             self.retry.run(step, seconds=START_RETRY_SECONDS)
 

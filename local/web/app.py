@@ -10,7 +10,7 @@ from typing import Any
 
 from hippodrome.participants import frame
 from local.web import access
-from local.web.gateway import ROUTES, GatewayResponse, Scope, answer_of, event_of, json_answer
+from local.web.gateway import ROUTES, GatewayResponse, Scope, answer_of, event_of, headers_of, joined, json_answer
 
 LARGEST_BODY = 10 * 1024 * 1024
 THREADS = 32
@@ -36,8 +36,9 @@ class App:
         answer = await self._answer(scope, receive)
         if answer is None:
             return
-        headers = [*self._sent_headers(scope, answer.headers), (b"content-length", str(len(answer.body)).encode())]
-        await send({"type": "http.response.start", "status": answer.status, "headers": headers})
+        headers = [*self._sent_headers(scope, answer.headers), ("content-length", str(len(answer.body)))]
+        encoded = [(name.encode("latin-1"), value.encode("latin-1", "replace")) for name, value in headers]
+        await send({"type": "http.response.start", "status": answer.status, "headers": encoded})
         body = b"" if scope["method"] == "HEAD" else answer.body
         await send({"type": "http.response.body", "body": body})
 
@@ -53,9 +54,8 @@ class App:
             scope = {**scope, "path": path}
         if path == "/healthz":
             return _plain(200, "ok\n")
-        refused = access.refusal(
-            scope["method"], path, _headers(scope), self._origins, scheme=scope.get("scheme", "http")
-        )
+        headers = joined(headers_of(scope))
+        refused = access.refusal(scope["method"], path, headers, self._origins, scheme=scope.get("scheme", "http"))
         if refused:
             return _plain(403, f"{refused}\n")
         for route in ROUTES:
@@ -63,7 +63,7 @@ class App:
             if parameters is not None:
                 break
         else:
-            return _nothing_here(scope)
+            return _nothing_here(scope["method"], headers.get("accept", ""))
         body = await _body(receive)
         if body is None:
             return None
@@ -73,12 +73,12 @@ class App:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._threads, self._call, self._functions[route.function], event)
 
-    def _sent_headers(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+    def _sent_headers(self, scope: Scope, headers: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
         """The headers that are sent with an answer (`access.headers_for`), and its cookies."""
-        cookies = [(name, value) for name, value in headers if name == b"set-cookie"]
-        others = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in headers if name != b"set-cookie"]
-        sent = access.headers_for(_headers(scope).get("origin"), others, self._origins)
-        return [(name.encode("latin-1"), value.encode("latin-1")) for name, value in sent.items()] + cookies
+        cookies = [header for header in headers if header[0] == "set-cookie"]
+        others = [header for header in headers if header[0] != "set-cookie"]
+        sent = access.headers_for(joined(headers_of(scope)).get("origin"), others, self._origins)
+        return [*sent.items(), *cookies]
 
     def _call(self, handler: Handler, event: dict[str, Any]) -> GatewayResponse:
         try:
@@ -86,15 +86,6 @@ class App:
         except Exception:  # noqa: BLE001 - as with API Gateway, the participant sees no details
             self._say(f"a function failed:\n{traceback.format_exc().rstrip()}")
             return _message(500, "Internal Server Error")
-
-
-def _headers(scope: Scope) -> dict[str, str]:
-    """The headers of a request, for `access`. A header that was sent twice has both values, with a comma between."""
-    found: dict[str, str] = {}
-    for raw_name, raw_value in scope["headers"]:
-        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
-        found[name] = f"{found[name]},{value}" if name in found else value
-    return found
 
 
 async def _body(receive: Receive) -> bytes | None:
@@ -111,21 +102,18 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _plain(status: int, text: str) -> GatewayResponse:
-    return GatewayResponse(status, [(b"content-type", b"text/plain; charset=utf-8")], text.encode())
+    return GatewayResponse(status, [("content-type", "text/plain; charset=utf-8")], text.encode())
 
 
 def _message(status: int, text: str) -> GatewayResponse:
     return json_answer(status, {"message": text})
 
 
-def _nothing_here(scope: Scope) -> GatewayResponse:
+def _nothing_here(method: str, accept: str) -> GatewayResponse:
     """The answer for a path without a route: that of API Gateway, or a page if a browser asks for one."""
-    accepts = b",".join(value for name, value in scope["headers"] if name.lower() == b"accept")
-    if scope["method"] not in ("GET", "HEAD") or b"text/html" not in accepts:
+    if method not in ("GET", "HEAD") or "text/html" not in accept:
         return _message(404, "Not Found")
     text = "Please open your study link again. It looks like /next?projectId=…"
     page = frame.message_page("There is nothing here", text)
     headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
-    return GatewayResponse(
-        404, [(name.lower().encode(), value.encode()) for name, value in headers.items()], page.html.encode()
-    )
+    return GatewayResponse(404, [(name.lower(), value) for name, value in headers.items()], page.html.encode())

@@ -14,7 +14,7 @@ import json
 import re
 import time
 import uuid
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
@@ -50,27 +50,33 @@ ROUTES = (
 
 
 class GatewayResponse(NamedTuple):
-    """The status, headers and body that are sent to the client."""
+    """The status, headers and body that a function returns. The names of headers are in lower case."""
 
     status: int
-    headers: list[tuple[bytes, bytes]]
+    headers: list[tuple[str, str]]
     body: bytes
+
+
+def headers_of(scope: Scope) -> list[tuple[str, str]]:
+    """Return the headers of a request. Their names are in lower case."""
+    return [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in scope["headers"]]
+
+
+def joined(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return the values by their names. Values of the same name are joined by commas, as API Gateway does."""
+    found: dict[str, str] = {}
+    for name, value in pairs:
+        found[name] = f"{found[name]},{value}" if name in found else value
+    return found
 
 
 def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:
     """Return the event of payload format 2.0 for this request."""
-    headers: dict[str, str] = {}
-    cookies: list[str] = []
-    for raw_name, raw_value in scope["headers"]:
-        name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
-        if name == "cookie":
-            cookies += [part.strip() for part in value.split(";") if part.strip()]
-        else:
-            headers[name] = f"{headers[name]},{value}" if name in headers else value
-    query: dict[str, str] = {}
+    sent = headers_of(scope)
+    headers = joined(pair for pair in sent if pair[0] != "cookie")
+    cookies = [part.strip() for name, value in sent if name == "cookie" for part in value.split(";") if part.strip()]
     raw_query = scope["query_string"].decode("latin-1")
-    for name, value in parse_qsl(raw_query, keep_blank_values=True):
-        query[name] = f"{query[name]},{value}" if name in query else value
+    query = joined(parse_qsl(raw_query, keep_blank_values=True))
     now = time.time()
     host = headers.get("host", _HOST)
     route_key = f"{scope['method']} {route.path}"
@@ -126,11 +132,7 @@ def answer_of(result: Any) -> GatewayResponse:
     if not any(name == "content-type" for name, _ in headers):
         headers.append(("content-type", "text/plain; charset=utf-8"))
     headers += [("set-cookie", str(cookie)) for cookie in result.get("cookies") or ()]
-    sent = [
-        (name.encode("latin-1"), value.encode("latin-1", "replace"))
-        for name, value in headers
-        if name not in ("content-length", "transfer-encoding", "connection")
-    ]
+    sent = [header for header in headers if header[0] not in ("content-length", "transfer-encoding", "connection")]
     return GatewayResponse(int(result["statusCode"]), sent, data)
 
 
@@ -146,4 +148,4 @@ def _text(body: bytes, content_type: str) -> str | None:
 
 def json_answer(status: int, data: Any) -> GatewayResponse:
     """Return a response with JSON."""
-    return GatewayResponse(status, [(b"content-type", b"application/json")], json.dumps(data).encode())
+    return GatewayResponse(status, [("content-type", "application/json")], json.dumps(data).encode())
