@@ -166,26 +166,27 @@ def _run(
             "If that is right, delete the folder. If not, look at --project, --stack and --region.",
         )
     tally.gone = fetch.forget_gone(state, folder)
-    style = table_files.Style("csv" in options.formats, "parquet" in options.formats, options.spreadsheet)
+    parquet = "parquet" in options.formats
+    # If datasets are the only format, the tables are CSV.
+    style = table_files.Style("csv" in options.formats or not parquet, parquet, options.spreadsheet)
     written: list[Path] = []
     with _bar("Writing tables") as progress:
         answers = StudyAnswers(state, project, options.apart, read_fields(source, project))
-        either = style if style.csv or style.parquet else table_files.Style(parquet=False)
         columns = answers.columns
-        written += table_files.write(folder / "answers", columns, answers.rows(), either)
+        written += table_files.write(folder / "answers", columns, answers.rows(), style)
         finished, scrubbed = answers.finished, answers.scrubbed
         if options.long:
-            written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), either)
+            written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), style)
         if options.wanted.recordings:
             players, shared = tables.players(state), tables.in_sessions(state)
             rows = tables.episodes(state, players, shared)
-            written += table_files.write(folder / "episodes", tables.episode_columns(players, shared), rows, either)
+            written += table_files.write(folder / "episodes", tables.episode_columns(players, shared), rows, style)
             if any(found.get("callbacks") for _, _, found in state.episodes()):
                 lines = tables.callbacks(state, folder, shared)
-                written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, either)
+                written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)
             if shared:
                 rows = tables.presence(state, folder)
-                written += table_files.write(folder / "presence", tables.PRESENCE, rows, either)
+                written += table_files.write(folder / "presence", tables.PRESENCE, rows, style)
         only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
         written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)

@@ -544,6 +544,12 @@ def test_foreign_folders_and_wrong_options_are_refused(place: Place, tmp_path: P
     assert main(["data", str(place.out), "--project", "maze", "--from", str(tmp_path / "none")]) == Exit.FAILED
 
 
+def test_formulas_are_escaped_too_if_datasets_are_the_only_format(place: Place) -> None:
+    arrive(place.put, "ann", {"2": {"pet": "=1+1"}})
+    place.done("--format", "minari", "--spreadsheet")
+    assert place.rows()[0]["2.pet"] == "'=1+1"
+
+
 @pytest.mark.parametrize(("formats", "package"), [("parquet", "pyarrow"), ("csv,minari", "minari")])
 def test_a_package_that_is_missing_is_named_before_anything_is_done(
     place: Place, monkeypatch: Any, formats: str, package: str
