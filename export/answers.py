@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from export import scrub
 from export.page_fields import FieldKind
-from export.recording_columns import as_whole, when
+from export.recording_columns import as_number, as_whole, when
 from export.scrub import clean, texts
 from export.state import ExportedParticipant, ExportState
 from export.table_files import Column, fit, json_text
@@ -243,14 +243,12 @@ def _membership(participant: ExportedParticipant) -> list[Any]:
     """The participant's session and seat, whether they were unmatched, and the seconds for which they waited."""
     about = participant.membership
     session = about.get("session") if is_session_id(about.get("session")) else None
-    seat = as_whole(about.get("seat"))
-    unmatched, waited = about.get("unmatched"), about.get("waited")
-    is_number = isinstance(waited, int | float) and not isinstance(waited, bool)
+    seat, waited, unmatched = as_whole(about.get("seat")), as_number(about.get("waited")), about.get("unmatched")
     return [
         session,
         seat if session is not None and seat is not None and seat >= 0 else None,
         unmatched if isinstance(unmatched, bool) else None,
-        waited if is_number and waited >= 0 else None,
+        waited if waited is not None and waited >= 0 else None,
     ]
 
 

@@ -190,6 +190,15 @@ def test_with_identities_apart_only_private_files_hold_members_data(place: Place
     assert f"I am {who[ANN]} and {who[BOB]} and (PROLIFIC_PID)" in str(table(place.out, "messages"))
 
 
+@pytest.mark.parametrize("wrong", [{"seat": 2**63}, {"waited": 2**53 + 1}, {"waited": 10**400}])
+def test_a_number_that_no_column_can_hold_does_not_stop_the_run(place: Place, wrong: dict[str, int]) -> None:
+    study(place.put, place.tmp)
+    file = place.data / membership_key(PROJECT.id, ANN)
+    file.write_text(json.dumps(json.loads(file.read_text()) | wrong))
+    place.done()
+    assert {row["participant"] for row in place.rows()} == {ANN, BOB, CY}
+
+
 def test_minari_has_a_dataset_for_each_human_player(tmp_path: Path, monkeypatch: Any) -> None:
     study(into_folder(tmp_path / "data"), tmp_path, observe=True)
     out = tmp_path / "out"
