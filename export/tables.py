@@ -296,8 +296,8 @@ def _without_ids(key: str, participant: ExportedParticipant | None, project: str
         return "(somewhere in users/)"
     parts = key.split("/")
     match parts[1:]:
-        case ["participant.json" | "session.json" as name]:
-            rest = name
+        case ["participant.json" | "session.json"]:
+            rest = parts[1]
         case ["answers", name] if (
             re.fullmatch(r"[A-Za-z0-9_-]{1,64}\.json", name) and name != f"{participant.user}.json"
         ):
