@@ -8,21 +8,19 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import json
-import math
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from random import Random
 from typing import IO, Any, ClassVar
 
 from local.check import idle
 from local.check.agent_progress import AgentProgress
+from local.check.game import CheckedGame
+from local.check.one_player import OnePlayer
 from local.check.outside import Outside
-from local.check.several import GameOfSeveral
 from protocol import environment as variables
 from protocol import handover
 from protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
@@ -32,7 +30,7 @@ from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.callbacks import Callbacks, TrialFacts
 from trial.agent.joint import JointAdapter
 from trial.agent.starting import start
-from trial.core.players import PLAYER, Player, who_plays
+from trial.core.players import Player, who_plays
 from trial.pictures import assets
 from trial.pictures.assets import Assets
 from trial.pictures.reader import PictureReader
@@ -102,40 +100,36 @@ def _try(report: Path, deadline: _Deadline) -> None:
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
     player: AgentAdapter | JointAdapter = progress.result
+    joint = player if isinstance(player, JointAdapter) else OnePlayer(player)
 
     def reset() -> Any:
         os.environ.__class__ = usual_class
         if document:
             assignment.set_environment(os.environ, _assigned(document))
         progress.callbacks.session_begins()
-        return player.reset(1)
+        return joint.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
     if question and not _matches(adapter, question, progress, deadline):
         return
-    spaces = {PLAYER: player.action_space} if isinstance(player, AgentAdapter) else player.action_spaces
     progress.known = _actions(player, config)
-    if not progress.call("players", lambda: who_plays(config, spaces, group)):
+    if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
         return
     players = progress.result
     progress.callbacks = _callbacks(player, players, progress, config.callback_seconds)
+    names, count = progress.known["names"], progress.known["count"]
+    if count is not None and names > count:
+        if isinstance(player, AgentAdapter):
+            first = int(getattr(player.env.action_space, "start", 0))
+            progress.foreign = _foreign_actions(player.env, range(first, first + count))
+        elif not player.steps_itself:
+            progress.foreign = [count]
     if isinstance(player, JointAdapter):
-        game = GameOfSeveral(player, players, config, folder, progress)
-        if not player.steps_itself and progress.known["names"] > (progress.known["count"] or math.inf):
-            progress.foreign = [progress.known["count"]]
-        if game.load() and game.play(reset, progress.time_over):
-            _note_idle(player, players, config, progress)
-            if game.close():
-                progress.over()
-        return
-    env, space = player.env, getattr(player.env, "action_space", None)
-    count = getattr(space, "n", None)
-    if count is not None and len(player.action_space) > int(count):
-        first = int(getattr(space, "start", 0))
-        progress.foreign = _foreign_actions(env, range(first, first + int(count)))
-    if _play(player, progress, reset, config):
-        _note_idle(player, players, config, progress)
-        if progress.call("close", player.close):
+        player.views = tuple(one.name for one in players if one.human)
+    game = CheckedGame(joint, players, config, progress)
+    if game.load(folder, adapter.agent_module) and game.play(reset):
+        _note_idle(joint, players, config, progress)
+        if game.close():
             progress.over()
 
 
@@ -200,7 +194,7 @@ def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[
 
 
 def _note_idle(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: TrialSection, progress: AgentProgress
+    joint: JointAdapter | OnePlayer, players: Sequence[Player], config: TrialSection, progress: AgentProgress
 ) -> None:
     """Note whether the idle action, which is taken while no key is pressed, changes the picture.
 
@@ -212,14 +206,10 @@ def _note_idle(
     others = {one.name: one.idle for one in players}
 
     def step(action: int) -> bool:
-        if isinstance(player, AgentAdapter):
-            outcome = player.step(action)
-            return outcome.terminated or outcome.truncated
-        return player.step({**others, human.name: action}).over
+        return joint.step({**others, human.name: action}).over
 
-    picture = player.render if isinstance(player, AgentAdapter) else player.pictures
     with contextlib.suppress(Exception):
-        still = idle.actions_without_effect(player.reset, step, picture, len(human.action_space), human.idle)
+        still = idle.actions_without_effect(joint.reset, step, joint.pictures, len(human.action_space), human.idle)
         if still is not None:
             names = [human.action_space[action] for action in still]
             progress.known["idle"] = {"action": human.action_space[human.idle], "still": names}
@@ -254,47 +244,6 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
     with contextlib.suppress(AttributeError):  # an object without a `__dict__` cannot be watched
         env.step = watched
     return found
-
-
-def _play(player: Any, progress: AgentProgress, first_reset: Callable[[], Any], config: TrialSection) -> bool:
-    """Play until the last episode or the time is over; False if a call failed.
-
-    Each action is taken once, in turn; then actions are random.
-    """
-    callbacks = progress.callbacks
-    random = Random(1)  # noqa: S311 - the same actions each time
-    for episode in range(1, config.max_episodes + 1):
-        reset = first_reset if episode == 1 else partial(player.reset, episode)
-        if not progress.call("reset", reset):
-            return False
-        observation, info, _ = progress.result
-        if not progress.call("render", player.render):
-            return False
-        callbacks.episode_began(episode, {PLAYER: observation}, {PLAYER: info})
-        steps, ended = 0, False
-        while not ended:
-            if progress.time_over():
-                callbacks.session_ended()
-                return True
-            steps += 1
-            actions = len(player.action_space)
-            progress.action = progress.steps if progress.steps < actions else random.randrange(actions)
-            began = time.monotonic()
-            if not progress.call("step", lambda: player.step(progress.action)):
-                return False
-            progress.steps += 1
-            outcome = progress.result
-            ended = outcome.terminated or outcome.truncated or steps >= config.most_steps
-            if not progress.call("render", player.render):
-                return False
-            progress.pace.took(time.monotonic() - began)
-            progress.returned((outcome.info,), outcome.extra)
-            seen = {PLAYER: outcome.observation}, {PLAYER: outcome.info}
-            callbacks.stepped({PLAYER: progress.action}, {PLAYER: outcome.reward}, *seen)
-        progress.episodes = episode
-        callbacks.episode_ended("terminated" if outcome.terminated else "truncated")
-    callbacks.session_ended()
-    return True
 
 
 def _main(report: Path) -> None:

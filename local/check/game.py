@@ -1,23 +1,25 @@
-"""Lets an environment with several players play, in the agent's process (`agent_process.py`).
+"""Plays whole episodes with the agent, in its process (`agent_process.py`).
 
-Humans take random actions, and policies play the other players. As on a server, but one after another, so that each
-policy is timed by itself. If there are several humans, `substitute` plays in each of their places for a while.
+Humans take random actions, and policies play the other players. The policies are called one after another, so that each
+is timed by itself. If there are several humans, `substitute` plays in each of their places for a while.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Any, Protocol
+from typing import Any
 
+from local.check.agent_progress import AgentProgress
+from local.check.one_player import OnePlayer
 from local.check.pace import Pace
 from protocol.trial import TrialSection
 from trial.agent.joint import Joint, JointAdapter
-from trial.core.players import Player, legal_actions
+from trial.core.players import PLAYER, Player, legal_actions
 from trial.core.seeds import policy_seed
 from trial.policies.places import load_policies
 from trial.policies.policy import Policy
@@ -25,30 +27,17 @@ from trial.policies.policy import Policy
 STAYS = 20  # steps for which a substitute plays in one place
 
 
-class Reporting(Protocol):
-    """The methods of `AgentProgress` that are used here."""
-
-    action: Any
-    steps: int
-    episodes: int
-    pace: Pace
-    known: dict[str, Any]
-    result: Any
-    callbacks: Any
-
-    def call(self, name: str, function: Callable[[], Any]) -> bool: ...
-
-    def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None: ...
-
-
-class GameOfSeveral:
-    """A game of several players that `make check` plays: `load` it, `play` it, `close` it."""
+class CheckedGame:
+    """A game that `make check` plays: `load` its policies, `play` it, `close` it."""
 
     def __init__(
-        self, adapter: JointAdapter, players: Sequence[Player], config: TrialSection, folder: Path, progress: Reporting
+        self,
+        adapter: JointAdapter | OnePlayer,
+        players: Sequence[Player],
+        config: TrialSection,
+        progress: AgentProgress,
     ) -> None:
         self._adapter, self._players, self._config, self._progress = adapter, players, config, progress
-        self._folder = folder
         self._policies: dict[str, Policy] = {}
         self._paces: dict[str, Pace] = {}
         self._last: dict[str, int] = {}
@@ -56,33 +45,28 @@ class GameOfSeveral:
         self._pressed = 0
         self._substitutes: dict[str, Policy] = {}  # by the player in whose place each plays
         self._acted: set[frozenset[str]] = set()  # the groups of players that acted at the same time
-        adapter.views = tuple(player.name for player in players if player.human)
 
-    def load(self) -> bool:
-        """Load the policies; return False if one cannot be loaded, which is reported."""
+    def load(self, folder: Path, agent_module: Any) -> bool:
+        """Load the policies from `folder` and agent.py; return False if one cannot be loaded, which is reported."""
+
+        def loaded(players: Sequence[Player]) -> bool:
+            spaces = self._adapter.observation_spaces
+            return self._progress.call("policies", lambda: load_policies(players, folder, agent_module, spaces))
+
         humans = [player for player in self._players if player.human]
         plays = self._config.substitute if len(humans) > 1 else None
-        policies = self._loaded(self._players)
-        if policies is None:
+        if not loaded(self._players):
             return False
-        self._policies = policies
-        substitutes = self._loaded([replace(player, plays=plays) for player in humans]) if plays else {}
-        if substitutes is None:
-            return False
-        self._substitutes = substitutes
-        self._paces = {name: Pace() for name in (*policies, *substitutes)}
+        self._policies = self._progress.result
+        if plays:
+            if not loaded([replace(player, plays=plays) for player in humans]):
+                return False
+            self._substitutes = self._progress.result
+        self._paces = {name: Pace() for name in (*self._policies, *self._substitutes)}
         return True
 
-    def _loaded(self, players: Sequence[Player]) -> dict[str, Policy] | None:
-        """The policies of these players; None if one cannot be loaded, which is reported."""
-        agent = self._adapter
-        done = self._progress.call(
-            "policies", lambda: load_policies(players, self._folder, agent.agent_module, agent.observation_spaces)
-        )
-        return dict(self._progress.result) if done else None
-
-    def play(self, first_reset: Callable[[], Any], over: Callable[[], bool]) -> bool:
-        """Play until the last episode has ended or `over()`; return False if a call failed, which is reported."""
+    def play(self, first_reset: Callable[[], Any]) -> bool:
+        """Play until the last episode or the time is over; return False if a call failed, which is reported."""
         progress, callbacks = self._progress, self._progress.callbacks
         for episode in range(1, self._config.max_episodes + 1):
             if not progress.call("reset", first_reset if episode == 1 else partial(self._adapter.reset, episode)):
@@ -93,7 +77,7 @@ class GameOfSeveral:
             callbacks.episode_began(episode, now.observations, now.infos)
             steps = 0
             while not now.over and steps < self._config.most_steps:
-                if over():
+                if progress.time_over():
                     callbacks.session_ended()
                     return True
                 self._acted.add(now.to_act)
@@ -101,7 +85,7 @@ class GameOfSeveral:
                 if actions is None:
                     return False
                 began = time.monotonic()
-                progress.action = actions
+                progress.action = actions[PLAYER] if isinstance(self._adapter, OnePlayer) else actions
                 if not progress.call("step", partial(self._adapter.step, actions)):
                     return False
                 now, steps = progress.result, steps + 1
