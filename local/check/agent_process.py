@@ -100,7 +100,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
     player: AgentAdapter | JointAdapter = progress.result
-    joint = player if isinstance(player, JointAdapter) else OnePlayer(player)
+    joint = player if isinstance(player, JointAdapter) else OnePlayer(player, masked=config.pace == "turns")
 
     def reset() -> Any:
         os.environ.__class__ = usual_class

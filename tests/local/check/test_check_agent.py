@@ -278,6 +278,14 @@ def with_a_third_name(folder: Path, step: str) -> None:
     agent(folder, "return self.env.step(action)", step)
 
 
+def test_turn_by_turn_no_action_is_taken_that_the_mask_forbids(folder: Path) -> None:
+    config(folder, "  maxEpisodes: 1\n", "  maxEpisodes: 1\n  pace: turns\n")
+    agent(folder, "return 0, {}", "return 0, {'action_mask': [1, 0]}")
+    agent(folder, "self.n >= 30, False, {}", "self.n >= 30, False, {'action_mask': np.array([1, 0])}")
+    agent(folder, "self.n += 1", "self.n += 1; assert action == 0, 'an illegal action'")
+    assert tried(folder) == []
+
+
 def test_an_agent_may_turn_names_into_actions_of_the_environment(folder: Path) -> None:
     with_a_third_name(folder, "return self.env.step([0, 0, 1][action])")
     assert tried(folder) == []
