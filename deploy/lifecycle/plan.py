@@ -243,7 +243,7 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
     prepared = prepare(account, stack, settings)
     if prepared.existing is None:
         found = of_creation(prepared.template, prepared.parameters)
-        findings = preflight.look_at(preflight.InstallationCheck(prepared, study))
+        findings = preflight.look_at(prepared, study)
         seconds = time.monotonic() - began
         return Plan(stack, account.region, "create", found, {}, seconds, findings, new_site(prepared))
     act = states.action_for(prepared.status)
@@ -265,7 +265,7 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
     if not changes:
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
     findings = [look("CloudFormation", warning) for warning in made.warnings]
-    findings += preflight.look_at(preflight.InstallationCheck(prepared, study))
+    findings += preflight.look_at(prepared, study)
     changed, seconds = prepared.changed_parameters(), time.monotonic() - began
     return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
 

@@ -1,15 +1,14 @@
 """Checks before anything is made. One list of findings shows all mistakes in seconds, without a rollback.
 
-A finding is bad if the stack would fail, or wait for hours; bad findings stop the command. A finding that a first study
-can live with is only worth a look, and so is a check that these credentials may not make.
+A finding is bad if the stack would fail, or wait for hours; bad findings stop the command. A finding that does not
+prevent a first study is only worth a look. So is a check that these credentials may not make.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from botocore.exceptions import ClientError
 
@@ -32,16 +31,11 @@ FEW = 20  # servers at once; if the quota allows fewer, the advice is to ask AWS
 USUAL = 1.0  # vCPU of a server, if there is no study that says
 
 
-@dataclass(frozen=True)
-class InstallationCheck:
-    """An installation that will be made or changed, and the study that will be registered there, if any."""
+class AccountCheck(NamedTuple):
+    """An account without an installation, and the study that will be registered there, if any."""
 
-    prepared: Prepared
-    study: ProjectFolder | None = None
-
-    @property
-    def account(self) -> Account:
-        return self.prepared.account
+    account: Account
+    study: ProjectFolder | None
 
 
 def check(
@@ -51,12 +45,12 @@ def check(
 
     Raises `Problem` if one of them is bad, unless `anyway`.
     """
-    _stop(list(wrong) + look_at(InstallationCheck(prepared, study)), anyway)
+    _stop([*wrong, *look_at(prepared, study)], anyway)
 
 
 def check_account(account: Account, wrong: Sequence[Finding], study: ProjectFolder | None = None) -> None:
     """Check the account before a first installation; show all findings. Raises `Problem` if one of them is bad."""
-    _stop([*wrong, *examine((account, study), _OF_ACCOUNT)])
+    _stop([*wrong, *examine(AccountCheck(account, study), _OF_ACCOUNT)])
 
 
 def of_problem(name: str, problem: Problem) -> Finding:
@@ -64,23 +58,26 @@ def of_problem(name: str, problem: Problem) -> Finding:
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
-def look_at(checked: InstallationCheck) -> list[Finding]:
-    """Make all checks that apply, and return the findings that are not good, bad ones last. Changes nothing."""
-    before, after = checked.prepared.before, checked.prepared.parameters
+def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Finding]:
+    """Make all checks that apply, and return the findings that are not good, bad ones last. Changes nothing.
+
+    `study` is the study that will be registered in this installation.
+    """
+    before, after = prepared.before, prepared.parameters
     found: list[Finding] = []
-    checks: dict[str, Callable[[InstallationCheck], Iterable[Finding]]] = {}
+    checks: dict[str, Callable[[Prepared], Iterable[Finding]]] = {}
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
         checks |= _OF_ADDRESSES
-    if domain_change.moves(checked.prepared):
+    if domain_change.moves(prepared):
         checks |= {"CAA": _authorities, "servers' names": _servers_names}
     if (before.get("VpcId") or "") != after["VpcId"]:
         checks["servers"] = _servers_that_run
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
         checks["network"] = _subnets
-    if checked.prepared.existing is None:
+    if prepared.existing is None:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
-        found = examine((checked.account, checked.study), _OF_ACCOUNT)
-    found += examine(checked, checks)
+        found = examine(AccountCheck(prepared.account, study), _OF_ACCOUNT)
+    found += examine(prepared, checks)
     return _bad_last(one for one in found if one.mark is not Mark.GOOD)
 
 
@@ -101,24 +98,22 @@ def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
 
 # -- the account ------------------------------------------------------------------------------------------------------
 
-Newcomer = tuple[Account, "ProjectFolder | None"]  # an account without an installation, and the study for it
 
-
-def _region(newcomer: Newcomer) -> Iterator[Finding]:
+def _region(checked: AccountCheck) -> Iterator[Finding]:
     try:
-        regions.check(newcomer[0].region)
+        regions.check(checked.account.region)
     except Problem as problem:
         yield of_problem("region", problem)
 
 
-def _root(newcomer: Newcomer) -> Iterator[Finding]:
-    if newcomer[0].identity["Arn"].endswith(":root"):
+def _root(checked: AccountCheck) -> Iterator[Finding]:
+    if checked.account.identity["Arn"].endswith(":root"):
         yield look("credentials", "They are the root user's, who can do anything.", "Use a role or a user of your own.")
 
 
-def _executions(newcomer: Newcomer) -> Iterator[Finding]:
+def _executions(checked: AccountCheck) -> Iterator[Finding]:
     """Check Lambda's concurrent executions, which pages and the functions behind queues share (`aws.concurrency`)."""
-    account, _ = newcomer
+    account = checked.account
     free = concurrency.unreserved(account)
     if concurrency.starts(free) < concurrency.USUAL:
         pages, starts = max(0, free - concurrency.workers(free)), concurrency.starts(free)
@@ -130,8 +125,8 @@ def _executions(newcomer: Newcomer) -> Iterator[Finding]:
         )
 
 
-def _servers(newcomer: Newcomer) -> Iterator[Finding]:
-    account, study = newcomer
+def _servers(checked: AccountCheck) -> Iterator[Finding]:
+    account, study = checked
     if study and not study.plays:
         return
     cpu = float(study.registration["awsSetup"]["cpu"]) if study else USUAL
@@ -148,11 +143,11 @@ def _servers(newcomer: Newcomer) -> Iterator[Finding]:
         )
 
 
-def _builds(newcomer: Newcomer) -> Iterator[Finding]:
+def _builds(checked: AccountCheck) -> Iterator[Finding]:
     """Check whether the image of a study with a game can be built, by Docker here or by CodeBuild."""
     from deploy.study.image import docker  # noqa: PLC0415 - pydantic, needed only before a first installation
 
-    account, study = newcomer
+    account, study = checked
     if (study and not study.plays) or docker.available():
         return
     value = quotas.applied(account, quotas.BUILDS)
@@ -170,7 +165,7 @@ def _builds(newcomer: Newcomer) -> Iterator[Finding]:
         yield look("CodeBuild", f"{missing}: images of studies cannot be built.", remedy)
 
 
-_OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
+_OF_ACCOUNT: Mapping[str, Callable[[AccountCheck], Iterable[Finding]]] = {
     "region": _region,
     "credentials": _root,
     "CodeBuild": _builds,
@@ -182,12 +177,12 @@ _OF_ACCOUNT: Mapping[str, Callable[[Newcomer], Iterable[Finding]]] = {
 # -- the addresses ----------------------------------------------------------------------------------------------------
 
 
-def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
+def _delegation(prepared: Prepared) -> Iterator[Finding]:
     """Check the zone's delegation. Without it the stack waits up to twelve hours for ACM, which asks DNS, and fails.
 
     (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
-    zone = read_zone(checked.account, checked.prepared.parameters["HostedZoneId"])
+    zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
     found = delegation(zone)
     servers = ", ".join(zone.name_servers)
     if found.problem and found.certain:
@@ -201,12 +196,12 @@ def _delegation(checked: InstallationCheck) -> Iterator[Finding]:
         yield look("domain", found.problem, f"Its name servers have to be {servers}.")
 
 
-def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
+def _authorities(prepared: Prepared) -> Iterator[Finding]:
     """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
-    after = checked.prepared.parameters
+    after = prepared.parameters
     root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
     servers = names_of(domain_change.servers_domain(after))
-    known = partial(exists, checked.account, read_zone(checked.account, after["HostedZoneId"]))
+    known = partial(exists, prepared.account, read_zone(prepared.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for issuer, name, authorities in wanted:
         found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
@@ -222,8 +217,8 @@ def _authorities(checked: InstallationCheck) -> Iterator[Finding]:
             )
 
 
-def _site(checked: InstallationCheck) -> Iterator[Finding]:
-    account, after = checked.account, checked.prepared.parameters
+def _site(prepared: Prepared) -> Iterator[Finding]:
+    account, after = prepared.account, prepared.parameters
     site = f"{after['SiteHost']}.{after['RootDomain']}"
     advice = (
         "If that is your installation in another region, set AWS_REGION to that one; else take another --site, or "
@@ -240,26 +235,26 @@ def _site(checked: InstallationCheck) -> Iterator[Finding]:
         yield bad("site", f"API Gateway already serves {site} in this region, for something else.", advice)
 
 
-def _servers_names(checked: InstallationCheck) -> Iterator[Finding]:
+def _servers_names(prepared: Prepared) -> Iterator[Finding]:
     try:
-        domain_change.check(checked.prepared)
+        domain_change.check(prepared)
     except Problem as problem:
         yield of_problem("servers' names", problem)
 
 
-def _servers_that_run(checked: InstallationCheck) -> Iterator[Finding]:
+def _servers_that_run(prepared: Prepared) -> Iterator[Finding]:
     """Check that no running server uses an address of the site, or a network, that is to be replaced."""
     for check in (domain_change.check_site, domain_change.check_network):
         try:
-            check(checked.prepared)
+            check(prepared)
         except Problem as problem:
             yield of_problem("servers", problem)
 
 
-def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
+def _other_stacks(prepared: Prepared) -> Iterator[Finding]:
     """Check for other stacks with this domain: if both had the same study, its servers would have the same names."""
-    name, root = checked.prepared.stack.name, checked.prepared.parameters["RootDomain"]
-    for other, parameters in other_installations(checked.account, name):
+    name, root = prepared.stack.name, prepared.parameters["RootDomain"]
+    for other, parameters in other_installations(prepared.account, name):
         if parameters.get("RootDomain") == root:
             yield look(
                 "domain",
@@ -268,7 +263,7 @@ def _other_stacks(checked: InstallationCheck) -> Iterator[Finding]:
             )
 
 
-_OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = {
+_OF_ADDRESSES: Mapping[str, Callable[[Prepared], Iterable[Finding]]] = {
     "domain": _delegation,
     "CAA": _authorities,
     "site": _site,
@@ -280,11 +275,11 @@ _OF_ADDRESSES: Mapping[str, Callable[[InstallationCheck], Iterable[Finding]]] = 
 # -- the network, and what an earlier installation has left -----------------------------------------------------------
 
 
-def _subnets(checked: InstallationCheck) -> Iterator[Finding]:
-    after = checked.prepared.parameters
+def _subnets(prepared: Prepared) -> Iterator[Finding]:
+    after = prepared.parameters
     vpc, subnets = after["VpcId"], after["SubnetIds"].split(",")
     try:
-        found = checked.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
+        found = prepared.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
     except ClientError as error:
         if errors.code(error) not in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
             raise
@@ -305,28 +300,28 @@ def _subnets(checked: InstallationCheck) -> Iterator[Finding]:
         )
 
 
-def _vpcs(checked: InstallationCheck) -> Iterator[Finding]:
+def _vpcs(prepared: Prepared) -> Iterator[Finding]:
     """Check the quota of VPCs, which is 5 in a Region at first, for an installation with a VPC of its own."""
-    if checked.prepared.parameters["VpcId"]:
+    if prepared.parameters["VpcId"]:
         return
-    pages = checked.account.client("ec2").get_paginator("describe_vpcs").paginate()
+    pages = prepared.account.client("ec2").get_paginator("describe_vpcs").paginate()
     present = sum(len(page["Vpcs"]) for page in pages)
-    allowed = quotas.applied(checked.account, quotas.VPCS)
+    allowed = quotas.applied(prepared.account, quotas.VPCS)
     if allowed is not None and present >= allowed:
         yield bad(
             "VPCs",
-            f"There are {present} VPCs in {checked.account.region}, and this account may have no more.",
+            f"There are {present} VPCs in {prepared.account.region}, and this account may have no more.",
             "Use one of them (--vpc vpc-… --subnets subnet-…,subnet-…), or ask for one more: "
-            + quotas.request(checked.account, quotas.VPCS, present + 1),
+            + quotas.request(prepared.account, quotas.VPCS, present + 1),
         )
 
 
-def _left_over(checked: InstallationCheck) -> Iterator[Finding]:
+def _left_over(prepared: Prepared) -> Iterator[Finding]:
     """Check for log groups that an unfinished `destroy` has left: the stack cannot make groups of the same names."""
-    if checked.prepared.found is not None:
+    if prepared.found is not None:
         return
-    name = checked.prepared.stack.name
-    if left := inventory.log_groups(checked.account, name):
+    name = prepared.stack.name
+    if left := inventory.log_groups(prepared.account, name):
         yield bad(
             "left over",
             f"An earlier installation {name} has left {count(len(left), 'log group')}, such as {left[0]}.",

@@ -43,7 +43,7 @@ def game(tmp_path: Path) -> project_folder.ProjectFolder:
 def findings(
     world: World, settings: StackSettings = FIRST, game: project_folder.ProjectFolder | None = None
 ) -> list[Finding]:
-    return preflight.look_at(preflight.InstallationCheck(prepare(world.account, "hippodrome", settings), game))
+    return preflight.look_at(prepare(world.account, "hippodrome", settings), game)
 
 
 def only(found: list[Finding]) -> Finding:

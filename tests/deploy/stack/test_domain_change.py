@@ -99,7 +99,7 @@ def test_running_servers_stop_a_change_of_the_network(world: Installed) -> None:
 def test_preflight_finds_servers_that_stop_a_change_of_site_or_network(world: Installed, site: str, vpc: str) -> None:
     world.record("alice")
     moved = prepared(world, ServersHost="", SiteHost=site, VpcId=vpc, SubnetIds="subnet-1")
-    found = preflight.look_at(preflight.InstallationCheck(moved))
+    found = preflight.look_at(moved)
     assert [one.mark for one in found if one.check == "servers"] == [Mark.BAD]
 
 
