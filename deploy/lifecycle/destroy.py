@@ -14,7 +14,6 @@ from deploy.aws.account import STACK, Account, elsewhere, open_account
 from deploy.core import options
 from deploy.lifecycle.remains import look_again
 from deploy.lifecycle.removal import FoundInstallation, Removal
-from deploy.stack import inventory
 
 
 def command(
@@ -39,11 +38,10 @@ def command(
     if dry_run or not found:
         return _tell(account, stack, found, data, as_json)
     _show(found, data)
-    remembered = inventory.resources(account, stack)
     if found.stack or found.things or data:
         _ask(stack, data and bool(found.data), yes)
         removal.run(found, data)
-    remains = look_again(removal, remembered)
+    remains = look_again(removal, found.resources)
     if as_json:
         screen.result_json(remains.as_json())
     else:

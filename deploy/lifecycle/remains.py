@@ -29,7 +29,7 @@ OLD_VERSIONS = 30  # days that the data bucket keeps versions that are not curre
 def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Remains:
     """List what exists after a removal. Waits up to `LISTED` seconds while AWS still lists deleted resources.
 
-    `remembered`: the resources that the installation had, as CloudFormation lists them.
+    `remembered` are the resources that CloudFormation listed before the removal.
     """
 
     def look() -> Remains:

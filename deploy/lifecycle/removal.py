@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -20,7 +21,7 @@ from deploy.stack import acm_records, inventory, policies
 from deploy.stack.acm_records import Validation
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.deletion import StackDeletion
-from deploy.stack.inventory import Addresses, ListedResource
+from deploy.stack.inventory import Addresses, ListedResource, Resource
 from deploy.stack.policies import PolicyAttachments
 from deploy.stack.stack import Stack, ids_of
 from hippodrome.aws import errors
@@ -41,7 +42,8 @@ class FoundInstallation:
     things: Sequence[ListedResource]  # resources outside of the stack, made by the commands or left by the stack
     data: Sequence[str]  # data buckets
     installation: Installation | None  # None if the stack's outputs are not complete
-    addresses: Sequence[Addresses] = ()  # of the stack, and of deleted stacks of its name
+    resources: Sequence[Resource] = ()  # of the stack, and of deleted stacks of its name, as CloudFormation lists them
+    addresses: Sequence[Addresses] = ()  # of the same stacks
     attached: Sequence[PolicyAttachments] = ()  # to whom the stack's policies are attached
 
     def __bool__(self) -> bool:
@@ -74,13 +76,15 @@ class Removal:
         if self._code.exists():
             things.append(ListedResource("S3 bucket", self._code.name))
         attached = [policies.attached(self.account, arn) for arn in ids_of(made, "AWS::IAM::ManagedPolicy")]
-        known = inventory.stacks(self.account, self.name)
+        stacks = inventory.stacks(self.account, self.name)
+        resources = inventory.resources(self.account, stacks)
         return FoundInstallation(
             described,
             things,
-            self._data(),
+            inventory.data_buckets(self.account, self.name, resources),
             _installation(self.account, described),
-            inventory.addresses(known),
+            resources,
+            inventory.addresses(stacks),
             [*filter(None, attached)],
         )
 
@@ -97,10 +101,6 @@ class Removal:
     def run(self, found: FoundInstallation, data: bool) -> None:
         """Remove everything, the data only with `data`. Raises `Problem` if AWS or another resource prevents it."""
         self.executor.execute(self.plan(found, data))
-
-    def _data(self) -> list[str]:
-        known = inventory.resources(self.account, self.name)
-        return inventory.data_buckets(self.account, self.name, self._code.name, known)
 
     # -- steps
 
@@ -121,19 +121,16 @@ class Removal:
         acm_records.remember(self._code, self._records)
 
     def _delete_stack(self, found: FoundInstallation) -> None:
-        def stop_servers() -> None:
-            if found.installation:
-                self._stop_servers(found.installation)
-
+        stop_servers = partial(self._stop_servers, found.installation)
         StackDeletion(self.account, self._stack, self.executor, stop_servers).run()
         if found.stack:
             screen.success(f"The stack {self.name} is deleted.")
 
-    def _stop_servers(self, installation: Installation) -> None:
+    def _stop_servers(self, installation: Installation | None) -> None:
         """Stop servers by their records, if the bucket exists; then stop all other tasks in the cluster."""
-        ecs, cluster = self.account.client("ecs"), installation["Cluster"]
-        if not inventory.cluster_exists(self.account, cluster):
+        if installation is None or not inventory.cluster_exists(self.account, installation["Cluster"]):
             return
+        ecs, cluster = self.account.client("ecs"), installation["Cluster"]
         if inventory.bucket_exists(self.account, installation["Bucket"]):
             stopper = Stopper(self.account.platform(installation), None, self.executor)
             with screen.progress() as bar:
@@ -148,7 +145,7 @@ class Removal:
         def running() -> Sequence[str]:
             found = tasks.arns(cluster)
             for arn in found:
-                self._remove(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
+                _remove(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
             return found
 
         if left_running := self.executor.wait(running, STOPPING):
@@ -181,7 +178,7 @@ class Removal:
         for record in answer["ResourceRecordSets"]:
             if record["Name"].rstrip(".") == name and record["Type"] == "TXT" and record.get("TTL") == TTL:
                 batch = acm_records.deletion(record)
-                self._remove(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
+                _remove(client.change_resource_record_sets, HostedZoneId=zone, ChangeBatch=batch)
 
     def _task_definitions(self) -> None:
         ecs = self.account.client("ecs")
@@ -193,16 +190,17 @@ class Removal:
             for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten
                 chunk = arns[start : start + 10]
                 for arn in chunk:
-                    self._remove(ecs.deregister_task_definition, taskDefinition=arn)
-                self._remove(ecs.delete_task_definitions, taskDefinitions=chunk)
+                    _remove(ecs.deregister_task_definition, taskDefinition=arn)
+                _remove(ecs.delete_task_definitions, taskDefinitions=chunk)
                 bar.advance(task, len(chunk))
 
     def _log_groups(self) -> None:
         for group in inventory.log_groups(self.account, self.name):
-            self._remove(self.account.client("logs").delete_log_group, logGroupName=group)
+            _remove(self.account.client("logs").delete_log_group, logGroupName=group)
 
     def _data_buckets(self) -> None:
-        for bucket in self._data():
+        resources = inventory.resources(self.account, inventory.stacks(self.account, self.name))
+        for bucket in inventory.data_buckets(self.account, self.name, resources):
             self._bucket(bucket, "data")
 
     def _bucket(self, name: str, kind: str) -> None:
@@ -221,17 +219,18 @@ class Removal:
                 raise
         screen.success(f"The {kind} bucket {name} is deleted.")
 
-    def _remove(self, call: Callable[..., Any], **arguments: Any) -> None:
-        """Make the call, and ignore an error that says that the resource is gone already."""
-        try:
-            call(**arguments)
-        except ClientError as error:
-            if not _GONE.search(f"{errors.code(error)} {errors.message(error)}"):
-                raise
+
+def _remove(call: Callable[..., Any], **arguments: Any) -> None:
+    """Make the call, and ignore an error that says that the resource is gone already."""
+    try:
+        call(**arguments)
+    except ClientError as error:
+        if not _GONE.search(f"{errors.code(error)} {errors.message(error)}"):
+            raise
 
 
 def _zone(found: FoundInstallation) -> str:
-    """Return the hosted zone of the present stack; without one, of the stack of its name that was deleted last."""
+    """Return the hosted zone of the present stack; without a stack, of the stack of its name that was deleted last."""
     standing = inventory.addresses([found.stack] if found.stack else [])
     return (standing or found.addresses)[0].zone
 

@@ -16,7 +16,6 @@ from botocore.exceptions import ClientError
 from console import screen
 from deploy.aws.account import Account, Installation
 from deploy.stack import inventory
-from deploy.stack.code_bucket import CodeBucket
 from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, StoredCertificate, names_of, renew_at
 from hippodrome.ports import Conflict, Documents
 
@@ -56,8 +55,7 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
 
 def _kept(account: Account, installation: Installation) -> Iterator[str]:
     """Yield the names of the data buckets of earlier installations with this name in this region."""
-    code = CodeBucket(account, installation.stack).name
-    for bucket in inventory.data_buckets(account, installation.stack, code):
+    for bucket in inventory.data_buckets(account, installation.stack):
         if bucket != installation["Bucket"]:
             yield bucket
 

@@ -50,19 +50,11 @@ def removal_of(thing: ListedResource, account: Account) -> str:
     return f"{command} --account-id {account.id}" if listing.service == "budgets" else command
 
 
-def resources(account: Account, stack: str) -> list[Resource]:
-    """List the resources of all installations of that name, also of those deleted in the last 90 days."""
-    found = [
-        Resource(one["ResourceType"], one["PhysicalResourceId"])
-        for known in stacks(account, stack)
-        for one in Stack(account, stack).resources(known["StackId"])
-        if one.get("PhysicalResourceId")
-    ]
-    return list(dict.fromkeys(found))
-
-
 def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
-    """Describe the installations of that name: the present one, then those that were deleted last."""
+    """Describe the installations of that name: the present one, then deleted ones, `REMEMBERED` at most.
+
+    CloudFormation lists a deleted stack for 90 days.
+    """
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
     found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
@@ -80,6 +72,17 @@ def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
             return None
         raise
     return found
+
+
+def resources(account: Account, described: Iterable[Mapping[str, Any]]) -> list[Resource]:
+    """List the resources of these installations, which `stacks` has described, each once."""
+    found = [
+        Resource(one["ResourceType"], one["PhysicalResourceId"])
+        for stack in described
+        for one in Stack(account, stack["StackName"]).resources(stack["StackId"])
+        if one.get("PhysicalResourceId")
+    ]
+    return list(dict.fromkeys(found))
 
 
 class Addresses(NamedTuple):
@@ -115,8 +118,8 @@ def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedReso
         if type_ in LISTINGS:
             listing = LISTINGS[type_]
             listed = set(_list(account, listing))
-            if type_ == "AWS::ECS::Cluster":
-                listed = {_last(one) for one in listed}
+            if type_ == "AWS::ECS::Cluster":  # AWS lists ARNs, and CloudFormation names
+                listed = {arn.rpartition("/")[2] for arn in listed}
             found += [ListedResource(listing.kind, one) for one in sorted(ids & listed)]
     return found
 
@@ -150,10 +153,6 @@ def _by_token(call: Callable[..., Any], arguments: dict[str, Any]) -> Iterator[A
     while page.get("NextToken"):
         page = call(**arguments, NextToken=page["NextToken"])
         yield page
-
-
-def _last(arn: str) -> str:
-    return arn.rsplit("/", 1)[-1]
 
 
 # -- what the commands make outside of the stack ----------------------------------------------------------------------
@@ -194,14 +193,15 @@ def log_groups(account: Account, stack: str) -> list[str]:
     ]
 
 
-def data_buckets(account: Account, stack: str, code_bucket: str, known: Iterable[Resource] = ()) -> list[str]:
+def data_buckets(account: Account, stack: str, known: Iterable[Resource] = ()) -> list[str]:
     """Return the existing data buckets of the stack, and of earlier stacks of that name in this region.
 
-    They are found among the `known` resources of CloudFormation, and by their tag, which stays longer.
+    Such a bucket is among the `known` resources, which CloudFormation lists, or has the stack's tag, which stays longer.
     """
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
     buckets = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
     prefix = resource_names.bucket_prefix(stack)
+    code_bucket = resource_names.code_bucket(stack, account.id, account.region)
     buckets = [name for name in buckets if name != code_bucket and (name in remembered or name.startswith(prefix))]
     # ListBuckets may name a bucket that was deleted a moment ago (S3 user guide, consistency of bucket configurations).
     return [
