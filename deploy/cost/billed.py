@@ -33,7 +33,7 @@ class Billed:
 
     @property
     def asking(self) -> float:
-        """The price of the requests to Cost Explorer, in US dollars."""
+        """What the requests to Cost Explorer have cost, in US dollars."""
         return self.requests * Prices().explorer_request.usd
 
 

@@ -12,6 +12,7 @@ import typer
 from rich.text import Text
 
 from console import screen
+from console.formatting import count
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.aws.resource_names import TAG
@@ -156,7 +157,7 @@ def _before(study: StudyToEstimate, waiting: Sequence[WarmCost], prices: Prices,
             }
         )
         return Exit.DONE
-    people = f"{study.participants:,} participant{'s' if study.participants > 1 else ''}"
+    people = count(study.participants, "participant")
     _table(f"The study, {people}", [*lines, CostLine("Together", "", total(lines))], study.participants)
     screen.result("")
     _show_warm(waiting)
@@ -170,17 +171,15 @@ def _before(study: StudyToEstimate, waiting: Sequence[WarmCost], prices: Prices,
 
 
 def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
-    rows = [(line.what, line.amount, *map(_money, (line.usd.low, line.usd.likely, line.usd.high))) for line in lines]
+    rows = [(line.what, line.amount, *map(_money, line.usd)) for line in lines]
     if people > 1:
-        each = lines[-1].usd * (1 / people)
-        rows.append(("Each participant", "", *map(_money, (each.low, each.likely, each.high))))
-    screen.table(
-        ["", "amount", "low $", "likely $", "high $"], rows, title, right=["amount", "low $", "likely $", "high $"]
-    )
+        rows.append(("Each participant", "", *map(_money, lines[-1].usd * (1 / people))))
+    right = ["amount", "low $", "likely $", "high $"]
+    screen.table(["", *right], rows, title, right=right)
 
 
 def _show_warm(waiting: Sequence[WarmCost]) -> None:
-    """Print what warm servers cost in an hour and in a day, since nobody knows how long their studies are live."""
+    """Print what warm servers cost in an hour and in a day, since it is not known how long their studies stay live."""
     rows: list[Sequence[object]] = []
     for one in waiting:
         size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
@@ -263,7 +262,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
 
 
 def _row(name: str, one: Spent) -> tuple[object, ...]:
-    return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, (one.usd.low, one.usd.likely, one.usd.high)))
+    return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, one.usd))
 
 
 def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
@@ -273,7 +272,7 @@ def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
         notes.append(f"{never:,} more were asked for and never ran: not counted.")
     if guessed:
         notes.append(
-            f"{guessed:,} records do not say what the server ran on: reckoned with the project's present size."
+            f"{guessed:,} records do not say what the server ran on: computed with the project's present size."
         )
     if unreadable:
         notes.append(f"{unreadable:,} records cannot be read and are not counted.")
@@ -281,9 +280,9 @@ def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
 
 
 def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
-    """Ask for the bill since the first server's day or the first of this month.
+    """Ask for the bill since the day of the first server, or without servers since the first day of this month.
 
-    Return None and why if there is none.
+    If there is no bill, return None and the reason.
     """
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
     # Cost Explorer remembers about a year.
@@ -311,7 +310,7 @@ def _prices(account: Account) -> Prices:
     try:
         return current(account.client("pricing", "us-east-1"), account.region, today)
     except LookupError as error:
-        raise Problem(f"{error}.", "Leave out --current to reckon with the table of this version.") from None
+        raise Problem(f"{error}.", "Leave out --current to use the table of this version.") from None
 
 
 def _line(line: CostLine) -> dict[str, Any]:
@@ -319,8 +318,12 @@ def _line(line: CostLine) -> dict[str, Any]:
 
 
 def _warm(one: WarmCost) -> dict[str, Any]:
-    hours = {"spotHour": one.spot, "onDemandHour": one.on_demand}
-    return {"project": one.project_id, "servers": one.servers, **{name: usd.as_json() for name, usd in hours.items()}}
+    return {
+        "project": one.project_id,
+        "servers": one.servers,
+        "spotHour": one.spot.as_json(),
+        "onDemandHour": one.on_demand.as_json(),
+    }
 
 
 def _spent(one: Spent) -> dict[str, Any]:

@@ -256,9 +256,7 @@ def assumptions(study: StudyToEstimate) -> list[str]:
     """Write the assumptions of the estimate, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
-    found = [
-        f"{study.participants:,} participants who do all {study.steps} steps.",
-    ]
+    found = [f"{study.participants:,} participants who do all {study.steps} steps."]
     if study.games:
         whom = f" {study.players}" if study.has_sessions else ""
         found.append(

@@ -108,14 +108,14 @@ def command(
     _packages(chosen)
     study = study_of(project)
     name = study.id
-    local = from_ if from_ is not None or aws or bucket is not None else _local(study)
+    undecided = from_ is None and bucket is None and not aws  # no option says where the data are
+    local = _local(study) if undecided else from_
     target = folder or folder_for(name, local)
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
     source: Source
     if local:
         source = Folder(local)
     else:
-        undecided = from_ is None and not aws and bucket is None
         source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
     if dry_run:
         return _dry_run(work.look(source, name, target, wishes), target, as_json)
@@ -206,20 +206,17 @@ def _check(folder: Path, as_json: bool) -> int:
 
 
 def _dry_run(tally: Tally, target: Path, as_json: bool) -> int:
-    found = {
-        "folder": str(target),
-        "participants": tally.participants,
+    files = {
         "new": tally.new,
         "changed": tally.changed,
         "unchanged": tally.unchanged,
         "gone": tally.gone,
         "damaged": tally.damaged,
-        "bytes": tally.bytes,
     }
     if as_json:
-        screen.result_json(found)
+        screen.result_json({"folder": str(target), "participants": tally.participants, **files, "bytes": tally.bytes})
     else:
-        screen.table(["what", "files"], [(name, f"{found[name]:,}") for name in list(found)[2:7]], right=["files"])
+        screen.table(["what", "files"], [(name, f"{number:,}") for name, number in files.items()], right=["files"])
         screen.result(
             f"{formatting.count(tally.participants, 'participant')}; {formatting.size(tally.bytes)} to fetch "
             f"into {target}/"

@@ -36,8 +36,12 @@ _LEFT_OUT = {
     "function_name",
     "function_arn",
     "cold_start",
+    "function_memory_size",
+    "function_request_id",
+    "requestId",
+    "xray_trace_id",
+    "type",
 }
-_LEFT_OUT |= {"function_memory_size", "function_request_id", "requestId", "xray_trace_id", "type"}
 
 
 @dataclass(frozen=True)
@@ -100,13 +104,11 @@ def read(event: Mapping[str, Any], source: str) -> LogLine:
 def _of_json(entry: dict[str, Any], time: datetime, source: str, stream: str) -> LogLine:
     kind = str(entry.get("type", ""))
     if kind.startswith("platform.") and isinstance(entry.get("record"), dict):
-        status = str(entry["record"].get("status", "success"))
-        succeeded = status == "success"
-        message = kind.removeprefix("platform.") + ("" if succeeded else f": {status}")
+        event, status = kind.removeprefix("platform."), str(entry["record"].get("status", "success"))
+        if status == "success":
+            return LogLine(time, source, "", event, platform=True, stream=stream)
         shown = {key: value for key, value in entry["record"].items() if key in ("status", "errorType", "metrics")}
-        if succeeded:
-            return LogLine(time, source, "", message, platform=True, stream=stream)
-        return LogLine(time, source, "ERROR", message, shown, stream=stream)
+        return LogLine(time, source, "ERROR", f"{event}: {status}", shown, stream=stream)
     if "errorType" in entry and "message" not in entry:  # an exception that left the function
         fields = {key: value for key, value in entry.items() if key in ("errorType", "stackTrace", "requestId")}
         return LogLine(time, source, "ERROR", "unhandled exception", fields, stream=stream)

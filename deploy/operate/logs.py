@@ -55,25 +55,16 @@ class Reader:
             return sorted([*Template.read().functions, TRIAL])
         return sorted(found)
 
-    def lines(self, sources: Iterable[str], since: datetime, project_id: str | None = None) -> Iterator[LogLine]:
-        """Yield every line since this time, in the order of time. Reads the groups page by page."""
-        for event, source in self._merged(sources, since, project_id):
-            yield read(event, source)
-
     def events(
         self, sources: Iterable[str], since: datetime, project_id: str | None = None
-    ) -> list[tuple[str, LogLine]]:
-        """Return the same lines as `lines`, each with its event's id, by which `follow` recognises new events."""
-        merged = self._merged(sources, since, project_id)
-        return [(f"{source}/{_id_of(event)}", read(event, source)) for event, source in merged]
+    ) -> Iterator[tuple[str, LogLine]]:
+        """Yield every line since this time, in the order of time. Reads the groups page by page.
 
-    def _merged(
-        self, sources: Iterable[str], since: datetime, project_id: str | None
-    ) -> Iterator[tuple[Mapping[str, Any], str]]:
-        """Yield the events of all sources in the order of time, each with its source."""
+        With each line comes its event's id, by which `follow` recognises new events.
+        """
         streams = [self._events(source, since, project_id) for source in sources]
-        for _, _, event, source in heapq.merge(*streams, key=lambda one: (one[0], one[1])):
-            yield event, source
+        for _, _, event, source in heapq.merge(*streams, key=lambda one: one[:2]):
+            yield f"{source}/{_id_of(event)}", read(event, source)
 
     def _events(
         self, source: str, since: datetime, project_id: str | None
@@ -131,7 +122,7 @@ class LineFilter:
 
 
 def follow(
-    look: Callable[[datetime], list[tuple[str, LogLine]]],
+    look: Callable[[datetime], Iterable[tuple[str, LogLine]]],
     since: datetime,
     show: Callable[[LogLine], None],
     *,
@@ -221,7 +212,7 @@ def command(
         if following:
             follow(lambda moment: reader.events(sources, moment, project), start, show)
         else:
-            for line in reader.lines(sources, start, project):
+            for _, line in reader.events(sources, start, project):
                 show(line)
             if not shown:
                 what = "No errors were" if errors else "Nothing was"

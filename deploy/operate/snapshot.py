@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, NamedTuple, TypeVar
+from functools import partial
+from typing import Any, NamedTuple
 
 from console.formatting import count
 from console.problem import Problem
@@ -30,7 +31,6 @@ from hippodrome.servers.causes import Cause, FailureCategory, parse_cause
 from hippodrome.servers.sessions import readable_session
 from hippodrome.storage.repository import Repository
 
-T = TypeVar("T")
 ASK = "`python -m deploy doctor` names them"
 DAY = timedelta(days=1)  # the age up to which failures are shown
 DAILY = timedelta(days=1)  # the interval of the function renew_certificate
@@ -75,7 +75,7 @@ class WarmServers(NamedTuple):
 
 
 class ServerFailure(NamedTuple):
-    """Servers of a project that failed for one cause in the last 24 hours: how many; the last one's time and name."""
+    """How many servers of a project failed for one cause in the last 24 hours, and the time and name of the last."""
 
     project: str
     cause: Cause
@@ -149,33 +149,33 @@ class InstallationMonitor:
     def look(self, progress: Callable[[str], None] = lambda _: None) -> Snapshot:
         """Take a snapshot. `progress` gets a text on the progress of a long listing."""
         look = Snapshot(at=datetime.now(UTC))
+        parts = {
+            "servers": self._servers,
+            "tasks": self._tasks,
+            "queues": self._queues,
+            "certificate": self._certificate,
+            "alarms": self._alarms,
+        }
         with ThreadPoolExecutor(4) as pool:
-            servers = pool.submit(self._try, look, "servers", lambda: self._servers(look))
-            others = [
-                pool.submit(self._try, look, "tasks", lambda: self._tasks(look)),
-                pool.submit(self._try, look, "queues", lambda: self._queues(look)),
-                pool.submit(self._try, look, "certificate", lambda: self._certificate(look)),
-                pool.submit(self._try, look, "alarms", lambda: self._alarms(look)),
-            ]
-            projects = self._try(look, "projects", lambda: self._projects(look, progress)) or []
-            servers.result()
-            for one in others:
+            running = [pool.submit(self._try, look, part, read) for part, read in parts.items()]
+            self._try(look, "projects", partial(self._projects, progress=progress))
+            for one in running:
                 one.result()
-        sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
+        sizes = {project.id: (project.size.cpu, project.size.memory) for project, _ in look.projects}
         look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
         return look
 
-    def _try(self, look: Snapshot, part: str, act: Callable[[], T]) -> T | None:
+    def _try(self, look: Snapshot, part: str, read: Callable[[Snapshot], None]) -> None:
+        """Call `read`, which adds a part to the snapshot. If AWS refuses, write the reason into `problems`."""
         try:
-            return act()
+            read(look)
         except Exception as error:
             problem = explain.problem_from(error)
             if problem is None:
                 raise
             look.problems[part] = str(problem)
-            return None
 
-    def _projects(self, look: Snapshot, progress: Callable[[str], None]) -> Sequence[Project]:
+    def _projects(self, look: Snapshot, progress: Callable[[str], None]) -> None:
         documents = self._platform.documents
         unread: list[UnreadableEntry] = []
         projects = participants.choose(participants.registered_projects(documents, unread), self._project_id)
@@ -190,7 +190,6 @@ class InstallationMonitor:
             look.projects.append(
                 (project, participants.count_participants(documents, project, midnight(look.at), advance))
             )
-        return projects
 
     def _servers(self, look: Snapshot) -> None:
         # Servers that may be open, or have failed or cost something today: their records were written within the last
@@ -204,10 +203,7 @@ class InstallationMonitor:
         look.members = dict(self._members([server for server in look.servers if server.is_sessions]))
 
     def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
-        """Yield the names of sessions' servers, each with the number of members.
-
-        Reads each formed session only once.
-        """
+        """Yield the names of sessions' servers, each with the number of members. Reads each formed session once."""
         for server in servers:
             known = self._formed.get(server.user_id)
             if known is None:

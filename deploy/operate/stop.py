@@ -168,7 +168,8 @@ def command(
         _show(found, as_json)
         return Exit.CHANGES if found.to_do else Exit.DONE
     if found.to_do:
-        _show(found, False) if not as_json else None
+        if not as_json:
+            _show(found, False)
         owner = f"of {project}" if project else "of all projects together"
         warm = sum(record.is_warm_server for record in found.servers)
         servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")

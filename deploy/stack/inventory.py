@@ -196,7 +196,7 @@ def log_groups(account: Account, stack: str) -> list[str]:
 def data_buckets(account: Account, stack: str, known: Iterable[Resource] = ()) -> list[str]:
     """Return the existing data buckets of the stack, and of earlier stacks of that name in this region.
 
-    Such a bucket is among the `known` resources, which CloudFormation lists, or has the stack's tag, which stays longer.
+    Such a bucket is among the `known` resources that CloudFormation lists, or has the stack's tag, which stays longer.
     """
     remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
     buckets = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +21,7 @@ from deploy.operate.doctor.check_context import Check, CheckContext
 from deploy.operate.doctor.play import MAX_BOTS, WITHIN
 from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.operate.doctor.rehearsal import Rehearsal, project_for
+from deploy.stack.stack import Stack
 from hippodrome.model.project import Project
 
 CHECKS: dict[str, Check] = {
@@ -90,34 +92,31 @@ def command(
     """
     if play and not rehearse:
         raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
-    findings: list[Finding] = []
     rehearsal: list[Finding] = []
     document: dict[str, Any] = {}
     account = open_account(profile, region)
-    findings += credentials(account)
+    findings = [*credentials(account)]
     installation, found = installation_state(account, stack)
     findings += found
     if installation is not None:
-        context = CheckContext(account, installation, at_once, datetime.now(UTC))
-        context.fetch = None if only_aws else addresses.fetch
+        context = CheckContext(account, installation, at_once, datetime.now(UTC), fetch=addresses.fetch)
         if only_aws:
-            context.delegation = None
+            context.delegation = context.fetch = None
         context.wanted = _wanted(context, project)
         with screen.err.status("Looking …"):
             findings += examine(context, CHECKS)
-        if not as_json:
-            show(findings, screen.out)
-        if rehearse:
-            if play:
-                from deploy.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
-
-                rehearsal, document = played(context, play, minutes=within, yes=yes, file=transcript)
-            else:
-                rehearsal = _rehearse(context)
-            findings += rehearsal
-            show(rehearsal, screen.out) if not as_json else None
-    elif not as_json:
+    if not as_json:
         show(findings, screen.out)
+    if installation is not None and rehearse:
+        if play:
+            from deploy.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
+
+            rehearsal, document = played(context, play, minutes=within, yes=yes, file=transcript)
+        else:
+            rehearsal = _rehearse(context)
+        findings += rehearsal
+        if not as_json:
+            show(rehearsal, screen.out)
     failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
     if as_json:
         more = {"transcript": document} if document else {}
@@ -175,8 +174,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
 
 def _version(account: Account, stack: str) -> Iterator[Finding]:
     """Check whether the stack's template is that of this version, apart from the functions' code."""
-    from deploy.code.template import Template  # noqa: PLC0415
-    from deploy.stack.stack import Stack  # noqa: PLC0415
+    from deploy.code.template import Template  # noqa: PLC0415 - YAML, which only this check needs
 
     present = Stack(account, stack).template()
     if present and _plain(present) != _plain(Template.read().text):
@@ -189,8 +187,6 @@ def _version(account: Account, stack: str) -> Iterator[Finding]:
 
 def _plain(template: str) -> str:
     """Return the template without the hashes of the functions' code."""
-    import re  # noqa: PLC0415
-
     return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
 
 
