@@ -54,7 +54,7 @@ def result_json(value: Any) -> None:
 
 
 def _text(value: Any) -> str:
-    """A date or time in the form of ISO 8601, any other value as by `str()`."""
+    """Write a date or time as ISO 8601, and any other value as `str()` does."""
     return value.isoformat() if isinstance(value, date) else str(value)
 
 
@@ -69,7 +69,10 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str =
 
 
 class ProgressBars(Progress):
-    """Progress bars on stderr. If stderr is no terminal, a line at the beginning of each task takes their place."""
+    """Progress bars on stderr, for work that takes some seconds. Use them as a context manager.
+
+    If stderr is no terminal, a line at the beginning of each task takes their place.
+    """
 
     def __init__(self, *more: ProgressColumn, width: int = 40) -> None:
         columns = (
@@ -86,11 +89,6 @@ class ProgressBars(Progress):
         if self.disable:
             info(f"{description} …")
         return super().add_task(description, *args, **fields)
-
-
-def progress() -> Progress:
-    """Return progress bars for work that takes some seconds. Use them as a context manager."""
-    return ProgressBars()
 
 
 def confirm(question: str, yes: bool = False) -> None:

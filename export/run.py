@@ -391,6 +391,6 @@ def _refused(folder: Path, error: OSError) -> Problem:
 @contextlib.contextmanager
 def _bar(description: str) -> Iterator[Callable[[int, int], None]]:
     """Show a progress bar. Yields a function that updates it: call it with the total, and the number done."""
-    with screen.progress() as bars:
+    with screen.ProgressBars() as bars:
         task = bars.add_task(description, total=None)
         yield lambda total, done: bars.update(task, total=total, completed=done)

@@ -229,6 +229,17 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
     return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
 
 
+def site_host(parameters: Mapping[str, str]) -> str:
+    """Return the host name of the site of an installation with these parameters."""
+    return f"{parameters.get('SiteHost', '')}.{parameters.get('RootDomain', '')}"
+
+
+def servers_domain(parameters: Mapping[str, str]) -> str:
+    """Return the domain directly above servers' names in an installation with these parameters."""
+    settings = Settings(root_domain=parameters["RootDomain"], servers_host=parameters.get("ServersHost", ""))
+    return settings.servers_domain
+
+
 def other_installations(account: Account, stack: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the other installations in the account and region: name and parameters of each stack with our tag."""
     for page in account.client("cloudformation").get_paginator("describe_stacks").paginate():

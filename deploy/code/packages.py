@@ -321,7 +321,7 @@ class WheelCache:
         command += self.target.pip_options + [str(pin) for pin in pins]
         lines: list[str] = []
         with (
-            screen.progress() as bar,
+            screen.ProgressBars() as bar,
             subprocess.Popen(  # noqa: S603 - pip, with names and versions from our own pins
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
             ) as pip,

@@ -101,7 +101,7 @@ class Executor:
             return found
         with contextlib.ExitStack() as stack:
             if title:
-                stack.enter_context(screen.progress()).add_task(title, total=None)
+                stack.enter_context(screen.ProgressBars()).add_task(title, total=None)
             while found and not timer.over(seconds):
                 timer.sleep(PAUSE if pause is None else pause)
                 found = look()

@@ -35,9 +35,9 @@ def selected(given: str | None) -> StudySelection:
     """
     from deploy.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is read
 
-    folder: Path | None = Path(given) if given is not None and options.is_folder(given) else Path(".")
+    folder: Path | None = Path(".")
     if given is not None and options.is_folder(given):
-        found = options.project_id(given)
+        folder, found = Path(given), options.project_id(given)
     else:
         here = id_in(Path("."))
         found = here if given is None else given

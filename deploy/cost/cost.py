@@ -202,7 +202,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     prices = _prices(account) if now else Prices()
     at = datetime.now(UTC)
     records = Records(documents)
-    with screen.progress() as progress:
+    with screen.ProgressBars() as progress:
         bar = progress.add_task("Reading the records of servers", total=None)
         every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
     sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}

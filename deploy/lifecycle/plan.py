@@ -11,7 +11,7 @@ from rich.text import Text
 
 from console import screen
 from console.problem import Exit, Problem
-from deploy.aws.account import STACK, Account, open_account
+from deploy.aws.account import STACK, Account, open_account, site_host
 from deploy.code.template import Template
 from deploy.core import options
 from deploy.core.finding import Finding, look
@@ -272,8 +272,8 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
 
 def new_site(prepared: Prepared) -> str:
     """Return the new host name of the site, which participants open; "" if it does not change."""
-    hosts = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
-    return hosts[1] if hosts[0] != hosts[1] else ""
+    site = site_host(prepared.parameters)
+    return site if site != site_host(prepared.before) else ""
 
 
 def run(

@@ -16,7 +16,7 @@ from console import screen
 from console.formatting import count
 from console.problem import Problem
 from deploy.aws import caa, concurrency, quotas, regions
-from deploy.aws.account import Account, other_installations
+from deploy.aws.account import Account, other_installations, servers_domain, site_host
 from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
 from deploy.stack import domain_change, inventory
@@ -199,8 +199,7 @@ def _delegation(prepared: Prepared) -> Iterator[Finding]:
 def _authorities(prepared: Prepared) -> Iterator[Finding]:
     """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
     after = prepared.parameters
-    root, site = after["RootDomain"], f"{after['SiteHost']}.{after['RootDomain']}"
-    servers = names_of(domain_change.servers_domain(after))
+    root, site, servers = after["RootDomain"], site_host(after), names_of(servers_domain(after))
     known = partial(exists, prepared.account, read_zone(prepared.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for issuer, name, authorities in wanted:
@@ -219,7 +218,7 @@ def _authorities(prepared: Prepared) -> Iterator[Finding]:
 
 def _site(prepared: Prepared) -> Iterator[Finding]:
     account, after = prepared.account, prepared.parameters
-    site = f"{after['SiteHost']}.{after['RootDomain']}"
+    site = site_host(after)
     advice = (
         "If that is your installation in another region, set AWS_REGION to that one; else take another --site, or "
         "remove it."

@@ -133,7 +133,7 @@ class Removal:
         ecs, cluster = self.account.client("ecs"), installation["Cluster"]
         if inventory.bucket_exists(self.account, installation["Bucket"]):
             stopper = Stopper(self.account.platform(installation), None, self.executor)
-            with screen.progress() as bar:
+            with screen.ProgressBars() as bar:
                 task = bar.add_task("Stopping servers", total=None)
                 left = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
             if stopper.stopped:
@@ -185,7 +185,7 @@ class Removal:
         arns = inventory.task_definitions(self.account, self.name)
         if not arns:
             return
-        with screen.progress() as bar:
+        with screen.ProgressBars() as bar:
             task = bar.add_task("Removing task definitions", total=len(arns))
             for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten
                 chunk = arns[start : start + 10]
@@ -207,7 +207,7 @@ class Removal:
         """Delete a bucket of the account with all versions of all objects. `kind` (code or data) is for messages."""
         if not inventory.bucket_exists(self.account, name):
             return
-        with screen.progress() as bar:
+        with screen.ProgressBars() as bar:
             task = bar.add_task(f"Emptying the {kind} bucket", total=None)
             VersionedBucket(self.account, name).empty(lambda deleted: bar.advance(task, len(deleted)))
         try:

@@ -153,7 +153,7 @@ def _must_be_known(project: str, known: list[str], stack: str) -> None:
 
 
 def _erase(erasers: list[Eraser], found: Mapping[str, FoundOfParticipant]) -> None:
-    with screen.progress() as bars:
+    with screen.ProgressBars() as bars:
         bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
         for eraser in erasers:
             if found[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):

@@ -78,8 +78,10 @@ class FoundOfParticipant:
     def counts(self) -> dict[str, int]:
         """Return how many documents and resources were found, by kind."""
         counts = {"documents": self.documents, **self.resources.counts(), "places": self.slots}
-        counts |= {"tasks": counts["tasks"] + len(self.draining)}
-        return counts | ({"sessions": len(self.sessions)} if self.sessions else {})
+        counts["tasks"] += len(self.draining)
+        if self.sessions:
+            counts["sessions"] = len(self.sessions)
+        return counts
 
 
 class Eraser:

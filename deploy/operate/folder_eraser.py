@@ -134,11 +134,11 @@ class FolderEraser:
     def _must_be_over(self, sessions: Sequence[FoundSession]) -> None:
         """Raise `Problem` if a killed `make run` has left a running server, or recordings that it has not moved."""
         state = self._state / self._folder.root.name
-        theirs = [session_folder(self._project, found.id).rstrip("/") for found in sessions]
-        folders = {participant_folder(self._project, self._user).rstrip("/"), *theirs}
+        theirs = [session_folder(self._project, found.id) for found in sessions]
+        folders = {participant_folder(self._project, self._user), *theirs}
         runs = any(_runs(path, folders) for path in sorted((state / "tasks").glob("*")))
         spool = DataFolder(state / "spool")
-        unfinished = any(any(spool.versions(f"{each}/")) for each in theirs)
+        unfinished = any(any(spool.versions(folder)) for folder in theirs)
         if runs or unfinished:
             raise Problem(
                 "Their server still runs, or its recording is unfinished: `make run` was killed. Nothing was touched.",
@@ -160,7 +160,7 @@ def _runs(path: Path, folders: set[str]) -> bool:
     """Whether this file describes a task for one of these folders whose process is alive."""
     try:
         task: dict[str, Any] = json.loads(path.read_bytes())
-        if task.get("folder", "").rstrip("/") not in folders or task.get("stopped"):
+        if f"{task.get('folder', '').rstrip('/')}/" not in folders or task.get("stopped"):
             return False
         os.kill(int(task["pid"]), 0)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):

@@ -174,7 +174,7 @@ def command(
         warm = sum(record.is_warm_server for record in found.servers)
         servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
         screen.confirm(f"Stop {servers} {owner}? Participants who play there lose the game that is on.", yes)
-    with screen.progress() as progress:
+    with screen.ProgressBars() as progress:
         bar = progress.add_task("Stopping servers", total=len(found.servers))
         left = stopper.run(wait, lambda number: progress.advance(bar, number))
     if as_json:

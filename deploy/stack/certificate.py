@@ -177,7 +177,7 @@ def obtain(
 
 def obtain_visibly(account: Account, installation: Installation, choice: Choice) -> Report:
     """Call `obtain`, and show a progress bar."""
-    with screen.progress() as bar:
+    with screen.ProgressBars() as bar:
         which = {STAGING: "test ", PRODUCTION: "real "}.get(choice.directory, "")
         task = bar.add_task(f"Looking at the {which}certificate", total=len(OrderStage))
 

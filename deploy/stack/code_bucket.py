@@ -83,7 +83,7 @@ class CodeBucket:
         missing = [function for function, found in zip(functions, present, strict=True) if not found]
         if not missing:
             return 0
-        with screen.progress() as bar:
+        with screen.ProgressBars() as bar:
             task = bar.add_task("Uploading functions", total=len(missing))
             for function in missing:
                 bar.update(task, description=f"Uploading {function.name}")

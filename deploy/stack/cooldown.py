@@ -55,7 +55,7 @@ def wait(account: Account, stack: str, executor: Executor | None = None) -> None
     left = round(remaining(account, stack))
     if left <= 0:
         return
-    with screen.progress() as bar:
+    with screen.ProgressBars() as bar:
         task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {left} s", total=left)
         for _ in range(left):
             executor.sleep(1)

@@ -47,8 +47,7 @@ class StackDeletion:
 
     def _recover(self, error: Exception) -> bool:
         """Wait for what blocks the deletion, or remove it. Return False if neither is possible."""
-        needed = recoveries(error.failures) if isinstance(error, NotDeleted) else []
-        if not isinstance(error, NotDeleted) or not needed:
+        if not isinstance(error, NotDeleted) or not (needed := recoveries(error.failures)):
             return False
         self._without = [one.logical_id for one in error.failures if recovery_from(one) is Recovery.GONE]
         for recovery in needed:

@@ -7,13 +7,13 @@ only when there is a certificate for them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from datetime import UTC, datetime
 
 from console import screen
 from console.problem import Problem
-from deploy.aws.account import Account, Installation, other_installations
+from deploy.aws.account import Account, Installation, other_installations, servers_domain, site_host
 from deploy.core.server_records import Records
 from deploy.stack import certificate
 from deploy.stack.certificate import Choice
@@ -21,7 +21,6 @@ from deploy.stack.changes import Prepared
 from hippodrome.certificates.rules import Verdict
 from hippodrome.model import ids
 from hippodrome.model.server import Server
-from hippodrome.ports import Settings
 
 _WAIT = "Wait until they have ended, or end them with `python -m deploy stop`; then apply again."
 _WAIT_FOR_WARM_TOO = (
@@ -57,13 +56,12 @@ def check_site(prepared: Prepared) -> None:
     A server asks the site for a presigned request for each document (`hippodrome/servers/signing.py`). A domain name of
     API Gateway can only be replaced, so CloudFormation deletes the old one.
     """
-    before = _before(prepared)
-    sites = [f"{one.get('SiteHost')}.{one.get('RootDomain')}" for one in (prepared.before, prepared.parameters)]
-    if before is None or sites[0] == sites[1]:
+    before, site = _before(prepared), site_host(prepared.before)
+    if before is None or site == site_host(prepared.parameters):
         return
     _refuse(
         _running(prepared.account, before),
-        f"Servers run that store their answers and recordings by way of {sites[0]}, which would be gone.",
+        f"Servers run that store their answers and recordings by way of {site}, which would be gone.",
         _WAIT_FOR_WARM_TOO,
     )
 
@@ -138,12 +136,6 @@ def _before(prepared: Prepared) -> Installation | None:
         return found if found.env else None
     except Problem:
         return None
-
-
-def servers_domain(parameters: Mapping[str, str]) -> str:
-    """Return the domain directly above servers' names in an installation with these parameters."""
-    settings = Settings(root_domain=parameters["RootDomain"], servers_host=parameters.get("ServersHost", ""))
-    return settings.servers_domain
 
 
 def _running(account: Account, installation: Installation) -> list[Server]:

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 from botocore.exceptions import ClientError
 
 from deploy.aws import resource_names
-from deploy.aws.account import Account, is_no_stack, is_ours, parameters_of
+from deploy.aws.account import Account, is_no_stack, is_ours, parameters_of, servers_domain, site_host
 from deploy.aws.resource_names import TAG
 from deploy.aws.versions import VersionedBucket
 from deploy.stack.listings import BY_KIND, KEY_TYPES, LISTINGS, Listing
 from deploy.stack.stack import Stack
 from hippodrome.aws import errors
 from hippodrome.aws.dns import Route53Dns
-from hippodrome.ports import Settings
 
 
 class ListedResource(NamedTuple):
@@ -99,9 +98,9 @@ def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
     found = []
     for parameters in map(parameters_of, described):
         zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
-        servers = Settings(root_domain=root, servers_host=parameters.get("ServersHost", "")).servers_domain
         if zone and root:
-            found.append(Addresses(zone, root, f"{host}.{root}" if host else "", servers))
+            site = site_host(parameters) if host else ""
+            found.append(Addresses(zone, root, site, servers_domain(parameters)))
     return list(dict.fromkeys(found))
 
 

@@ -12,7 +12,7 @@ from typer import Option
 
 from console.problem import Problem
 from deploy.aws import availability_zones, concurrency
-from deploy.aws.account import Account
+from deploy.aws.account import Account, site_host
 from deploy.aws.hosted_zone import clean_domain, find_zone, read_zone
 
 SITE_LENGTH = 64
@@ -118,7 +118,7 @@ class StackSettings:
         limit = concurrency.unreserved_or_none(account) if concurrency.PARAMETER in defaults else None
         if limit is not None:
             found |= concurrency.parameters(limit)
-        _check_site(f"{found.get('SiteHost', '')}.{found['RootDomain']}")
+        _check_site(site_host(found))
         if set(availability_zones.PARAMETERS) <= set(defaults):
             found |= _zones(account, found, previous, subnets)
         missing = sorted(set(defaults) - set(found))

@@ -128,7 +128,7 @@ class Stack:
         command follows the operation again.
         """
         try:
-            with _bar() as bar:
+            with screen.ProgressBars(TextColumn("{task.fields[now]}", markup=False), width=24) as bar:
                 return self._follow(bar, bar.add_task(title, total=total or None, now=""), stack_id, after)
         except KeyboardInterrupt:
             raise Problem(
@@ -357,7 +357,3 @@ def advice(failures: Sequence[FailedResource], details: Sequence[str] = ()) -> s
         if re.search(pattern, reason, re.IGNORECASE):
             return text
     return "Put that right, and run the same command again; nothing has to be cleaned up before."
-
-
-def _bar() -> Progress:
-    return screen.ProgressBars(TextColumn("{task.fields[now]}", markup=False), width=24)

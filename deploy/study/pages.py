@@ -43,7 +43,7 @@ def compare(account: Account, bucket: str, project_id: str, folder: Path, more: 
 def upload(account: Account, bucket: str, changes: Changes) -> None:
     """Upload the pages that are new or different. After an interruption, the next `compare` finds the rest."""
     documents = _documents(account, bucket)
-    with screen.progress() as progress:
+    with screen.ProgressBars() as progress:
         for key, file in progress.track(changes.put.items(), description="Uploading pages"):
             _put(documents, key, file.read_bytes())
 

@@ -75,7 +75,8 @@ class RegisterPlan:
         """The steps that `register` would take, a line for each; empty if nothing has changed."""
         found = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
-            found.append(f"build the image {self.image.content} ({formatting.size(self.image.bundle.size)} of files)")
+            order = self.image.order
+            found.append(f"build the image {order.content} ({formatting.size(order.bundle.size)} of files)")
         if self.image and self.definition is None:
             found.append("make a new revision of the task definition")
         if self.before is None:
@@ -172,7 +173,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     made, revision = None, None
     if doing.image:
         made = image.build(installation, doing.image, on_aws=request.on_aws)
-        screen.success(f"Image {made.content}: {'built' if made.built else 'there already'}")
+        screen.success(f"Image {doing.image.order.content}: {'built' if made.built else 'there already'}")
         wanted = _definition(installation, found, made.uri)
         revision = doing.definition or definition.find(account, wanted)
         known = revision is not None
@@ -202,13 +203,12 @@ def register(account: Account, installation: Installation, folder: Path, request
 
 def _remarks(folder: Path, found: project_folder.ProjectFolder) -> list[str]:
     """Return remarks on a project without mistakes: on its files, the installation, and with a game its packages."""
-    of_packages = [
-        *agent_imports.requirement_remarks(folder),
-        *agent_imports.missing(folder),
-        *agent_imports.missing_for_players(folder, found.config),
-    ]
-    of_packages = of_packages if found.plays else []
-    return [str(remark) for remark in [*remarks.remarks_on(folder, found.config), *found.remarks, *of_packages]]
+    made = [*remarks.remarks_on(folder, found.config), *found.remarks]
+    if found.plays:
+        made += agent_imports.requirement_remarks(folder)
+        made += agent_imports.missing(folder)
+        made += agent_imports.missing_for_players(folder, found.config)
+    return [str(remark) for remark in made]
 
 
 def link(installation: Installation, project_id: str) -> str:

@@ -35,7 +35,7 @@ def make(*arguments: str) -> str:
 
 
 def test_progress_is_a_line_without_a_terminal(capsys: Any) -> None:
-    with screen.progress() as bar:
+    with screen.ProgressBars() as bar:
         bar.advance(bar.add_task("Uploading", total=3), 3)
     assert capsys.readouterr().err == "Uploading …\n"
 
@@ -43,7 +43,7 @@ def test_progress_is_a_line_without_a_terminal(capsys: Any) -> None:
 def test_progress_is_a_bar_on_a_terminal(monkeypatch: Any) -> None:
     file = io.StringIO()
     monkeypatch.setattr(screen, "err", Console(file=file, force_terminal=True, width=80))
-    with screen.progress() as bar:
+    with screen.ProgressBars() as bar:
         bar.advance(bar.add_task("Uploading", total=3), 3)
     assert "3/3" in file.getvalue()
     assert "Uploading …" not in file.getvalue()

@@ -7,7 +7,6 @@ import secrets
 import ssl
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from deploy.core.captured_log import functions_log
 from deploy.core.finding import Finding, bad, good, look
@@ -37,17 +36,7 @@ STAGES = {
     ServerState.READY: "ready",
     ServerState.CLOSED: "closed",
 }
-
-
-@dataclass
-class SecondsToStates:
-    """The seconds from the start message to each state of the server."""
-
-    seconds: dict[ServerState, float] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        names = {ServerState.STARTING: "claimed", ServerState.NAMING: "running", ServerState.READY: "ready"}
-        return ", ".join(f"{names[state]} after {seconds:.0f} s" for state, seconds in self.seconds.items())
+REACHED = {ServerState.STARTING: "claimed", ServerState.NAMING: "running", ServerState.READY: "ready"}
 
 
 class Rehearsal:
@@ -76,7 +65,7 @@ class Rehearsal:
         self._repository = Repository(platform.documents)
         self._name = f"rehearsal-{secrets.token_hex(6)}"
         self.user_id = ids.new_session_id() if project.has_sessions else self._name
-        self.took = SecondsToStates()
+        self._seconds: dict[ServerState, float] = {}  # from the start message to each state of the server
         self.left: list[Finding] = []  # findings on what is left after an interruption
         self._record: Server | None = None
 
@@ -95,7 +84,8 @@ class Rehearsal:
             self._until_ready(started)
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
             subject = "A warm server" if self._record and self._record.warm_server_name else "A server"
-            found.append(good(CHECK, f"{subject} of {self._project.id}, {kind}: {self.took}."))
+            took = ", ".join(f"{REACHED[state]} after {seconds:.0f} s" for state, seconds in self._seconds.items())
+            found.append(good(CHECK, f"{subject} of {self._project.id}, {kind}: {took}."))
             found += self._visit()
         except CheckFailed as failure:
             found.append(bad(CHECK, str(failure), failure.advice))
@@ -112,7 +102,7 @@ class Rehearsal:
             state = record.state if record else None
             self._progress(f"{seconds:3.0f} s  {STAGES[state]}")
             if record and state is not ServerState.CLOSED:
-                self.took.seconds.setdefault(record.state, seconds)
+                self._seconds.setdefault(record.state, seconds)
             if state is ServerState.READY:
                 return
             if record and record.is_closed and next_attempt(record) is None:

@@ -11,7 +11,7 @@ from console import screen
 from console.problem import Problem
 from deploy.aws.account import Account, Installation
 from deploy.study.image import docker
-from deploy.study.image.bundle import Bundle, make_bundle
+from deploy.study.image.bundle import make_bundle
 from deploy.study.image.codebuild import Builder
 from deploy.study.image.ecr import ImageRepository, content_tag
 from deploy.study.image.order import Order
@@ -21,12 +21,10 @@ __all__ = ["Image", "ImagePlan", "build", "plan"]
 
 @dataclass(frozen=True)
 class ImagePlan:
-    """The content of a project's image, and the `uri` (with digest) of the image with this content, if there is one."""
+    """A comparison of a project's files with the repository. `uri` (with digest) is the image with the same content."""
 
-    content: str  # the tag without a number: the project and the hash of the content
-    bundle: Bundle
-    uri: str | None
-    order: Order
+    uri: str | None  # None: the image has to be built
+    order: Order  # how to build it
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,6 @@ class Image:
     """An image in the repository. `uri` has its digest. `built`: whether it was built just now."""
 
     uri: str
-    content: str
     built: bool
 
 
@@ -58,7 +55,7 @@ def plan(
     images = repository.images()
     cache = "" if again else images.alike(project_id)
     order = Order(repository, content, images.next_tag(content), bundle, fresh=again, cache_from=cache)
-    return ImagePlan(content, bundle, None if again else images.of(content), order)
+    return ImagePlan(None if again else images.of(content), order)
 
 
 def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
@@ -67,7 +64,7 @@ def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False
     This machine's Docker builds it. If no Docker answers, or with `on_aws`, CodeBuild does.
     """
     if wanted.uri:
-        return Image(wanted.uri, wanted.content, built=False)
+        return Image(wanted.uri, built=False)
     order = wanted.order
     try:
         if not on_aws and docker.available():
@@ -83,4 +80,4 @@ def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False
     uri = order.arrived()
     if uri is None:
         raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")
-    return Image(uri, wanted.content, built=True)
+    return Image(uri, built=True)

@@ -13,7 +13,7 @@ class Order:
     """Build this bundle and push it to the repository under this tag."""
 
     repository: ImageRepository
-    content: str  # the tag that tells the content, the same for the same bundle
+    content: str  # the tag without a number: the project's id and the hash of the bundle
     tag: str
     bundle: Bundle
     fresh: bool = False  # use no layers of earlier images, so that the newest base is pulled

@@ -17,7 +17,8 @@ from console.problem import Problem
 from deploy.core.finding import Finding, Mark, bad
 from deploy.cost.prices import REGION
 from deploy.operate.doctor.check_context import CheckContext
-from deploy.operate.doctor.play.play import Play, expected
+from deploy.operate.doctor.play import upkeep
+from deploy.operate.doctor.play.play import Play
 from deploy.operate.doctor.play.transcript import Transcript
 from deploy.operate.doctor.rehearsal import CHECK, project_for
 
@@ -36,7 +37,7 @@ def played(
         return [bad(CHECK, "No live project has a game: there is nothing to play.", "Register one with --live.")], {}
     if file is not None and not file.absolute().parent.is_dir():
         raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the transcript.")
-    usd = expected(project, bots)
+    usd = upkeep.estimate(project, bots)
     screen.info(
         f"{bots} bots and three servers more, about ten minutes, {minutes} at most. It costs about ${usd.likely:.2f}, "
         f"${usd.high:.2f} at most (list prices of {REGION}). {project.id} itself is not touched: a copy of it is "

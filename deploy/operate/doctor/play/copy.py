@@ -88,7 +88,7 @@ class Copy:
 
 
 def changed(project: Project, new_id: str) -> Project:
-    """Change the study for bots: each bot gets a signed link and a server of its own, and may stop the game."""
+    """Change the study for bots: they have signed links and may stop the game; no limits, no warm servers."""
     ui = project.trial.get("ui") or dict.fromkeys(CONTROLS, True)
     return msgspec.structs.replace(
         project,

@@ -14,7 +14,6 @@ from bots.addresses import OneSite
 from console.problem import Problem
 from deploy.core import explain
 from deploy.core.finding import Mark
-from deploy.cost.prices import Prices, Usd
 from deploy.operate.doctor import addresses
 from deploy.operate.doctor.check_context import CheckContext, CheckFailed
 from deploy.operate.doctor.play import WITHIN, upkeep
@@ -27,11 +26,6 @@ from hippodrome.model.server import Server
 from hippodrome.storage.project_cache import FRESH
 
 DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
-
-
-def expected(project: Project, bots: int) -> Usd:
-    """Estimate what a rehearsal of this project will cost."""
-    return upkeep.estimate(bots, project.size.cpu, project.size.memory, Prices())
 
 
 def site(context: CheckContext, project_id: str) -> OneSite:

@@ -20,6 +20,7 @@ from deploy.operate.doctor.play.walk import left
 from deploy.operate.doctor.rehearsal import write_session
 from hippodrome.model import ids
 from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, Topic
 from protocol.session import Member, SessionDocument
@@ -258,10 +259,11 @@ def _add_seconds(seconds: list[float], begin: datetime | None, end: datetime | N
         seconds.append(max((end - begin).total_seconds(), 0.0))
 
 
-def estimate(bots: int, cpu: float, memory: float, prices: Prices) -> Usd:
+def estimate(project: Project, bots: int) -> Usd:
     """Estimate what a rehearsal costs: servers run for 2 to 20 minutes each. All else costs less than a cent."""
     servers = bots + 3  # the killed server, its replacement, and the server that its timer ends
-    spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) for kind in (True, False))
+    size, prices = project.size, Prices()
+    spot, on_demand = (prices.server_hour(size.cpu, size.memory, spot=kind) for kind in (True, False))
     return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
 
 

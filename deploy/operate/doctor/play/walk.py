@@ -267,9 +267,11 @@ class Walk:
         # The recording of a killed server may lack its end.
         missing = [*of_others.missing, *(one for one in of_struck.missing if not one.endswith("is cut off"))]
         counts = made["counts"]
-        if missing or counts["problems"] or counts["participants"] != len(self.all):
-            missing += [f"{counts['problems']} files are not as they should be"] if counts["problems"] else []
-            missing += [] if counts["participants"] == len(self.all) else [f"{counts['participants']} participants"]
+        if counts["problems"]:
+            missing.append(f"{counts['problems']} files are not as they should be")
+        if counts["participants"] != len(self.all):
+            missing.append(f"{counts['participants']} participants")
+        if missing:
             scene.transcript.bad(
                 "data", f"Of {len(self.all)} bots: {'; '.join(missing)}.", "See `python -m deploy logs trial`."
             )
