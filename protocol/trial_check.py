@@ -11,7 +11,7 @@ from protocol import trial_rules, values
 from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, RESERVED_CONTROLS, TrialSection
 from protocol.trial_keys import keys, names
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import LONGEST_NAME, Check, Keys, SectionProblem, checked
+from protocol.values import LONGEST_NAME, Check, Keys, SectionProblem, checked, is_blank
 
 _CONTROL = values.text("the name of a control", LONGEST_NAME)
 
@@ -22,7 +22,7 @@ def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
     `section` holds JSON values, or texts and `values.Plain`. A key without a value counts as not given. The default
     takes the place of a wrong value. Unknown keys are ignored.
     """
-    if section is None or section == "":
+    if is_blank(section):
         return TrialSection(), []
     if not isinstance(section, dict):
         _, problems = checked(values.section("actionBufferLifespan: …"), section, ())
@@ -41,7 +41,7 @@ def _with_one_spelling(section: dict[str, Any]) -> tuple[dict[str, Any], list[Se
     if RATE_CHANGE_MISSPELT not in section:
         return section, []
     rest = {key: value for key, value in section.items() if key != RATE_CHANGE_MISSPELT}
-    if rest.get(RATE_CHANGE) not in (None, ""):
+    if not is_blank(rest.get(RATE_CHANGE)):
         return rest, [SectionProblem((RATE_CHANGE_MISSPELT,), f"{RATE_CHANGE} is given too; keep that one")]
     return rest | {RATE_CHANGE: section[RATE_CHANGE_MISSPELT]}, []
 
@@ -54,7 +54,7 @@ def _section(
     problems: list[SectionProblem] = []
     for key in keys(model):
         value, here = section.get(key.name), (*path, key.name)
-        if value is None or value == "" or (key.section is Ui and value == {}):
+        if is_blank(value) or (key.section is Ui and value == {}):
             continue
         value, wrong = checked(key.check, value, here)
         if key.each and not wrong:
@@ -79,7 +79,7 @@ def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...],
     problems: list[SectionProblem] = []
     for name in [name for name in section if name not in names(Ui)]:
         here = (*path, name)
-        shown, wrong = (False, []) if section[name] in (None, "") else checked(values.flag, section[name], here)
+        shown, wrong = (False, []) if is_blank(section[name]) else checked(values.flag, section[name], here)
         if shown and name in RESERVED_CONTROLS:
             wrong = [SectionProblem(here, "the game's server knows this word already; give the control another name")]
         elif shown:

@@ -46,6 +46,11 @@ class SectionProblem(NamedTuple):
     compared: tuple[str, ...] = ()
 
 
+def is_blank(value: object) -> bool:
+    """Return whether this is the value of a key that was left empty. Such a key counts as not given."""
+    return value is None or value == ""
+
+
 def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[SectionProblem]]:
     """Return the result of the check and no problem, or None and the problem at this path."""
     try:
@@ -60,7 +65,7 @@ def show(value: object) -> str:
         return printable(value.text)
     if isinstance(value, str) and value:
         return f'"{printable(value)}"'
-    if value is None or value == "":
+    if is_blank(value):
         return "empty"
     if isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 10**18):
         return json.dumps(value)
@@ -143,15 +148,13 @@ def number_in(value: object) -> int | float | None:
     return value if isinstance(value, int) or math.isfinite(value) else None
 
 
-def whole(low: int, high: int | None = None) -> Check:
-    """Return a check for a whole number from `low` to `high`, also as text. Without `high`, the limit is a billion."""
-    span = f"of at least {low}" if high is None else f"from {low} to {high}"
-    most = high or 10**9
+def whole(low: int, high: int) -> Check:
+    """Return a check for a whole number from `low` to `high`, also as text."""
 
     def check(value: object) -> int:
         found = number_in(value)
-        if found is None or found != int(found) or not low <= found <= most:
-            raise ValueError(f"must be a whole number {span}, not {show(value)}")
+        if found is None or found != int(found) or not low <= found <= high:
+            raise ValueError(f"must be a whole number from {low} to {high}, not {show(value)}")
         return int(found)
 
     return check

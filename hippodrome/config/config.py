@@ -59,7 +59,7 @@ class Config:
         remarks: Iterable[Diagnostic] = (),
     ) -> Config:
         """Return the project with these checked values, which have no mistakes."""
-        project = checked.root.project
+        project = checked.project
         events = resolve_events(project.events, [step.key for step in steps], project.steps)
         return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks))
 

@@ -45,7 +45,7 @@ def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
 
 def _missing(checked: Checked) -> Iterator[Mistake]:
     """Sections and keys that every study needs."""
-    project = checked.root.project
+    project = checked.project
     if not checked.has_project:
         if checked.valid(("project",)):
             yield Mistake((), "the section project is missing")
@@ -60,7 +60,7 @@ def _missing(checked: Checked) -> Iterator[Mistake]:
 
 def _hours(checked: Checked) -> Iterator[Mistake]:
     """`maxServerHours` must cover `maxRuntime`: otherwise no server could start."""
-    project, path = checked.root.project, ("project", "maxServerHours")
+    project, path = checked.project, ("project", "maxServerHours")
     if not checked.valid(path, ("project", "maxRuntime")) or project.max_server_hours is None:
         return
     if project.max_server_hours * 60 < project.max_runtime:
@@ -70,7 +70,7 @@ def _hours(checked: Checked) -> Iterator[Mistake]:
 
 def _warm(checked: Checked) -> Iterator[Mistake]:
     """`warmServers` needs names without participants, a step that starts servers, and room within `maxServers`."""
-    project, path = checked.root.project, ("project", "warmServers")
+    project, path = checked.project, ("project", "warmServers")
     if not project.warm_servers:
         return
     if project.subdomain == "userId":
@@ -85,7 +85,7 @@ def _warm(checked: Checked) -> Iterator[Mistake]:
 
 def _plain_clients(checked: Checked) -> Iterator[Mistake]:
     """`plainClients` needs the origin of HIPPO's front end, which finds a server by the participant's id."""
-    project, path = checked.root.project, ("project", "plainClients")
+    project, path = checked.project, ("project", "plainClients")
     if not project.plain_clients or not checked.valid(path):
         return
     if not project.front_end and checked.valid(("project", "frontEnd")):
@@ -98,7 +98,7 @@ def _plain_clients(checked: Checked) -> Iterator[Mistake]:
 def _starts_nothing(checked: Checked) -> bool:
     """Whether it is certain that no step starts a server."""
     known = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
-    return known and not checked.game_steps and checked.root.project.events.start_server_step is None
+    return known and not checked.game_steps and checked.project.events.start_server_step is None
 
 
 _AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the installation are used
@@ -109,7 +109,7 @@ _AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the ins
 
 def _aws(checked: Checked) -> Iterator[Mistake]:
     """`useAWS: true` needs a size of servers, and Fargate must offer this size."""
-    project, path = checked.root.project, ("project", "awsSetup")
+    project, path = checked.project, ("project", "awsSetup")
     setup = project.aws_setup
     if not checked.valid(("project", "useAWS")) or project.keeps_off_aws:
         return
@@ -123,8 +123,8 @@ def _aws(checked: Checked) -> Iterator[Mistake]:
 
 def _ssl(checked: Checked) -> Iterator[Mistake]:
     """With `useAWS: true`, `ssl` has all three keys or none."""
-    ssl = checked.root.project.ssl
-    if not checked.root.project.use_aws or not ssl.model_fields_set:
+    ssl = checked.project.ssl
+    if not checked.project.use_aws or not ssl.model_fields_set:
         return
     for key in ("sslBucket", "fullchain", "privkey"):
         if not ssl.given(key) and checked.valid(("project", "ssl", key)):
@@ -147,7 +147,7 @@ def _environment_size(checked: Checked) -> Iterator[Mistake]:
     """The environment variables of a server must fit into the RunTask call, or ECS refuses it."""
     if not checked.valid(("trial",), STEPS):
         return
-    project, trial = checked.root.project, checked.trial.registered()
+    project, trial = checked.project, checked.trial.registered()
     pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
     length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), ",".join(checked.game_steps), pages))
     if length > _ECS_LIMIT:
@@ -167,7 +167,7 @@ def _step_numbers(checked: Checked) -> Iterator[Mistake]:
     if not _keys_known(checked):
         return
     numbers = [int(key) for key in checked.step_keys if key != FINAL]
-    for before, number in itertools.pairwise([0, *(numbers or [2])]):
+    for before, number in itertools.pairwise([0, *(numbers or [2])]):  # with finalStep alone, step 1 is missing
         if number > before + 1:
             gap = f"step {before + 1} is" if number == before + 2 else f"steps {before + 1} to {number - 1} are"
             after = str(number) if numbers else FINAL
@@ -176,7 +176,7 @@ def _step_numbers(checked: Checked) -> Iterator[Mistake]:
 
 def _game_step(checked: Checked) -> Iterator[Mistake]:
     """The last step is no game step."""
-    last = checked.root.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
+    last = checked.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
     if last and type_of(last).on_server:
         path = (*STEPS, checked.step_keys[-1])
         yield Mistake(path, "the game cannot be the last step; add a page after it, which stops the server")
@@ -188,7 +188,7 @@ _STOP: Keys = ("project", "events", "stopServerStep")
 
 def _event_steps(checked: Checked) -> Iterator[Mistake]:
     """The steps of `events` exist; the server starts at the first game step or before, and stops after the last."""
-    steps, events = checked.root.project.steps, checked.root.project.events
+    steps, events = checked.project.steps, checked.project.events
     if not _keys_known(checked):
         return
     keys = visited(checked.step_keys, steps)

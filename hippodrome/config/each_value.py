@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from hippodrome.config.diagnostics import Mistake
-from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, Root
+from hippodrome.config.project_keys import NAMES, STEPS, TEXTS, TRIAL_SECTIONS, ProjectKeys, Root
 from hippodrome.config.step_order import is_step_key
 from hippodrome.config.unknown_keys import explain, meant_for
 from hippodrome.model.step_order import FINAL, ordered
@@ -23,7 +23,7 @@ from protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
 from protocol.trial_check import check as check_trial
 from protocol.trial_keys import names
 from protocol.trial_sections import Ui
-from protocol.values import Keys, show
+from protocol.values import Keys, is_blank, show
 
 _EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
 _ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding them takes time
@@ -33,7 +33,7 @@ _ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding 
 class Checked:
     """The result of the checks: the valid values, the keys of all steps, the mistakes, and the paths with mistakes."""
 
-    root: Root
+    project: ProjectKeys
     step_keys: list[str]
     has_project: bool
     trial: TrialSection = field(default_factory=TrialSection)
@@ -43,7 +43,7 @@ class Checked:
     @property
     def game_steps(self) -> list[str]:
         """The keys of the game steps."""
-        return [key for key, page in self.root.project.steps.items() if type_of(page).on_server]
+        return [key for key, page in self.project.steps.items() if type_of(page).on_server]
 
     def valid(self, *paths: Keys) -> bool:
         """Return whether no mistake is at one of these paths, below it or above it."""
@@ -61,9 +61,9 @@ def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Chec
     about_trial = sections.pop("trial", None)
     steps = _at(sections, STEPS)
     keys = [key for key in steps if is_step_key(key)] if isinstance(steps, dict) else []
-    if isinstance(steps, dict) and steps.get(FINAL, "") in (None, ""):
-        steps.pop(FINAL, None)  # left empty, it counts as not given
-    checked = Checked(Root(), ordered(keys), "project" in sections, invalid=list(invalid))
+    if isinstance(steps, dict) and is_blank(steps.get(FINAL)):
+        steps.pop(FINAL, None)
+    checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, invalid=list(invalid))
     _check_project(sections, checked)
     _check_trial(about_trial, checked)
     return checked
@@ -72,7 +72,7 @@ def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Chec
 def _check_project(sections: dict[str, Any], checked: Checked) -> None:
     while True:
         try:
-            checked.root = Root.model_validate(sections)
+            checked.project = Root.model_validate(sections).project
             return
         except ValidationError as error:
             _take(error.errors(include_url=False), checked, sections)

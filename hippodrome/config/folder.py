@@ -82,16 +82,15 @@ def read_project(folder: Path) -> Config:
     if checked.valid(STEPS) and not missing_files:
         groups = number_of_groups(page.variants for page in (*steps, *game_pages))
         missing_files += sessions.mistakes_of_groups(checked, groups)
-    mistakes = [source.diagnostic(m.path, m.message, line=m.line) for m in (*checked.mistakes, *missing_files)]
-    mistakes += [source.diagnostic(m.path, m.message, line=m.line) for m in source.parsed.mistakes]
+    found = (*checked.mistakes, *missing_files, *source.parsed.mistakes)
+    mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
     agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
     mistakes += [problem for problem in agent if not problem.remark]
     if mistakes:
         raise ConfigErrors(in_order(mistakes))
     loaded = _loaded_from(source, steps)
     if loaded:
-        project = checked.root.project.model_copy(update={"allowed_hosts": loaded})
-        checked.root = checked.root.model_copy(update={"project": project})
+        checked.project = checked.project.model_copy(update={"allowed_hosts": loaded})
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
     return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
@@ -128,7 +127,7 @@ def _parse(layout: Layout) -> ParsedFile:
 
 def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Mistake]]:
     """The steps with their files, and the mistakes in files."""
-    pages = checked.root.project.steps
+    pages = checked.project.steps
     steps: list[StepFiles] = []
     mistakes: list[Mistake] = []
     own = {page for page in pages.values() if type_of(page).has_files and page != CLOSING_PAGE}

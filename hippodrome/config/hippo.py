@@ -16,7 +16,7 @@ from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from hippodrome.model.step_order import FINAL
 from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
-from protocol.values import Keys, Plain, flag, number_in, path_text, show
+from protocol.values import Keys, Plain, flag, is_blank, number_in, path_text, show
 
 CLOSING_PAGE = "hippodrome-the-end"
 """The last page of a study without pages (`step_files.CLOSING`)."""
@@ -109,17 +109,13 @@ def _copy(value: Any) -> Any:
     return [_copy(item) for item in value] if isinstance(value, list) else value
 
 
-def _blank(value: object) -> bool:
-    return value is None or value == ""
-
-
 # project
 
 
 def _spellings(adapted: Adapted) -> None:
     for path, right in _SPELLINGS.items():
         section = adapted.section(path[:-1])
-        if path[-1] in section and _blank(section.get(right)):
+        if path[-1] in section and is_blank(section.get(right)):
             section[right] = section.pop(str(path[-1]))
             adapted.origins[(*path[:-1], right)] = path
             adapted.remark(path, f"read as {right}")
@@ -140,7 +136,7 @@ def _id(adapted: Adapted, name: str) -> None:
         return
     given = project["id"]
     text = given.text if isinstance(given, Plain) and not isinstance(given.value, bool) else given
-    blank = _blank(given)
+    blank = is_blank(given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
     if blank and _flag(project.get("useAWS")):  # another folder may have this name; HIPPO refuses an empty id, too
@@ -155,7 +151,7 @@ def _id(adapted: Adapted, name: str) -> None:
 
 def _live(adapted: Adapted) -> None:
     project = adapted.section(("project",))
-    if "live" in project and _blank(project["live"]):
+    if "live" in project and is_blank(project["live"]):
         adapted.remark(("project", "live"), "is empty: the study is open; HIPPO Gym took that for closed")
 
 
@@ -176,7 +172,7 @@ def _steps(adapted: Adapted) -> None:
     given = adapted.section(STEPS)
     if not given or not all(_is_page(page) for page in given.values()):
         return
-    if all(_blank(page) for page in given.values()):
+    if all(is_blank(page) for page in given.values()):
         _put_steps(adapted, {"1": "game", FINAL: CLOSING_PAGE}, {})
         text = (
             "no step has a page: participants play the game and then see a page that says that it is over; name pages "
@@ -189,13 +185,13 @@ def _steps(adapted: Adapted) -> None:
     if len(numbers) == int(numbers[-1] if numbers else 0):  # with a gap, another key may be a misspelt number
         others = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
         _drop_steps(adapted, others, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
-    without = [key for key in numbers if _blank(given[key])]
+    without = [key for key in numbers if is_blank(given[key])]
     rest = [key for key in numbers if key not in without]
-    if not rest and not _blank(given.get(FINAL)):
+    if not rest and not is_blank(given.get(FINAL)):
         _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
         adapted.remark((*STEPS, FINAL), "the study has this page only")
     elif without and len(numbers) == int(numbers[-1]):  # steps with gaps stay, for the check to report
-        unplayed = "game" not in given.values() and not _blank(adapted.at(("trial", "game")))
+        unplayed = "game" not in given.values() and not is_blank(adapted.at(("trial", "game")))
         more = "; no step is game, so no participant plays: if this one is to be, write game" if unplayed else ""
         for key in without:
             adapted.remark((*STEPS, key), f"has no page: participants go on to the next step{more}")
@@ -224,7 +220,7 @@ def _renumber(adapted: Adapted, with_page: list[str], before: list[str]) -> None
     moved = [key for key in with_page if now[key] != key]
     if moved:
         adapted.remark((*STEPS, moved[0]), f"counts as step {now[moved[0]]}, since one before it has no page")
-    final = {FINAL: given[FINAL]} if not _blank(given.get(FINAL)) else {}
+    final = {FINAL: given[FINAL]} if not is_blank(given.get(FINAL)) else {}
     _put_steps(adapted, {now[key]: given[key] for key in with_page} | final, {now[key]: key for key in moved})
     events = adapted.section(("project", "events"))
     for event in ("startServerStep", "stopServerStep"):
@@ -261,7 +257,7 @@ def _size(adapted: Adapted) -> None:
         return
     setup = adapted.section(("project", "awsSetup"))
     for key, default, unit in (("cpu", _CPU, "vCPUs"), ("memory", _MEMORY, "GB")):
-        if key in setup and _blank(setup[key]):
+        if key in setup and is_blank(setup[key]):
             setup[key] = default
             message = f"is empty: each server has {default} {unit}, as with HIPPO Gym"
             adapted.remark(("project", "awsSetup", key), message)
@@ -279,10 +275,10 @@ def _certificate(adapted: Adapted) -> None:
     """Removes an incomplete section `ssl`, which would have no effect."""
     project, path = adapted.section(("project",)), ("project", "ssl")
     ssl = project.get("ssl")
-    if not isinstance(ssl, dict) or not any(_blank(ssl.get(key)) for key in _SSL):
+    if not isinstance(ssl, dict) or not any(is_blank(ssl.get(key)) for key in _SSL):
         return
     del project["ssl"]
-    if any(not _blank(value) for value in ssl.values()) and _flag(project.get("useAWS")):
+    if any(not is_blank(value) for value in ssl.values()) and _flag(project.get("useAWS")):
         adapted.remark(path, SSL_NO_EFFECT)
 
 
@@ -292,7 +288,7 @@ def _certificate(adapted: Adapted) -> None:
 def _no_game(adapted: Adapted) -> None:
     """Fills in an empty name of the environment, for an agent that does not need it."""
     trial, pages = adapted.section(("trial",)), adapted.section(STEPS).values()
-    if "game" in trial and _blank(trial["game"]) and "game" in pages:
+    if "game" in trial and is_blank(trial["game"]) and "game" in pages:
         trial["game"] = "none"
         adapted.remark(("trial", "game"), 'is empty: start() of the agent is given "none"')
 
@@ -327,7 +323,7 @@ def _frame_rates(adapted: Adapted) -> None:
         return
     defaults = TrialSection()
     low, start, high = (
-        number_in(trial[key]) if not _blank(trial.get(key)) else default
+        number_in(trial[key]) if not is_blank(trial.get(key)) else default
         for key, default in (
             ("minFrameRate", defaults.min_frame_rate),
             ("startingFrameRate", defaults.starting_frame_rate),
@@ -337,7 +333,7 @@ def _frame_rates(adapted: Adapted) -> None:
     if low is None or start is None or high is None or low <= start <= high or not 1 <= start <= HIGHEST_RATE:
         return
     for key in ("minFrameRate", "maxFrameRate"):
-        if not _blank(trial.get(key)):
+        if not is_blank(trial.get(key)):
             adapted.remark(("trial", key), f"no effect, since {RATE_CHANGE} is not true")
     trial |= {"minFrameRate": min(defaults.min_frame_rate, start), "maxFrameRate": max(defaults.max_frame_rate, start)}
 
@@ -367,13 +363,13 @@ def _is_mistake(adapted: Adapted, path: Keys) -> bool:
     unknown one may be a similar key of the agent."""
     meant = meant_for(path)
     misplaced = meant is not None and meant[-1] == path[-1] and path[0] != "trial"
-    return meant is not None and (misplaced or len(meant) == 1 or _blank(adapted.at(meant)))
+    return meant is not None and (misplaced or len(meant) == 1 or is_blank(adapted.at(meant)))
 
 
 def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     """Move an unknown key of `trial` to `trial.options`, for the agent."""
     trial = adapted.section(("trial",))
-    options = {} if _blank(trial.get("options")) else trial["options"]
+    options = {} if is_blank(trial.get("options")) else trial["options"]
     if not isinstance(options, dict):
         return
     if path[-1] in options:
@@ -388,6 +384,6 @@ def _own_control(adapted: Adapted, path: Keys) -> None:
     """Remove one of the project's own controls if it is neither true nor false."""
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]
-    if not _blank(value) and _flag(value) is None:
+    if not is_blank(value) and _flag(value) is None:
         del ui[str(path[-1])]
         adapted.remark(path, "no effect: neither true nor false")

@@ -11,7 +11,7 @@ from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
 from hippodrome.model.step_order import ordered
-from protocol.values import number_in, path_text, show
+from protocol.values import is_blank, number_in, path_text, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
 _KEPT = (  # HIPPO's script does not know these keys, so a registration by it keeps their earlier values
@@ -91,6 +91,6 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
         trial["game"] = "none"
         remarks.append(_NO_GAME)
     if steps and all(map(is_step_key, steps)):
-        with_page = [key for key in ordered(steps) if steps[key] not in (None, "")]
+        with_page = [key for key in ordered(steps) if not is_blank(steps[key])]
         project["steps"] = [{"key": key, "page": steps[key]} for key in with_page]
     return {**added, **project, "trial": trial}, remarks

@@ -29,10 +29,9 @@ class Rule:
         return dict(self.schema)
 
 
-def whole(low: int, high: int | None = None) -> Rule:
+def whole(low: int, high: int) -> Rule:
     """Return the rule for a whole number from `low` to `high`."""
-    bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
-    return Rule(values.whole(low, high), {"type": "integer", **bounds})
+    return Rule(values.whole(low, high), {"type": "integer", "minimum": low, "maximum": high})
 
 
 def one_of(*choices: str) -> Rule:
@@ -64,4 +63,4 @@ class Model(BaseModel):
     def _drop_empty(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        return {key: value for key, value in data.items() if value not in (None, "") or key not in cls.names()}
+        return {key: value for key, value in data.items() if not values.is_blank(value) or key not in cls.names()}

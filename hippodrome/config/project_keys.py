@@ -160,7 +160,7 @@ def step_name(value: object) -> str:
 
 def page(value: object) -> str:
     """Check the page of a step, and return its file without `.html`, or the type of a step such as `game`."""
-    if value is None or value == "":
+    if values.is_blank(value):
         raise ValueError(f"has no page; write the name of its file, or {step_types.NAMES}")
     found = as_text(value, f"the name of a file, or {step_types.NAMES}")
     stem = step_file(found)
@@ -194,7 +194,7 @@ def text_name(value: object) -> str:
 
 def own_text(value: object) -> str:
     """Check a study's own words for a text; "" stands for Hippodrome's English ones."""
-    return "" if value in (None, "") else str(_OWN_TEXT(value))
+    return "" if values.is_blank(value) else str(_OWN_TEXT(value))
 
 
 _OWN_TEXT = values.text('text, in quotes: "…"', LONGEST_TEXT)

@@ -57,7 +57,7 @@ def parse_registration(data: object) -> dict[str, Any]:
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))
-    shown = visited(checked.step_keys, checked.root.project.steps)
+    shown = visited(checked.step_keys, checked.project.steps)
     config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in shown])
     return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
 

@@ -36,7 +36,7 @@ def no_effect(trial: TrialSection) -> str:
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
     """Yield mistakes in keys that do not fit `project.players`; nothing if each participant plays alone."""
-    if not checked.root.project.has_sessions or not checked.valid(PLAYERS):
+    if not checked.project.has_sessions or not checked.valid(PLAYERS):
         return
     yield from _humans(checked)
     yield from _one_game_for_all(checked)
@@ -50,7 +50,7 @@ def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
 
     `groups` is their number: the versions of a page.
     """
-    project = checked.root.project
+    project = checked.project
     if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return
     pages = "write two versions of a page, such as rules-0.html and rules-1.html"
@@ -62,7 +62,7 @@ def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
 
 def _humans(checked: Checked) -> Iterator[Mistake]:
     """In each group, the number of human players must be `project.players`."""
-    wanted, trial = checked.root.project.players, checked.trial
+    wanted, trial = checked.project.players, checked.trial
     if not checked.valid(WHO_PLAYS) or not checked.game_steps:
         return
     if not trial.players:
@@ -82,7 +82,7 @@ def _humans(checked: Checked) -> Iterator[Mistake]:
 
 def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
     """`players` may differ between groups only if the participants of each game are of one group."""
-    project = checked.root.project
+    project = checked.project
     if by_group(checked.trial.players) and project.matching != "group" and checked.valid(MATCHING, WHO_PLAYS):
         message = "is given group by group, and a game may have participants of several groups"
         yield Mistake(WHO_PLAYS, f"{message}; write matching: group under project, or one map for all")
@@ -91,7 +91,7 @@ def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
 def _empty_places(checked: Checked) -> Iterator[Mistake]:
     """`afterPatience: policies` needs `substitute`. (`protocol/trial_rules.py` checks `afterAbsent: policy`.)"""
     trial = checked.trial
-    needs = checked.root.project.after_patience == "policies" and trial.after_absent != "policy"
+    needs = checked.project.after_patience == "policies" and trial.after_absent != "policy"
     path: Keys = ("trial", "substitute")
     if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
         message = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
@@ -100,7 +100,7 @@ def _empty_places(checked: Checked) -> Iterator[Mistake]:
 
 def _seats(checked: Checked) -> Iterator[Mistake]:
     """`seats` other than `lot` need a `matching` that orders the participants, and a participant for each seat."""
-    project = checked.root.project
+    project = checked.project
     if project.seats == "lot" or not checked.valid(SEATS, MATCHING):
         return
     if project.seats == "match" and project.matching != "match":
@@ -117,7 +117,7 @@ def _seats(checked: Checked) -> Iterator[Mistake]:
 
 def _of_one_participant(checked: Checked) -> Iterator[Mistake]:
     """HIPPO's front end, servers named by userId, and clusters of a participant need participants who play alone."""
-    project = checked.root.project
+    project = checked.project
     if project.plain_clients:
         message = "HIPPO's front end opens the game of one participant: write plainClients: false, or players: 1"
         yield Mistake(("project", "plainClients"), message)

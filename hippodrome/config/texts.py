@@ -23,7 +23,7 @@ _SENTENCE = 3  # words from which on a text is not the same in two languages
 
 def mistakes(checked: Checked) -> Iterator[Mistake]:
     """Yield mistakes in texts: placeholders such as `{seconds}` that the text does not have, and wrong languages."""
-    for name, text in checked.root.project.own_texts.items():
+    for name, text in checked.project.own_texts.items():
         if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
         elif wrong := [found for found in _BRACES.findall(text) if found[1:-1] not in places(ENGLISH[name])]:
@@ -38,7 +38,7 @@ def _known(name: str) -> str:
     if not known:
         return "this text has no placeholders"
     *first, last = known
-    return f"there {'are' if first else 'is'} {' and '.join(filter(None, [', '.join(first), last]))}"
+    return f"there are {', '.join(first)} and {last}" if first else f"there is {last}"
 
 
 def shown_as_they_are(config: Config) -> Iterator[Remark]:

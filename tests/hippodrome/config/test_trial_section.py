@@ -190,7 +190,7 @@ def idle_remark(*actions: str, **trial: Any) -> str | None:
     }
     checked = check(tree)
     assert checked.mistakes == []
-    steps = [StepFiles(key, page) for key, page in checked.root.project.steps.items()]
+    steps = [StepFiles(key, page) for key, page in checked.project.steps.items()]
     found = remarks.without_a_key(Config.of(checked, steps))
     return None if found is None else found.message
 
