@@ -22,6 +22,7 @@ from testing.studies import study
 from tests.trial.test_trial_tls import certificate
 from trial.recordings import presigned, recording
 from trial.recordings.presigned import PresignedStore, StoreError
+from trial.recordings.spool import store_file
 
 USER = "P1"
 UI = {"stop": True, "start": True}
@@ -209,6 +210,35 @@ def test_a_file_is_stored_whole(town, tmp_path):
     key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
     assert town.store(record).create(key, path) is True
     assert town.body(key) == path.read_bytes()
+
+
+def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(town, tmp_path, monkeypatch):
+    record, path, losses = town.start(), tmp_path / "recording", iter([True])
+    key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
+    path.write_bytes(b"the recording")
+    send = presigned._send
+
+    def send_and_lose_the_first_put(request, *more):
+        reply = send(request, *more)
+        if request["method"] == "PUT" and next(losses, False):
+            raise StoreError("no answer: TimeoutError")
+        return reply
+
+    monkeypatch.setattr(presigned, "_send", send_and_lose_the_first_put)
+    asyncio.run(store_file(town.store(record), key, path))
+    assert [each for each in town.documents.kept if each.startswith(FOLDER)] == [key]
+    assert not path.exists()
+    assert town.store(record).create(key, b"the recording") is False
+
+
+def test_another_recording_with_the_same_name_is_stored_under_a_number(town, tmp_path):
+    record, path = town.start(), tmp_path / "recording"
+    folder = f"{FOLDER}/trials/{record.name}"
+    town.documents.put(f"{folder}/3-trial.jsonl.gz", b"that of an earlier process")
+    path.write_bytes(b"the recording")
+    asyncio.run(store_file(town.store(record), f"{folder}/3-trial.jsonl.gz", path))
+    assert town.body(f"{folder}/3-trial.jsonl.gz") == b"that of an earlier process"
+    assert town.body(f"{folder}/3-trial-2.jsonl.gz") == b"the recording"
 
 
 def test_a_refusal_that_comes_before_the_body_is_sent_is_read(tmp_path):

@@ -54,6 +54,7 @@ class PresignedStore:
         self._credential = credential
         self._pause = pause
         self._gets: dict[str, Mapping[str, Any]] = {}  # presigned GETs that may still be valid, by key
+        self._unconfirmed: set[str] = set()  # keys of documents whose last PUT has failed
 
     def get(self, key: str) -> bytes | None:
         """Return the document; None if there is none. Retries transient errors for some seconds. Raises StoreError."""
@@ -83,20 +84,22 @@ class PresignedStore:
     def create(self, key: str, data: bytes | Path) -> bool:
         """Create a document; return False if it exists. Raises OSError.
 
-        Errors are not retried here, since the callers do so (`spool.retry_forever`).
+        Errors are not retried here, since the callers do so (`spool.retry_forever`). S3 may create a document although
+        its answer is lost, and then refuses the next request for the same key. This call returns True then: a task on
+        Fargate runs one process, so no other process creates this server's recordings.
         """
         size = data.stat().st_size if isinstance(data, Path) else len(data)
         request = self._signed({"method": "PUT", "key": key, "size": size})
-        if isinstance(data, Path):
-            with data.open("rb") as body:
-                status, _ = _send(request, body)
-        else:
-            status, _ = _send(request, data)
-        if status == 412:
-            return False
-        if status != 200:
-            raise _UnexpectedStatus(status)
-        return True
+        sent_before = key in self._unconfirmed
+        try:
+            status = _put(request, data)
+            if status not in (200, 412):
+                raise _UnexpectedStatus(status)
+        except StoreError:
+            self._unconfirmed.add(key)
+            raise
+        self._unconfirmed.discard(key)
+        return status == 200 or sent_before
 
     def _get(self, key: str) -> bytes | None:
         return _document(_send(self._signed({"method": "GET", "key": key}), None))
@@ -131,6 +134,14 @@ def _document(reply: Reply) -> bytes | None:
     if status != 200:
         raise _UnexpectedStatus(status)
     return body
+
+
+def _put(request: Mapping[str, Any], data: bytes | Path) -> int:
+    """Send a PUT with these bytes or a file's content, and return the answer's status. Raises OSError."""
+    if isinstance(data, bytes):
+        return _send(request, data)[0]
+    with data.open("rb") as body:
+        return _send(request, body)[0]
 
 
 def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int | None = None) -> Reply:
