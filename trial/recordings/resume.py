@@ -60,7 +60,7 @@ def add_lines(recorded: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> No
     """Add the lines of a recording to `recorded`. Lines of unknown kinds and malformed lines are ignored."""
     rate = 30.0
     for line in lines:
-        with contextlib.suppress(KeyError, TypeError, ValueError):
+        with contextlib.suppress(AttributeError, KeyError, TypeError, ValueError):
             if line["kind"] == "header":
                 rate = float(line["frameRate"]) or rate
             else:

@@ -47,6 +47,12 @@ def test_an_episode_that_was_cut_off_is_remembered_step_by_step():
     assert past.unfinished.score == 3.5
 
 
+@pytest.mark.parametrize("wrong", [{"messages": ["good"]}, {"players": ["a"]}, {"reward": "much"}, {"episode": None}])
+def test_a_malformed_line_is_ignored(wrong):
+    past = recorded_trial(reset(), step(), {**step(), **wrong}, step())
+    assert len(past.unfinished.steps) == 2
+
+
 def test_episodes_that_ended_are_counted_and_the_next_one_goes_on():
     past = recorded_trial(header(), reset(), step(), step(), end(), reset(2, 8), step(5.0, 2))
     assert past.ended == [Episode(1, 2, 2.0, "terminated")]
