@@ -6,13 +6,16 @@ import json
 import re
 import subprocess
 import sys
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hippodrome.aws.bus import TOPICS
-from hippodrome.ports import PORTS
+from hippodrome.model import sessions
+from hippodrome.model.project import Project
+from hippodrome.ports import PORTS, Settings
 from local.web.gateway import ROUTES
 from testing import template as cfn
 
@@ -59,6 +62,14 @@ def test_the_functions_that_register_and_start_know_whether_front_ends_need_toke
     }
     knowing = {name: it["PLAIN_CLIENTS"] for name, it in told.items() if "PLAIN_CLIENTS" in it}
     assert knowing == {name: {"Ref": "PlainClients"} for name in ("StartServer", "UpdateProjectMasterList")}
+
+
+@pytest.mark.parametrize("function", ["NextStep", "StartServer", "Sweep"])
+def test_the_functions_of_the_lobby_give_no_session_a_server_that_has_too_little_time_left(function: str) -> None:
+    told = cfn.template()["Resources"][function]["Properties"]["Environment"]["Variables"]
+    settings = Settings.from_env(cfn.ReferenceValues(parameters={"MaxRuntime": "120"}).resolve(told))
+    study = Project(id="maze", steps=[], max_runtime=110, players=2)
+    assert sessions.open_for(study, settings) == timedelta(minutes=10)
 
 
 def test_every_parameter_says_what_it_is_and_is_checked() -> None:
