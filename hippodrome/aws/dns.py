@@ -86,7 +86,7 @@ class Route53Dns:
             raise
 
     def list(self) -> Iterator[DnsRecord]:
-        """Yield the A records of servers: those that have the form of records which `change` creates.
+        """Yield the A records that have the form of the servers' records, which `change` creates.
 
         Records directly below `ROOT_DOMAIN` are included: earlier versions created them there. AWS calls: one for each
         300 records of the zone.

@@ -168,9 +168,7 @@ class EcsTasks:
                 raise
 
     def clusters(self) -> Iterator[str]:
-        """Yield the names of participants' own clusters: those clusters of the account whose names are names of
-        servers.
-        """
+        """Yield the names of participants' own clusters: the clusters of the account that are named like servers."""
         for page in self._ecs().get_paginator("list_clusters").paginate():
             for arn in page["clusterArns"]:
                 name = str(arn).rpartition("/")[2]
@@ -202,9 +200,7 @@ class EcsTasks:
         return overrides
 
     def draining(self, *clusters: str) -> Iterator[RunningTask]:
-        """Yield the servers' tasks in these clusters that were told to stop and have not ended. They may still store
-        data.
-        """
+        """Yield the servers' tasks in these clusters that are stopping. They may still store data."""
         for cluster in clusters:
             yield from self._list(cluster, "STOPPED")
 
@@ -216,7 +212,7 @@ class EcsTasks:
         return sum(len(self.arns(cluster)) for cluster in [self._need("CLUSTER"), *self.clusters()])
 
     def arns(self, cluster: str) -> Sequence[str]:
-        """Return the ARNs of all living tasks in a cluster, servers or not; none if the cluster does not exist."""
+        """Return the ARNs of all living tasks in a cluster, also of other programs; none if the cluster is deleted."""
         return [arn for page in self._pages(cluster, "RUNNING") for arn in page]
 
     def _list(self, cluster: str, desired: str = "RUNNING") -> Iterator[RunningTask]:

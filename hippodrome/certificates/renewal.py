@@ -102,7 +102,7 @@ class Renewal:
         return self._state()[0], self._stored()[0]
 
     def last_directory(self) -> str:
-        """Return the ACME directory that issued the present certificate, or else the last one.
+        """Return the ACME directory that issued the present certificate or, if it is gone, the one ordered last.
 
         The result is "" if no certificate was ever ordered, or if the administrator put the present one there. For a
         location that never had a certificate, it is the directory of the certificate at `FORMER`.

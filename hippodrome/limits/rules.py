@@ -101,7 +101,7 @@ def counts(parts: Sequence[ParticipantSlots]) -> list[int]:
 
 
 def first_shard(label: str, limit: int) -> int:
-    """Return the first shard in which a participant looks for a slot: one that has a share of the limit.
+    """Return the shard in which a participant looks for a slot first. It has a share of the limit.
 
     A participant may hold two slots: if `next_step` crashed between taking the slot and writing `participant.json`, and
     the limit changed before they came back. Then too few others are admitted, never too many.
@@ -179,7 +179,7 @@ class ServerSlots(Record, frozen=True):
         return self.without_all({label: (mine.attempt, None)}) if mine else self
 
     def without_all(self, ended: Mapping[str, tuple[int, int | None]]) -> ServerSlots:
-        """Release the slots of servers: `ended` has, by label, the attempt and the seconds used (None: not known).
+        """Release the slots of servers. `ended` maps a label to the attempt and the seconds used (None: not known).
 
         A slot that is held for another attempt stays.
         """

@@ -1,9 +1,9 @@
 """The document of decisions: one per project's lobby, with the records in it. Pure: no clock, no I/O.
 
 `_lobbies/{projectId}.json` is changed by compare-and-swap alone. A participant stands in it at most once: as a member
-of a session that is *proposed*, or of one that is *formed* (decided for good), or as *unmatched*. So no participant
-gets into two sessions, even if several functions decide at once from listings of different age. A formed session
-leaves the document only after its own document and its members' memberships have been written (`store.py`).
+of a *proposed* session, as a member of a *formed* session (which is decided for good), or as *unmatched*. So no
+participant gets into two sessions, even if several functions decide at once from listings of different age. A formed
+session leaves the document only after its own document and its members' memberships have been written (`store.py`).
 """
 
 from __future__ import annotations
@@ -103,9 +103,9 @@ class Unmatched(Record, frozen=True):
 class Decisions(Record, frozen=True):
     """The document of decisions.
 
-    `renewed`: when the document was made anew, because it could not be read. Then some sessions may be half written,
-    and the document does not name them. Until the sweep has finished them, no session is proposed, and no participant
-    becomes unmatched.
+    `renewed`: when this document replaced one that could not be read. Then some sessions may be half written, and this
+    document does not name them. Until the sweep has finished them, no session is proposed, and no participant becomes
+    unmatched.
 
     `version` counts the document's versions. It makes each version's bytes unique, and so its ETag, which S3 makes of
     the content (S3 API Reference, "Object"). So a function that has read an earlier version cannot overwrite a later

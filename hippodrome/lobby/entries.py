@@ -29,7 +29,7 @@ FOLDER = "_lobby/"
 PRESENT = timedelta(seconds=10)
 """A participant counts as present for this time after a request. The lobby's page sends one every two seconds."""
 REMEMBERED = timedelta(seconds=30)
-"""For this time after a request a participant keeps the time at which they came; later their waiting begins anew."""
+"""For this time after a request a participant keeps the time at which they came; later their waiting begins again."""
 DELETED = timedelta(seconds=60)
 """Entries of this age are deleted: well after `REMEMBERED`, so that no request under way still writes one of them."""
 NO_TRAIT = "-"  # the trait of all participants, if `matching` needs none
@@ -79,13 +79,13 @@ class Departure:
 
 @dataclass(frozen=True)
 class Entries:
-    """The entries in the lobby's folder, as one listing has them.
+    """The entries in the lobby's folder, as one listing shows them.
 
     A participant who has left and not come back is in `left`, not in `waiting`.
     """
 
     waiting: Mapping[str, Waiting] = field(default_factory=dict)  # by label
-    confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # labels, by the proposal's id
+    confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # by the proposal's id: who has confirmed it
     left: Mapping[str, Departure] = field(default_factory=dict)  # by label
     under_way: frozenset[str] = frozenset()
     done: frozenset[str] = frozenset()  # ids of sessions, and labels of unmatched participants
@@ -122,9 +122,9 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
             done.add(is_done[1])
             continue
         found = _NAME.fullmatch(name)
-        age = now - entry.modified
         if found is None:
             continue
+        age = now - entry.modified
         label, is_way, kind, text, joined, trait = found.groups()
         if age >= (way if is_way else DELETED):
             outdated.append(entry.key)

@@ -50,7 +50,7 @@ from hippodrome.storage.repository import Repository
 from protocol.answer import UNMATCHED
 
 SEEN_ANEW = timedelta(seconds=1)
-"""A request writes its participant's entry anew only if the entry is older than this."""
+"""A request writes its participant's entry again only if the entry is older than this."""
 DELETED_AT_ONCE = 5
 """How many old entries one request deletes at most."""
 Answers = Callable[[], Mapping[str, Any]]
@@ -58,7 +58,7 @@ Answers = Callable[[], Mapping[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class LobbyState:
-    """The lobby as the page of a participant who waits shows it."""
+    """The state of the lobby, as the page of a waiting participant shows it."""
 
     here: int  # participants who could play together, this one included
     seconds: float  # since the participant came
@@ -191,8 +191,8 @@ class Lobby:
 
         Returns the ids of all sessions that the lobby lists afterwards. If a session is not among them and has no
         document, its server is left over. To find such servers, the caller must list the servers before this call, and
-        look for the documents after it. If the document of decisions cannot be read, it is made anew, empty. Raises
-        `RetryLater` and the errors of the documents.
+        look for the documents after it. If the document of decisions cannot be read, it is replaced by an empty one.
+        Raises `RetryLater` and the errors of the documents.
         """
         return self._repair.run(project)
 
@@ -305,7 +305,7 @@ class Lobby:
         own_key = lobby_entries.waiting_key(project.id, one)
         self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != own_key and ".yes." not in key)
-        self._store.delete(others)  # the entries that they left, are under way, or wait on another page
+        self._store.delete(others)  # which say that they have left, are under way, or wait on another page
         return entries.with_waiting(one)
 
     def _confirm(self, project: Project, me: _Asker, proposal: Proposal, entries: Entries) -> Entries:

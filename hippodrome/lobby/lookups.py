@@ -72,8 +72,8 @@ class Lookups:
         """Read the records of the servers that this participant's request may give to sessions.
 
         The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
-        started ahead. Then it has that server. If no other session waits before theirs, it also has some servers of
-        open sessions; and more of these, if the session's own server has ended.
+        started ahead. Then it has the record of that server. If no other session has waited for longer, it also has the
+        records of some open sessions' servers, and of more of them if the session's own server has ended.
         """
         formed = known.formed_of(label)
         own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
@@ -107,7 +107,7 @@ class Lookups:
     def _members(
         self, project: Project, proposals: Sequence[Proposal], entries: Entries
     ) -> tuple[Mapping[str, Sequence[Matched]], Collection[str]]:
-        """The members of each session that can be formed, by the proposal's id; and the ids of the other proposals.
+        """By the proposal's id, the members of each session that can be formed; and the ids of the other proposals.
 
         A session cannot be formed if a member has left, or has a membership already (a late request of a second tab may
         have brought them back into the lobby), or if the project has been registered with another number of players

@@ -1,7 +1,7 @@
 """Asks the function `match` of agent.py who plays with whom, by documents that servers read and write (`questions.py`).
 
 A server without members answers (`trial/server/matching.py`). The function is the researcher's code, so the document of
-its answer may hold anything: the rules use only those of its sessions that are possible.
+its answer may hold anything: the rules use only the possible sessions in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hippodrome.storage.errors import RetryLater
 from protocol.keys import groups_folder, groups_key, questions_folder, waiting_key
 
 FORGOTTEN = timedelta(minutes=5)
-"""Older questions and answers are deleted: a question is asked anew after seconds."""
+"""Older questions and answers are deleted. Nobody needs them: a question is asked again after seconds."""
 
 
 class Matcher:

@@ -28,8 +28,8 @@ def choose(
 ) -> list[Sequence[Waiting]]:
     """Return the sessions to propose, at most `PROPOSED_AT_ONCE`.
 
-    `free` are the participants who are in no session, in the order of arrival; `chosen`, the sessions that the function
-    `match` has chosen, by their members' labels.
+    `free` are the participants who are in no session, in the order of arrival. `chosen` are the sessions that the
+    function `match` has chosen, each as its members' labels.
     """
     over = [one for one in free if patience_is_over(one.joined, project, now)]
     with_policies = project.after_patience == "policies"
@@ -47,7 +47,7 @@ def choose(
 
 
 def _of_match(free: Sequence[Waiting], project: Project, chosen: Sequence[Sequence[str]]) -> list[Sequence[Waiting]]:
-    """Those of the chosen sessions that have `players` different members, all of whom are free."""
+    """The chosen sessions that have `players` different members, all of whom are free."""
     waiting = {one.label: one for one in free}
     sessions: list[Sequence[Waiting]] = []
     for labels in chosen:
@@ -71,7 +71,7 @@ def _of_one_trait(free: Sequence[Waiting], players: int) -> list[Sequence[Waitin
 
 
 def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[Sequence[Waiting]]:
-    """Full sessions, in the order of arrival, with no trait more often than it may be in one session."""
+    """Full sessions, in the order of arrival. In none of them is a trait more often than it may be."""
     most = traits.most_of_one(project)
     by_trait: dict[str, deque[Waiting]] = {}
     for one in free:
@@ -100,7 +100,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
 def _short_sessions(
     free: Sequence[Waiting], over: Sequence[Waiting], sessions: Iterable[Sequence[Waiting]], project: Project
 ) -> list[Sequence[Waiting]]:
-    """A session for each participant in `over` who is in none: with others who are free, or alone."""
+    """A session for each participant in `over` who is in no session yet: with others who are free, or alone."""
     taken = {one.label for members in sessions for one in members}
     found: list[Sequence[Waiting]] = []
     for one in over:

@@ -24,9 +24,9 @@ from hippodrome.model.records import Record, from_json, to_json
 WAITED_STEPS = 5
 """The seconds to a multiple of which waiting times are rounded down. A question is asked again as often."""
 ANSWERED_WITHIN = timedelta(seconds=10)
-"""A question without an answer is asked anew after this: a server looks every two seconds, and `match` has five."""
+"""A question without an answer is asked again after this time: servers look every two seconds, `match` has five."""
 MOST_WAITING = 200
-"""The most participants in one question: those who came first."""
+"""The most participants in one question. If more wait, the question has the participants who came first."""
 MOST_CAME = 200
 """The most further participants in the document. Others are added by a later request, when there is room."""
 MOST_ANSWERS = 16 * 1024
@@ -62,7 +62,7 @@ class _Groups(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class MatchAnswer:
-    """The possible sessions of an answer. `problem`: a sentence on the first impossible one, "" if there is none."""
+    """The possible sessions in an answer. `problem` says what is wrong with the first impossible one, if any."""
 
     sessions: Sequence[Sequence[str]] = ()
     problem: str = ""

@@ -36,10 +36,11 @@ def decide(
     """Drop proposals that have fallen apart, and propose sessions of participants who are present and in no session.
 
     `known` is the document as it was read before the listing `entries` was made; None: `document` itself. Proposals
-    that are not in `known` stay, and participants who stood in `known` are not proposed now: the listing is too old to
-    judge both. `chosen` are the sessions, by labels, that the function `match` has chosen; with `matching: match` only
-    possible ones among them are proposed. `new_id` makes the id of a proposal, and of its session unless that gets an
-    open session. An open session can be used for `open_for` after its server was requested.
+    that are not in `known` stay, since they are newer than the listing. Participants who stand in `known` are not
+    proposed now, since the listing may be too old to say whether they are free. `chosen` are the sessions that the
+    function `match` has chosen, each as its members' labels; with `matching: match` no others are proposed. `new_id`
+    makes the id of a proposal, and of its session unless that gets an open session. An open session can be used for
+    `open_for` after its server was requested.
     """
     seen = known if known is not None else document
     settled = _without_fallen(document, entries, seen, now)
@@ -88,7 +89,7 @@ def number_here(document: Decisions, entries: Entries, project: Project, label: 
 
 
 def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
-    """The document without those of the proposals in `seen` that have fallen apart."""
+    """The document without the proposals in `seen` that have fallen apart."""
     before = {each.id for each in seen.proposed}
     fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
     return without_proposals(document, fallen)

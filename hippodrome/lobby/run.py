@@ -37,7 +37,7 @@ class StartedAhead:
         return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
 
     def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:
-        """Return the document after these servers have been given to the sessions that wait for one."""
+        """Return the document after these servers have been given to the sessions that wait for a server."""
         return servers_ahead.with_ready_servers(
             document, self.ready, self.over, now, coming=self.coming, open_for=open_for
         )
@@ -50,7 +50,7 @@ class LobbyRun:
     project: Project
     known: Decisions
     entries: Entries
-    members: Mapping[str, Sequence[Matched]]  # of the sessions that this run can form, by the proposal's id
+    members: Mapping[str, Sequence[Matched]]  # by proposal: the members of each session that this run can form
     broken: Collection[str]  # the proposals of sessions that cannot be formed
     now: datetime
     open_for: timedelta

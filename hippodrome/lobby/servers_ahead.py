@@ -13,7 +13,7 @@ from hippodrome.lobby.entries import Entries
 from hippodrome.model.project import Project
 
 SERVER_WITHIN = timedelta(minutes=5)
-"""If no server is ready for a session within this time, the session keeps the one that it waits for."""
+"""If no server is ready for a session within this time, the session keeps the server that it waits for."""
 
 
 def sessions_wanted(document: Decisions, entries: Entries, project: Project, also: Collection[str] = ()) -> int:
@@ -70,7 +70,7 @@ def with_ready_servers(
     servers = [each.waits_for for each in sessions if each.waits_for]
     opened = list(document.open)
     usable = {each.id for each in opened if each.is_usable(each.players, now, open_for)}
-    left = len({*usable, *(each.id for each in servers)} & set(ready))  # of those that are ready
+    left = len({*usable, *(each.id for each in servers)} & set(ready))  # ready servers that no session has got yet
     given: dict[tuple[str, ...], str] = {}  # by the labels of a session, the id of its server
     for at, session in enumerate(sessions):
         players = servers[at].players
@@ -113,8 +113,8 @@ def surplus(
 ) -> frozenset[str]:
     """Return the ids of the open sessions to remove.
 
-    These are the sessions that can no longer be used, those in `over`, and those beyond `wanted`: the ones whose
-    servers were requested last, since they take longest to be ready.
+    They are the sessions that can no longer be used, the sessions in `over`, and all but `wanted` of the others. Of the
+    others, the sessions stay whose servers were requested first, since these will be ready first.
     """
     usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
     return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])

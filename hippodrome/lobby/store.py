@@ -27,7 +27,7 @@ from protocol.session import BadSession, SessionDocument
 from protocol.times import time_text
 
 FORMED_LATELY = timedelta(hours=1)
-"""Sessions formed within this time may not be written completely. Older ones are, at the latest by a sweep."""
+"""Sessions formed within this time may not be written completely. A sweep has completed all older sessions."""
 
 
 class LobbyStore:
@@ -42,7 +42,7 @@ class LobbyStore:
     # Decisions
 
     def read(self, project: Project) -> Decisions:
-        """Return the document of decisions. If it cannot be read, it is made anew, empty."""
+        """Return the document of decisions. If it cannot be read, replace it by an empty one."""
         try:
             return self._shared.read(decisions.key(project.id), Decisions)
         except (ValueError, RecursionError) as error:
@@ -61,7 +61,7 @@ class LobbyStore:
     # Entries
 
     def entries(self, project: Project, label: str | None = None) -> Entries:
-        """Return the entries in the lobby: those of all participants, or of the one with this label.
+        """Return the entries of all participants in the lobby, or of the participant with this label.
 
         A participant counts as under way as long as the server that was started ahead for them can be used. So a
         participant who never comes costs no second server. AWS calls: one listing.

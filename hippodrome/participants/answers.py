@@ -51,11 +51,10 @@ class Answers:
         return answers or {}
 
     def repeats(self, project: Project, user_id: str, progress: Progress, answers: Mapping[str, Any]) -> bool:
-        """Return whether these answers equal those of a step that was answered within the last minute.
+        """Return whether these answers, of a form that names no step, repeat the answers to a step of the last minute.
 
-        They are those of a form that names no step. Simultaneous requests get the same result: `progress` has every
-        answer before the due step, and answers never change. AWS calls: one read for each answer of that minute, at
-        most `participant.MAX_COMPARED`.
+        Simultaneous requests get the same result: `progress` has every answer before the due step, and answers never
+        change. AWS calls: one read for each answer of that minute, at most `participant.MAX_COMPARED`.
         """
         recent = progress.recently_answered(project, self._platform.now())
         earlier = (self.read(project.id, user_id, key) for key in recent)

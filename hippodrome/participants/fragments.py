@@ -1,7 +1,7 @@
 """Prepares a researcher's step page for the frame, and fills values into it (`sandbox.py`).
 
-The researcher's text stays unchanged, byte for byte, except for a few tags. Those of a whole document (`<html>`,
-`<body>`, `<form>` …) are dropped. Relative addresses, of pictures for example, are changed to those of the project's
+The researcher's text stays unchanged, byte for byte, except for a few tags. Tags of a whole document (`<html>`,
+`<body>`, `<form>` …) are dropped. Relative addresses, of pictures for example, become addresses of the project's
 files. Scripts get the nonce without which no browser runs them. All of this happens before values are filled in, so a
 tag in a value gets neither a nonce nor another address.
 """

@@ -155,7 +155,7 @@ def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str,
 
 
 def allowed_sources(given: list[str]) -> list[str]:
-    """Return those of the sources that are valid. No value can add a directive to the policy."""
+    """Return the valid sources among the given ones. So no value can add a directive to the policy."""
     return [source for source in given if _SOURCE.fullmatch(source)]
 
 
@@ -214,7 +214,7 @@ _SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", 
 
 @cache
 def style(kind: str | None = None) -> str:
-    """Return `style.css` without what is only for other kinds of pages than this one: "step", "game" or "message".
+    """Return `style.css` without the sections for other kinds of pages. The kinds are "step", "game" and "message".
 
     For None, return all of it.
     """
@@ -240,7 +240,7 @@ def _sheet(name: str) -> str:
 
 @lru_cache(maxsize=16)
 def _joined(name: str, also: tuple[str, ...]) -> str:
-    """A script of `web/`, with the modules that it imports and those in `also`. It still has names of texts."""
+    """A script of `web/`, with the modules that it imports and the modules in `also`. It still has names of texts."""
     return _plain(name, scripts.join(WEB / name, also))
 
 

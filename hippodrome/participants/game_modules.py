@@ -43,7 +43,7 @@ TOGETHER = ("people.js", "lobby.js")
 
 
 def modules_of(project: Project) -> tuple[str, ...]:
-    """Return the names of the modules that a project needs besides `main.js` and those that it imports."""
+    """Return the names of the modules that a project needs besides `main.js` and its imports."""
     own = tuple(name for name, needed in MODULES.items() if needed(project.trial))
     own += OWN_WORDS if Texts(project.texts).of_server() else ()
     return own + TOGETHER if project.has_sessions else own

@@ -56,7 +56,7 @@ class GameView:
     page: str  # the page's own address, to which its form is sent too
     ticket: str
     sources: str  # the sources in the Content-Security-Policy to which the game may connect
-    # the researcher's pages that the game page shows, each with its values, by the key of `trial` that names it
+    # the researcher's pages that the game page shows: by the key of `trial` that names a page, its text and its values
     texts: Mapping[str, tuple[str, Mapping[str, Any]]] = field(default_factory=dict)
     files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 

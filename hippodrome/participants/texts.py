@@ -2,7 +2,7 @@
 
 A page contains neither names nor a table of texts, which would be more than a tenth of the game page's script. In a
 script, `TEXT.start` becomes `"Start"`, and `TEXT.seconds(left)` becomes `` `${left} seconds` ``. The expression between
-the brackets is evaluated as often as the text has its place, so it must have no effect but its value.
+the brackets is evaluated as often as its placeholder is in the text, so it must have no effect but its value.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Finds the cause why a server failed from ECS's words, and explains it to researchers and administrators. Pure.
+"""Finds out from ECS's words why a server failed, and explains it to researchers and administrators. Pure.
 
 Wordings (ECS Developer Guide, "Stopped task error messages" and "API failure reasons", API Reference, `Task`, and
 events of real tasks; read November 2026). `stopCode` is one of TaskFailedToStart, EssentialContainerExited,
@@ -170,7 +170,7 @@ _EXPLANATIONS = {
     Cause.UNKNOWN: _Explanation(
         FailureCategory.AWS,
         "AWS ended the server for a reason that Hippodrome does not know.",
-        "The console of ECS tells it for an hour, among the cluster's stopped tasks.",
+        "For an hour the console of ECS shows it, among the cluster's stopped tasks.",
     ),
 }
 
@@ -221,7 +221,7 @@ def cause_of_refusal(error: NoCapacity | Refused) -> Cause:
 def parse_cause(written: str) -> Cause | None:
     """Return the cause that a server's record names.
 
-    The result is None if the record names none, or one that only a later version knows.
+    The result is None if the record names no cause, or a cause that this version does not know.
     """
     return Cause(written) if written in set(Cause) else None
 

@@ -114,7 +114,7 @@ class DnsRecords:
         return unregistered
 
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
-        """Give servers their default name if the zone refuses theirs; return those that cannot be renamed."""
+        """Give servers their default name if the zone refuses theirs; return the servers that cannot be renamed."""
         for record in servers:
             logger.error(
                 "the zone refuses a server's name", extra={"server": record.name, "usual": record.has_default_name}
@@ -234,7 +234,7 @@ class DnsRecords:
     def _complete(self, servers: Mapping[ServerAttempt, int]) -> None:
         """Mark these servers ready; delete the DNS records of servers that were closed or drained before.
 
-        `servers` has, by server, the number of checks so far.
+        `servers` maps each server to the number of checks so far.
         """
         late, failed = for_each(
             self._platform,

@@ -28,11 +28,11 @@ class LeftoverReason(StrEnum):
 
 @dataclass(frozen=True)
 class Scope:
-    """The resources that a caller may remove. By default: those of closed servers, and of replaced attempts."""
+    """The resources that a caller may remove. By default: resources of closed servers, and of replaced attempts."""
 
-    closed_by: datetime | None = None  # only those of servers that were closed until this time
-    project_id: str | None = None  # only those of this project's servers
-    without_record: bool = False  # also those that no record owns, where only this installation's resources can be
+    closed_by: datetime | None = None  # only resources of servers that were closed until this time
+    project_id: str | None = None  # only resources of this project's servers
+    without_record: bool = False  # also resources without an owner, if only this installation can have created them
     labels: frozenset[str] = frozenset()  # the labels of an erased participant's servers, whose resources all go
     names: frozenset[str] = frozenset()  # the names of the warm servers that were assigned to that participant
 
@@ -81,7 +81,7 @@ def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Leftov
 
 
 def leftovers(found: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
-    """Return the resources that are left over. `owners` has, by a resource's name, the record that owns it."""
+    """Return the resources that are left over. `owners` maps a resource's name to the record that owns it."""
 
     def keep(name: str, *, ours: bool = False) -> bool:
         return why_left_over(name, owners.get(name), scope, ours=ours) is not None

@@ -1,7 +1,7 @@
 """Lists the resources of servers: their tasks, DNS records, timers and clusters.
 
-The sweep and the commands `stop`, `erase` and `destroy` use it. Each resource has the name of its server, from which
-the record that owns it is found (`hippodrome.model.server.owner`). Callers must list first and read the records
+The sweep and the commands `stop`, `erase` and `destroy` use it. Each resource has the name of its server, and by
+that name its owner's record is found (`hippodrome.model.server.owner`). Callers must list first and read the records
 afterwards: a record is written before its server's resources are created, so every listed resource has its record.
 """
 
@@ -43,7 +43,7 @@ class Resources:
         return [kind.removesuffix("s") for kind, number in self.counts().items() if number]
 
     def names(self) -> Iterator[str]:
-        """Yield the name of each resource. A name need not be that of a server."""
+        """Yield the name of each resource. Not every name is the name of a server."""
         yield from (task.name for task in self.tasks)
         yield from (ids.host_server(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)
@@ -53,7 +53,7 @@ class Resources:
         """Return the resources whose names `keep` accepts.
 
         `ours` decides instead for resources that only this installation can have created: tasks in its cluster, and
-        timers. The hosted zone and the account's other clusters may hold those of another installation.
+        timers. The hosted zone and the account's other clusters may hold resources of another installation.
         """
         ours = ours or keep
         return replace(

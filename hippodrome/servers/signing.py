@@ -5,9 +5,9 @@ handover document if it is a warm server, and the recordings of its participant'
 recordings, and create and read the answers of its game steps. The credential is derived from the installation's secret
 (`secret.py`). It is not the token, which the participant's browser knows.
 
-A session's server may also read the session's document. Its answers are those of the members whom that document names.
-Its recordings are the session's. With `matching: match`, as long as it has no members, it may read the question to the
-function `match` of agent.py, and create the document of the answer.
+A session's server may also read the session's document. Its answers are the answers of the members whom that document
+names, and its recordings are the session's. With `matching: match`, as long as it has no members, it may read the
+question to the function `match` of agent.py, and create the document of the answer.
 
 A server's rights follow from its record. For some minutes after the record is closed, the server may still store data,
 so that an answer given before the stop message is not lost.
@@ -185,7 +185,7 @@ class ServerAccess:
         return self.is_recording(wanted.key) and wanted.size <= MAX_RECORDING
 
     def is_recording(self, key: str) -> bool:
-        """Return whether the key is that of one of its own recordings."""
+        """Return whether this is the key of one of the server's own recordings."""
         return (
             not self.is_unassigned
             and key.startswith(self.folder)
@@ -197,7 +197,7 @@ class ServerAccess:
         return self.may_match and self.is_sessions and not self.members and self.closed is None
 
     def _is_groups(self, key: str) -> bool:
-        """Whether the key is that of an answer of the function `match`, and this server may write one."""
+        """Whether this is the key of an answer of the function `match`, and this server may write such an answer."""
         question = key.removeprefix(groups_folder(self.project_id)).removesuffix(".json")
         is_key = QUESTION_ID.fullmatch(question) is not None and key == groups_key(self.project_id, question)
         return self._is_asked_to_match and is_key
@@ -216,7 +216,7 @@ class ServerAccess:
         return any(key == answer_key(self.project_id, user, step) for user in players for step in self.game_steps)
 
     def _is_earlier(self, key: str) -> bool:
-        """Whether the key is that of a recording of an earlier server of the same participant or session."""
+        """Whether this is the key of a recording of an earlier server of the same participant or session."""
         if not key.startswith(self._recordings):
             return False
         name, _, file = key.removeprefix(self._recordings).partition("/")

@@ -2,8 +2,8 @@
 
 Resources are listed first and records read afterwards. A record is written before its server's resources are created,
 so a listed resource whose record is closed is a leftover: there is no race, and no need to guess by its age. Resources
-of three kinds stay: those of a server that was closed since the sweep began (the function that closed it deletes them),
-those whose name is no server's name, and those without a record in our bucket (they may be another installation's).
+of three kinds stay: if their server was closed after the sweep began (the function that closed it deletes them), if
+their name is no server's name, or if our bucket has no record of them (they may be another installation's).
 """
 
 from __future__ import annotations

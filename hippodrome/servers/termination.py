@@ -71,10 +71,10 @@ class Termination:
         return again + changed
 
     def _stop_once(self, wanted: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
-        """Stop servers; return the messages that failed, and those whose server's record was changed at the same time.
+        """Stop servers; return the messages that failed, and the messages for servers whose record has just changed.
 
-        The caller repeats the latter from the beginning: the change may have added a task or an address. The queue
-        would deliver them again only after its visibility timeout.
+        The caller handles the second kind once more from the beginning: the change may have added a task or an address.
+        The queue would deliver these messages again only after its visibility timeout.
         """
         found, again = for_each(self._platform, wanted, self._stop_task, "a server is not stopped yet")
         closing = _each_once(found)

@@ -74,7 +74,7 @@ class GameStep:
         return replace(visit, project=before) if before else visit
 
     def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:
-        """Those pages of an earlier registration that still exist."""
+        """The pages of an earlier registration that still exist."""
         project, cache = visit.project, self._services.project_cache
         return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
 

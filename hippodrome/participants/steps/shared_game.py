@@ -79,7 +79,7 @@ class SharedGame:
     def state_alone(
         self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
     ) -> dict[str, Any] | None:
-        """Return the state for a page that was made when one player was registered; None if one player never was.
+        """Return the state for a page that was made when one player was registered; None if that was never so.
 
         If the participant has no server of their own, the state is `ended`: the page is loaded again, and is then the
         page of the lobby or of the participant's session. AWS calls: one read.
