@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import signal
+import socket
 import ssl
 import subprocess
 import sys
@@ -681,8 +682,7 @@ def test_a_nonce_may_be_refused_a_limited_number_of_times(tmp_path, times, troub
 
 
 def test_an_authority_that_does_not_answer_is_unreachable(tmp_path):
-    with authority(acme((200, {}, b""))) as directory:
-        pass
-    with pytest.raises(OrderFailed) as failed:
-        alone(tmp_path).obtain(RenewalRequest(DOMAIN, directory))
+    with socket.socket() as silent, pytest.raises(OrderFailed) as failed:
+        silent.bind(("127.0.0.1", 0))  # it holds the port without listening, so no server of another test gets the port
+        alone(tmp_path).obtain(RenewalRequest(DOMAIN, f"http://127.0.0.1:{silent.getsockname()[1]}/dir"))
     assert failed.value.reason is FailureReason.UNREACHABLE
