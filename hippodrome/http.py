@@ -205,6 +205,14 @@ class Response:
         }
 
 
+class Refusal(Exception):
+    """A request is refused with this HTTP status and this sentence, which repeats nothing of the request."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status, self.text = status, text
+
+
 def html(status: int, text: str, headers: Mapping[str, str] | None = None) -> Response:
     """Return a response with a page."""
     return Response(status, text, {"Content-Type": "text/html; charset=utf-8", **(headers or {})})

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl
 
-from hippodrome.http import Request
+from hippodrome.http import Refusal, Request
 from hippodrome.model.texts import ENGLISH, Texts
 
 MAX_BODY = 256 * 1024  # bytes
@@ -19,15 +19,15 @@ JSON = "application/json"
 STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"  # the hidden fields
 
 
-class BadForm(Exception):
+class BadForm(Refusal):
     """The form is refused. `status` is the HTTP status, `text` the reason in English.
 
     `name` is the name of that text, if studies may have their own words for it (`model/texts.py`).
     """
 
     def __init__(self, status: int, text: str = "", *, name: str = "") -> None:
-        self.status, self.text, self._name = status, text or ENGLISH[name], name
-        super().__init__(self.text)
+        super().__init__(status, text or ENGLISH[name])
+        self._name = name
 
     def reason(self, texts: Texts) -> str:
         """Return the reason in the study's own words if it has a name, otherwise in English."""

@@ -15,13 +15,13 @@ from datetime import timedelta
 from typing import Any
 
 from hippodrome import http
-from hippodrome.http import Request, Response
+from hippodrome.http import Refusal, Request, Response
 from hippodrome.model import ids, participant
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server, requestable_attempt
 from hippodrome.participants import forms, previews
-from hippodrome.participants.forms import BadForm, PostedForm
+from hippodrome.participants.forms import PostedForm
 from hippodrome.ports import Platform, Topic
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
@@ -35,15 +35,6 @@ NO_PROOF = (
     "the answer of /next), or the server's token. A step of the study starts and stops servers without any request: "
     "see startServerStep and stopServerStep in its config.yml."
 )
-
-
-class Refusal(Exception):
-    """A relay refuses the request with this HTTP status and sentence."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-        self.text = text
 
 
 class Relays:
@@ -73,7 +64,7 @@ class Relays:
             form = _form(request)
             project, user_id = self._participant_of(request, form)
             act(project, user_id, form)
-        except (Refusal, BadForm) as refusal:
+        except Refusal as refusal:
             return _answer(refusal.status, refusal.text)
         return _answer(200 if request.method == "GET" else 202, "Accepted.")
 
@@ -145,7 +136,7 @@ class Relays:
 
 
 def _form(request: Request) -> PostedForm:
-    """The fields in the body of a POST, or in the query of a GET. Raises `Refusal` or `BadForm`."""
+    """The fields in the body of a POST, or in the query of a GET. Raises `Refusal`."""
     if request.method == "POST":
         return forms.read(request) if request.body else PostedForm({})
     if request.method != "GET":

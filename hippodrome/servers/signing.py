@@ -29,7 +29,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from hippodrome.certificates.rules import location
-from hippodrome.http import Request, Response
+from hippodrome.http import Refusal, Request, Response
 from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.records import from_json
@@ -119,15 +119,6 @@ class SigningRequest(msgspec.Struct, frozen=True):
     server: str
     credential: str
     requests: list[DocumentRequest]
-
-
-class SigningRefusal(Exception):
-    """The request is refused with this HTTP status and sentence, which repeats nothing of the request."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-        self.text = text
 
 
 @dataclass(frozen=True)
@@ -273,14 +264,14 @@ class Signing:
             asked = _read(request)
             access = self._authenticate(asked)
             signed = self._sign(access, asked.requests)
-        except SigningRefusal as refusal:
+        except Refusal as refusal:
             return _json(refusal.status, {"message": refusal.text})
         requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
         return _json(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
-        """The access of the server with this credential. Raises the same `SigningRefusal` for any mistake."""
-        refused = SigningRefusal(403, "That is not the credential of a server that may store anything now.")
+        """The access of the server with this credential. Raises the same `Refusal` for any mistake."""
+        refused = Refusal(403, "That is not the credential of a server that may store anything now.")
         label, attempt = ids.parse_server_name(asked.server) or ("", 0)
         secret = self._secrets.find() if label else None
         stored = self._repository.server(label) if secret else None
@@ -310,10 +301,10 @@ class Signing:
         return ServerAccess(name, record.project_id, certificate=certificate)
 
     def _sign(self, access: ServerAccess, asked: Sequence[DocumentRequest]) -> list[Presigned]:
-        """Sign all requests. Raises `SigningRefusal` and signs none if one of them is not allowed."""
+        """Sign all requests. Raises `Refusal` and signs none if one of them is not allowed."""
         if not all(access.allows(wanted) for wanted in asked):
             logger.warning("a server asked for a document that is not its own", extra={"server": access.name})
-            raise SigningRefusal(403, "That is none of this server's documents.")
+            raise Refusal(403, "That is none of this server's documents.")
         announced = [
             wanted.size or 0 for wanted in asked if wanted.method is Method.PUT and access.is_recording(wanted.key)
         ]
@@ -321,7 +312,7 @@ class Signing:
             stored = [entry.size for entry in self._platform.documents.list(access.folder)]
             if len(stored) + len(announced) > MAX_RECORDINGS or sum(stored) + sum(announced) > MAX_RECORDED:
                 logger.error("a server has stored too much", extra={"server": access.name})
-                raise SigningRefusal(
+                raise Refusal(
                     403, f"A server may store {MAX_RECORDINGS} recordings and {MAX_RECORDED // 1024**3} GB, no more."
                 )
         signer = self._platform.signer
@@ -339,15 +330,15 @@ def _json(status: int, data: Any) -> Response:
 
 
 def _read(request: Request) -> SigningRequest:
-    """Parse the body, which may be hostile. Raises `SigningRefusal`."""
+    """Parse the body, which may be hostile. Raises `Refusal`."""
     if request.method != "POST":
-        raise SigningRefusal(405, "Use POST.")
+        raise Refusal(405, "Use POST.")
     if request.body is None or len(request.body) > MAX_BODY:
-        raise SigningRefusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
+        raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
     try:
         asked = from_json(request.body, SigningRequest)
     except (ValueError, RecursionError):
-        raise SigningRefusal(400, "The body must be JSON with server, credential and requests.") from None
+        raise Refusal(400, "The body must be JSON with server, credential and requests.") from None
     if not 0 < len(asked.requests) <= MAX_REQUESTS:
-        raise SigningRefusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")
+        raise Refusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")
     return asked
