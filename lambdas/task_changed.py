@@ -19,7 +19,7 @@ def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     dns = DnsRecords(services)
     follow_ups = [(i, m) for i, m in found if isinstance(m, messages.DnsChanged)]
     events = [(i, m) for i, m in found if isinstance(m, messages.TaskChanged)]
-    failed = queue.all_at_once(follow_ups, lambda batch: dns.dns_changed(*batch))
+    failed = queue.all_at_once(follow_ups, dns.dns_changed)
     failed += queue.all_at_once([(i, m) for i, m in events if m.status == "RUNNING"], dns.tasks_running)
     failed += queue.all_at_once([(i, m) for i, m in events if m.status in ENDED], Termination(services).tasks_ended)
     queue.report_failures(services)

@@ -34,7 +34,7 @@ class Servers:
 
     def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
         """Do what `task_changed` does for its own messages; return those that should be delivered again."""
-        return self._dns.dns_changed(*messages)
+        return self._dns.dns_changed(messages)
 
     def stop(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
         """Do what `stop_server` does for a batch; return the messages that should be delivered again."""

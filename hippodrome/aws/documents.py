@@ -63,8 +63,9 @@ class S3Documents:
         self.bucket = bucket
 
     def get(self, key: str, known: Document | None = None) -> Document | None:
-        """Return the document; None if it is missing; `known` itself if it has not changed (304). AWS calls: one
-        GetObject.
+        """Return the document; None if it is missing; `known` itself if it has not changed since (304).
+
+        AWS calls: one GetObject.
         """
         condition = {"IfNoneMatch": known.etag} if known else {}
         try:

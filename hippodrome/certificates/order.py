@@ -74,8 +74,8 @@ def new_account_key() -> dict[str, Any]:
 
 
 def txt_name(domain: str) -> str:
-    """Return the name of the TXT record that proves `domain` and `*.domain`."""
-    return f"{acme_challenges.DNS01.LABEL}.{domain.removeprefix('*.')}"
+    """Return the name of the TXT record that proves control of `domain` and `*.domain`."""
+    return f"{acme_challenges.DNS01.LABEL}.{domain}"
 
 
 def order(

@@ -53,7 +53,7 @@ SEEN_ANEW = timedelta(seconds=1)
 """A request writes its participant's entry again only if the entry is older than this."""
 DELETED_AT_ONCE = 5
 """How many old entries one request deletes at most."""
-Answers = Callable[[], Mapping[str, Any]]
+ReadAnswers = Callable[[], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class _Asker:
     label: str
     user_id: str
     group: int | None
-    answers: Answers
+    answers: ReadAnswers
 
 
 class Lobby:
@@ -104,7 +104,7 @@ class Lobby:
     # Participants
 
     def visit(
-        self, project: Project, user_id: str, group: int | None, answers: Answers
+        self, project: Project, user_id: str, group: int | None, answers: ReadAnswers
     ) -> LobbyState | NoServerYet | Membership:
         """Handle a request of a participant at the game step.
 

@@ -167,13 +167,13 @@ class DnsRecords:
         self._written[after.server.label, after.server.attempt] = after
         return after.server
 
-    def dns_changed(self, *messages: DnsChanged) -> list[DnsChanged]:
+    def dns_changed(self, batch: Sequence[DnsChanged]) -> list[DnsChanged]:
         """Mark the servers of changes that are INSYNC `ready`; return the messages that should be delivered again.
 
         All messages are handled at once, because running tasks in the same batch wait for their DNS records.
         """
-        unmade = [message for message in messages if message.unmade]
-        made = [message for message in messages if not message.unmade]
+        unmade = [message for message in batch if message.unmade]
+        made = [message for message in batch if not message.unmade]
         in_sync, again = for_each(self._platform, made, self._check, "a DNS change could not be checked")
         again += self._retry_create(unmade) if unmade else []
         try:

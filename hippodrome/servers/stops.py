@@ -30,10 +30,8 @@ class Stops:
 
     def handle(self, batch: Sequence[StopServer | StopUser]) -> list[StopServer | StopUser]:
         """Stop servers; return the messages that should be delivered again."""
-        again: list[StopServer | StopUser] = []
-        again += self._termination.stop([message for message in batch if isinstance(message, StopServer)])
-        again += self._stop_everywhere([message for message in batch if isinstance(message, StopUser)])
-        return again
+        again = self._termination.stop([message for message in batch if isinstance(message, StopServer)])
+        return [*again, *self._stop_everywhere([message for message in batch if isinstance(message, StopUser)])]
 
     def _stop_everywhere(self, batch: Sequence[StopUser]) -> list[StopUser]:
         """Stop the open servers of these participants; return the messages that should be delivered again."""

@@ -61,13 +61,13 @@ class Termination:
 
         What belongs to a server is ended in this order: task, DNS record, slot, cluster, the server's record, timer.
         """
-        wanted = list(dict.fromkeys(batch))  # a message may be in a batch twice
-        again, changed = self._stop_once(wanted)
-        for _ in range(STOP_TRIES - 1):
+        again: list[StopServer] = []
+        changed = list(dict.fromkeys(batch))  # a message may be in a batch twice
+        for _ in range(STOP_TRIES):
+            failed, changed = self._stop_once(changed)
+            again += failed
             if not changed:
                 break
-            more, changed = self._stop_once(changed)
-            again += more
         return again + changed
 
     def _stop_once(self, wanted: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
