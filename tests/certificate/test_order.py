@@ -682,7 +682,8 @@ def test_a_nonce_may_be_refused_a_limited_number_of_times(tmp_path, times, troub
 
 
 def test_an_authority_that_does_not_answer_is_unreachable(tmp_path):
-    with socket.socket() as silent, pytest.raises(OrderFailed) as failed:
+    with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))  # it holds the port without listening, so no server of another test gets the port
-        alone(tmp_path).obtain(RenewalRequest(DOMAIN, f"http://127.0.0.1:{silent.getsockname()[1]}/dir"))
+        with pytest.raises(OrderFailed) as failed:
+            alone(tmp_path).obtain(RenewalRequest(DOMAIN, f"http://127.0.0.1:{silent.getsockname()[1]}/dir"))
     assert failed.value.reason is FailureReason.UNREACHABLE
