@@ -33,6 +33,7 @@ Faults, one module for each level at which they are injected
     `power_cut`       a disk that loses what was not synced
 
 How much and how fast
+    `async_tests`     the hook with which tests may be coroutine functions
     `waiting`         `until` waits until a condition is true
     `quiet_log`       switches the log off for a block
     `exploration`     how many examples and cases `make test` and `make hunt` take

@@ -51,14 +51,10 @@ class TakesMessages:
         return self.websocket.close_code
 
 
-def play_to_the_end(server: Any, open_client: Any) -> None:
+async def play_to_the_end(server: Any, open_client: Any) -> None:
     """Let one client start the game of this server and watch it until the trial is over."""
-
-    async def play() -> None:
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        await client.say(command="start")
+        assert await client.closed() == 1000

@@ -17,6 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from testing import preloaded
+from testing.async_tests import pytest_pyfunc_call  # noqa: F401 - a hook
 from tests.trial.client_messages import TakesMessages
 from trial.pictures.frames import Decoder, Frame
 from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, PACKED_SCENE, SCENE, SceneDecoder

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from typing import Any
 
@@ -105,23 +104,18 @@ def test_words_are_heard_and_repeated_like_other_feedback() -> None:
 # ---- a real server
 
 
-def test_a_press_reaches_the_agent_and_is_recorded(launch: Any, open_client: Any, grid: Any) -> None:
+async def test_a_press_reaches_the_agent_and_is_recorded(launch: Any, open_client: Any, grid: Any) -> None:
     agent = grid().replace('"nan": float("nan")', '"heard": getattr(self, "word", None)')
     server = launch(agent, {"ui": UI, "startingFrameRate": 60, "actionSpace": ["noop", "up", "left"]})
-
-    async def play() -> Any:
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            await client.say(command="start")
-            await client.say(command="reallyGood")
-            await client.say(command="leftUp")
-            await client.until(lambda: client.errors)
-            seen = len(client.frames)
-            await client.until(lambda: len(client.frames) > seen + 5)
-            return client
-
-    client = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        await client.say(command="start")
+        await client.say(command="reallyGood")
+        await client.say(command="leftUp")
+        await client.until(lambda: client.errors)
+        seen = len(client.frames)
+        await client.until(lambda: len(client.frames) > seen + 5)
     assert client.controls["words"] == ["reallyGood"]
     assert client.controls["UI"] == ["left", "start", "reallyGood", "fire", "leftUp"]
     assert client.errors == ["unknown command 'leftUp'"]

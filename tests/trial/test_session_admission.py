@@ -32,106 +32,78 @@ from trial.server import assignment, handshake
 from trial.settings import TrialSettings
 
 
-def test_each_member_plays_the_player_of_their_seat(launch):
+async def test_each_member_plays_the_player_of_their_seat(launch):
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        async with member(server, "bert") as bert, member(server, "anna") as anna:
-            assert (anna.controls["player"], bert.controls["player"]) == ("left", "right")
-
-    asyncio.run(run())
+    async with member(server, "bert") as bert, member(server, "anna") as anna:
+        assert (anna.controls["player"], bert.controls["player"]) == ("left", "right")
 
 
-def test_a_member_cannot_play_in_the_place_of_another(launch, open_client):
+async def test_a_member_cannot_play_in_the_place_of_another(launch, open_client):
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        await refused(server, open_client, userId="bert", token=member_token(TOKEN, "anna"))
-        await refused(server, open_client, userId="anna", token=member_token(TOKEN, "bert"))
-        await refused(server, open_client, userId=None, token=member_token(TOKEN, "anna"))
-        async with member(server, "anna", seat=1, player="right") as anna:
-            assert anna.controls["player"] == "left", "whoever names a seat keeps their own"
-
-    asyncio.run(run())
+    await refused(server, open_client, userId="bert", token=member_token(TOKEN, "anna"))
+    await refused(server, open_client, userId="anna", token=member_token(TOKEN, "bert"))
+    await refused(server, open_client, userId=None, token=member_token(TOKEN, "anna"))
+    async with member(server, "anna", seat=1, player="right") as anna:
+        assert anna.controls["player"] == "left", "whoever names a seat keeps their own"
 
 
-def test_no_token_lets_in_a_participant_who_is_no_member(launch, open_client):
+async def test_no_token_lets_in_a_participant_who_is_no_member(launch, open_client):
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        await refused(server, open_client, **hello_of("carl"))
-        await refused(server, open_client, userId="carl", token=member_token(TOKEN, "anna"))
-        await refused(server, open_client, userId="", token=member_token(TOKEN, ""))
-        await refused(server, open_client, userId=SID, token=member_token(TOKEN, SID))
-
-    asyncio.run(run())
+    await refused(server, open_client, **hello_of("carl"))
+    await refused(server, open_client, userId="carl", token=member_token(TOKEN, "anna"))
+    await refused(server, open_client, userId="", token=member_token(TOKEN, ""))
+    await refused(server, open_client, userId=SID, token=member_token(TOKEN, SID))
 
 
-def test_the_servers_own_token_opens_no_session(launch, open_client):
+async def test_the_servers_own_token_opens_no_session(launch, open_client):
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(refused(server, open_client, userId="anna", token=TOKEN))
+    await refused(server, open_client, userId="anna", token=TOKEN)
 
 
-def test_a_token_of_another_session_opens_nothing(launch, open_client):
+async def test_a_token_of_another_session_opens_nothing(launch, open_client):
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(refused(server, open_client, userId="anna", token=member_token("another-server", "anna")))
+    await refused(server, open_client, userId="anna", token=member_token("another-server", "anna"))
 
 
-def test_a_participant_whose_data_were_erased_is_no_member_any_more(launch, open_client):
+async def test_a_participant_whose_data_were_erased_is_no_member_any_more(launch, open_client):
     server = launch_session(launch, trial={"substitute": "idle"})
     form(server.store, document(("anna", "")))
-
-    async def run():
-        await refused(server, open_client, **hello_of("bert"))
-        await refused(server, open_client, userId="", token=member_token(TOKEN, ""))
-        async with member(server, "anna"):
-            pass
-
-    asyncio.run(run())
+    await refused(server, open_client, **hello_of("bert"))
+    await refused(server, open_client, userId="", token=member_token(TOKEN, ""))
+    async with member(server, "anna"):
+        pass
 
 
-def test_without_a_substitute_the_game_ends_if_the_data_of_a_member_were_erased(launch):
+async def test_without_a_substitute_the_game_ends_if_the_data_of_a_member_were_erased(launch):
     """As if that participant had left: the others do not wait for a game that cannot begin."""
     server = launch_session(launch)
     form(server.store, document(("anna", "")))
-
-    async def run():
-        async with member(server, "anna") as anna:
-            assert await anna.closed() == 1000
-            assert anna.done["outcome"] == "partnerLeft"
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna:
+        assert await anna.closed() == 1000
+        assert anna.done["outcome"] == "partnerLeft"
     assert server.wait() == 0
     assert answer(server.store, "anna")["answers"]["episodes"] == 0
 
 
-def test_the_score_of_a_game_with_a_member_whose_data_were_erased_counts_for_the_others(launch):
+async def test_the_score_of_a_game_with_a_member_whose_data_were_erased_counts_for_the_others(launch):
     first = launch_session(launch)
     form(first.store)
-
-    async def play():
-        async with member(first, "anna") as anna, member(first, "bert") as bert:
-            await anna.say(action="up", held=True)
-            await wait_for_pictures(21, anna, bert)
-            first.terminate()
-            await asyncio.gather(anna.closed(), bert.closed())
-
-    asyncio.run(play())
+    async with member(first, "anna") as anna, member(first, "bert") as bert:
+        await anna.say(action="up", held=True)
+        await wait_for_pictures(21, anna, bert)
+        first.terminate()
+        await asyncio.gather(anna.closed(), bert.closed())
     assert first.wait() == 0
     [lines] = recordings(first.store).values()
     put(first.store, f"study/sessions/{SID}/session.json", document(("anna", "")).to_json())
     second = launch_session(launch, SERVER="pair-2")
-
-    async def go_on():
-        async with member(second, "anna") as anna:
-            assert await anna.closed() == 1000
-
-    asyncio.run(go_on())
+    async with member(second, "anna") as anna:
+        assert await anna.closed() == 1000
     assert second.wait() == 0
     found = answer(second.store, "anna")["answers"]
     steps = [line for line in lines if line["kind"] == "step"]
@@ -160,48 +132,36 @@ def test_whatever_a_client_says_only_a_member_with_their_own_token_gets_in(user_
         assert admitted(member_token(TOKEN, other)) is (user_id == other)
 
 
-def test_a_second_tab_replaces_the_members_own_and_no_other(launch):
+async def test_a_second_tab_replaces_the_members_own_and_no_other(launch):
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        async with member(server, "anna") as first, member(server, "bert") as bert, member(server, "anna") as second:
-            assert await first.closed() == 4409
-            assert "another tab" in first.errors[-1]
-            assert second.controls["player"] == "left"
-            await bert.watch(0.3)
-            assert bert.websocket.close_code is None
-
-    asyncio.run(run())
+    async with member(server, "anna") as first, member(server, "bert") as bert, member(server, "anna") as second:
+        assert await first.closed() == 4409
+        assert "another tab" in first.errors[-1]
+        assert second.controls["player"] == "left"
+        await bert.watch(0.3)
+        assert bert.websocket.close_code is None
 
 
-def test_two_browsers_with_one_members_link_are_one_member(launch):
+async def test_two_browsers_with_one_members_link_are_one_member(launch):
     """The browser that opened it last plays; the other place stays the other member's."""
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        async with contextlib.AsyncExitStack() as stack:
-            clients = [await stack.enter_async_context(member(server, "anna")) for _ in range(3)]
-            assert {client.controls["player"] for client in clients} == {"left"}
-            assert [await client.closed() for client in clients[:2]] == [4409, 4409]
-
-    asyncio.run(run())
+    async with contextlib.AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(member(server, "anna")) for _ in range(3)]
+        assert {client.controls["player"] for client in clients} == {"left"}
+        assert [await client.closed() for client in clients[:2]] == [4409, 4409]
 
 
-def test_a_members_token_opens_nothing_for_programs(launch):
+async def test_a_members_token_opens_nothing_for_programs(launch):
     server = launch_session(launch, trial={"gym": "watch"})
     form(server.store)
-
-    async def run():
-        async with connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None) as program:
-            await program.wait_closed()
-            assert program.close_code == 4401
-
-    asyncio.run(run())
+    async with connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None) as program:
+        await program.wait_closed()
+        assert program.close_code == 4401
 
 
-def test_a_program_needs_the_servers_token_and_a_formed_session(launch):
+async def test_a_program_needs_the_servers_token_and_a_formed_session(launch):
     server = launch_session(launch, trial={"gym": "watch"})
 
     async def watch(code):
@@ -213,49 +173,33 @@ def test_a_program_needs_the_servers_token_and_a_formed_session(launch):
                 await program.wait_closed()
                 assert program.close_code == code
 
-    asyncio.run(watch(1013))
+    await watch(1013)
     form(server.store)
-
-    async def run():
-        async with member(server, "anna"):
-            await watch(None)
-
-    asyncio.run(run())
+    async with member(server, "anna"):
+        await watch(None)
 
 
-def test_a_members_token_makes_no_environments(launch):
+async def test_a_members_token_makes_no_environments(launch):
     server = launch_session(launch, trial={"gym": "environments"})
-
-    async def run():
-        with pytest.raises(InvalidStatus) as refusal:
-            await connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None)
-        assert refusal.value.response.status_code == 401
-
-    asyncio.run(run())
+    with pytest.raises(InvalidStatus) as refusal:
+        await connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None)
+    assert refusal.value.response.status_code == 401
 
 
-def test_a_page_without_a_token_never_gets_into_a_session(launch, open_client):
+async def test_a_page_without_a_token_never_gets_into_a_session(launch, open_client):
     page = "https://front.example"
     server = launch_session(launch, PLAIN_ORIGINS=page)
     form(server.store)
-
-    async def run():
-        async with open_client(server.address, subprotocols=None, origin=page) as client:
-            await client.hello(userId="anna", token=None)
-            assert await client.closed() == 4401
-
-    asyncio.run(run())
+    async with open_client(server.address, subprotocols=None, origin=page) as client:
+        await client.hello(userId="anna", token=None)
+        assert await client.closed() == 4401
 
 
-def test_a_client_without_a_subprotocol_never_gets_into_a_session(launch, open_client):
+async def test_a_client_without_a_subprotocol_never_gets_into_a_session(launch, open_client):
     """What such a client sends along is recorded: it could write another participant's id into the recording."""
     server = launch_session(launch)
     form(server.store)
-
-    async def run():
-        async with open_client(server.address, subprotocols=None) as client:
-            await client.hello(**hello_of("anna"))
-            assert await client.closed() == 4401
-            assert "subprotocol" in client.errors[-1]
-
-    asyncio.run(run())
+    async with open_client(server.address, subprotocols=None) as client:
+        await client.hello(**hello_of("anna"))
+        assert await client.closed() == 4401
+        assert "subprotocol" in client.errors[-1]

@@ -35,58 +35,46 @@ from trial.settings import TrialSettings
 # ---- two game steps
 
 
-def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client):
+async def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client):
     server = launch_session(launch, GAME_STEPS="3,5")
     form(server.store)
-
-    async def run():
-        await both_play(server)
-        async with member(server, "anna", step="5") as anna, member(server, "bert", step="5") as bert:
-            assert "another step's game" in await refused(server, open_client, 4404, **hello_of("bert", step="3"))
-            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
-            await bert.say(command="stop")
-            assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
-
-    asyncio.run(run())
+    await both_play(server)
+    async with member(server, "anna", step="5") as anna, member(server, "bert", step="5") as bert:
+        assert "another step's game" in await refused(server, open_client, 4404, **hello_of("bert", step="3"))
+        await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
+        await bert.say(command="stop")
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
     assert server.wait() == 0
     assert all(answer(server.store, each, step)["answers"]["session"] == SID for each in MEMBERS for step in "35")
 
 
-def test_a_member_cannot_open_a_later_game_step_before_their_answer_to_the_one_before(launch, open_client):
+async def test_a_member_cannot_open_a_later_game_step_before_their_answer_to_the_one_before(launch, open_client):
     """Else a member whose client names another step could keep the others out of their own."""
     server = launch_session(launch, GAME_STEPS="3,5")
     form(server.store)
-
-    async def run():
-        early = hello_of("bert", step="5")
-        assert "an earlier game step" in await refused(server, open_client, 4404, **early)
-        await both_play(server)
-        async with member(server, "bert", step="5"):
-            pass
-
-    asyncio.run(run())
+    early = hello_of("bert", step="5")
+    assert "an earlier game step" in await refused(server, open_client, 4404, **early)
+    await both_play(server)
+    async with member(server, "bert", step="5"):
+        pass
 
 
-def test_the_next_server_knows_which_members_have_answered_an_earlier_game_step(launch, open_client):
+async def test_the_next_server_knows_which_members_have_answered_an_earlier_game_step(launch, open_client):
     server = launch_session(launch, GAME_STEPS="3,5", SERVER="pair-2")
     form(server.store)
     put(server.store, "study/users/anna/answers/3.json", b'{"answers": {}}')
-
-    async def run():
-        assert "an earlier game step" in await refused(server, open_client, 4404, **hello_of("bert", step="5"))
-        async with member(server, "anna", step="5"):
-            pass
-
-    asyncio.run(run())
+    assert "an earlier game step" in await refused(server, open_client, 4404, **hello_of("bert", step="5"))
+    async with member(server, "anna", step="5"):
+        pass
 
 
 # ---- what it leaves behind
 
 
-def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launch):
+async def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launch):
     server = launch_session(launch, trial={"seed": 3})
     form(server.store, document(group=1))
-    asyncio.run(both_play(server))
+    await both_play(server)
     assert server.wait() == 0
     anna, bert = (answer(server.store, each) for each in MEMBERS)
     for found in (anna, bert):
@@ -102,7 +90,7 @@ def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launch):
     assert "user" not in lines[0]
 
 
-def test_recordings_and_log_hold_no_members_id(launch):
+async def test_recordings_and_log_hold_no_members_id(launch):
     """If the researcher's code raises an error that contains an id, the error is recorded without the id."""
     members, said = ("Participant-One", "Participant-Two"), "no Participant-Two here"
     broken = two_players(act="pass").replace(
@@ -111,16 +99,12 @@ def test_recordings_and_log_hold_no_members_id(launch):
     broken += f"\n\nclass Agent(Agent):\n    def on_join(self, session, player):\n        raise KeyError('{said}')\n"
     server = launch_session(launch, agent=broken, trial={"maxEpisodes": 2})
     form(server.store, document(members))
-
-    async def run():
-        async with member(server, members[0]) as one, member(server, members[1]) as two:
-            await one.say(command="start")
-            await two.until(lambda: two.errors)
-            await two.say(command="pause")
-            server.terminate()
-            await one.closed()
-
-    asyncio.run(run())
+    async with member(server, members[0]) as one, member(server, members[1]) as two:
+        await one.say(command="start")
+        await two.until(lambda: two.errors)
+        await two.say(command="pause")
+        server.terminate()
+        await one.closed()
     server.wait()
     written = json.dumps(recordings(server.store))
     assert "ValueError" in server.log_text()
@@ -133,10 +117,10 @@ def test_recordings_and_log_hold_no_members_id(launch):
     assert f"KeyError: '{hidden}'" in written
 
 
-def test_a_members_folder_holds_only_their_answer(launch):
+async def test_a_members_folder_holds_only_their_answer(launch):
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(both_play(server))
+    await both_play(server)
     server.wait()
     found = {path.relative_to(server.store).as_posix() for path in server.store.rglob("*") if path.is_file()}
     assert found == {
@@ -147,43 +131,35 @@ def test_a_members_folder_holds_only_their_answer(launch):
     }
 
 
-def test_a_game_step_that_all_members_have_answered_is_not_played_again(launch):
+async def test_a_game_step_that_all_members_have_answered_is_not_played_again(launch):
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(both_play(server))
+    await both_play(server)
     assert server.wait() == 0
     kept = {each: answer(server.store, each) for each in MEMBERS}
     again = launch_session(launch, SERVER="pair-2", LINGER_SECONDS="4")  # the second member has come by then
-
-    async def run():
-        async with member(again, "anna") as anna, member(again, "bert") as bert:
-            assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
-            assert anna.done["score"] == kept["anna"]["answers"]["score"]
-            assert bert.done["score"] == kept["bert"]["answers"]["score"]
-            assert not anna.frames
-
-    asyncio.run(run())
+    async with member(again, "anna") as anna, member(again, "bert") as bert:
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+        assert anna.done["score"] == kept["anna"]["answers"]["score"]
+        assert bert.done["score"] == kept["bert"]["answers"]["score"]
+        assert not anna.frames
     assert again.wait() == 0
     assert {each: answer(server.store, each) for each in MEMBERS} == kept
     assert not recordings(server.store, "pair-2")
 
 
-def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_next_one(launch):
+async def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_next_one(launch):
     """The server was lost between two answers: the stored answer stays, the missing one is stored."""
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(both_play(server))
+    await both_play(server)
     assert server.wait() == 0
     anna, bert = (answer(server.store, each) for each in MEMBERS)
     (server.store / "study/users/bert/answers/3.json").unlink()
     again = launch_session(launch, SERVER="pair-2")
-
-    async def run():
-        async with member(again, "bert") as client:
-            assert await client.closed() == 1000
-            assert client.done["score"] == bert["answers"]["score"]
-
-    asyncio.run(run())
+    async with member(again, "bert") as client:
+        assert await client.closed() == 1000
+        assert client.done["score"] == bert["answers"]["score"]
     assert again.wait() == 0
     assert answer(server.store, "anna") == anna, "an answer that exists is not written again"
     again_bert = answer(server.store, "bert")["answers"]
@@ -198,32 +174,32 @@ def recorder_of(tmp_path, *members):
     return Recorder(formed, "3", "the-trial", store, Spool(formed, store)), store
 
 
-def save_answers(recorder, answers):
+async def save_answers(recorder, answers):
     for each, said in answers.items():
-        asyncio.run(recorder.save_member(each, said))
+        await recorder.save_member(each, said)
 
 
-def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
+async def test_each_answer_is_created_once_with_the_members_own_group(tmp_path):
     recorder, _ = recorder_of(tmp_path, Member("anna", 0, 0), Member("bert", 1, 1))
     given = {"anna": {"score": 1, "player": "left"}, "bert": {"score": 2, "player": "right"}}
-    save_answers(recorder, given)
+    await save_answers(recorder, given)
     found = {each: answer(tmp_path, each) for each in MEMBERS}
     assert [found[each]["group"] for each in MEMBERS] == [0, 1]
     assert {each: found[each]["answers"] for each in MEMBERS} == {
         each: {**said, "session": SID} for each, said in given.items()
     }
-    save_answers(recorder, {each: {"score": 9} for each in MEMBERS})
+    await save_answers(recorder, {each: {"score": 9} for each in MEMBERS})
     assert {each: answer(tmp_path, each) for each in MEMBERS} == found
 
 
-def test_a_game_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
+async def test_a_game_step_is_over_when_each_member_has_an_answer_and_not_before(tmp_path):
     recorder, _ = recorder_of(tmp_path, Member("anna", None, 0), Member("", None, 1), Member("bert", None, 2))
-    assert asyncio.run(recorder.members_answers()) == {}
+    assert await recorder.members_answers() == {}
     bert = {"bert": {"score": 2, "session": SID}}
-    asyncio.run(recorder.save_member("bert", {"score": 2}))
-    assert asyncio.run(recorder.members_answers()) == bert
-    asyncio.run(recorder.save_member("anna", {"score": 1}))
-    assert asyncio.run(recorder.members_answers()) == bert | {"anna": {"score": 1, "session": SID}}
+    await recorder.save_member("bert", {"score": 2})
+    assert await recorder.members_answers() == bert
+    await recorder.save_member("anna", {"score": 1})
+    assert await recorder.members_answers() == bert | {"anna": {"score": 1, "session": SID}}
 
 
 # ---- a lost server
@@ -233,27 +209,23 @@ def steps(lines):
     return [line["step"] for line in lines if line["kind"] == "step"]
 
 
-def test_after_a_kill_the_game_goes_on_for_both_at_the_last_recorded_step(launch, tmp_path):
+async def test_after_a_kill_the_game_goes_on_for_both_at_the_last_recorded_step(launch, tmp_path):
     """A process that is killed leaves its recording in the spool, and the next process of that server stores it."""
     first = launch_session(launch, trial={"seed": 3})
     form(first.store)
-
-    async def killed():
-        async with member(first, "anna") as anna, member(first, "bert") as bert:
-            await anna.say(command="start")
-            await anna.say(action="up", lasts=None)
-            await wait_for_pictures(40, anna, bert)
-            first.process.kill()
-            await asyncio.gather(anna.closed(), bert.closed())
-
-    asyncio.run(killed())
+    async with member(first, "anna") as anna, member(first, "bert") as bert:
+        await anna.say(command="start")
+        await anna.say(action="up", lasts=None)
+        await wait_for_pictures(40, anna, bert)
+        first.process.kill()
+        await asyncio.gather(anna.closed(), bert.closed())
     folder = first.store / f"study/sessions/{SID}/trials/pair-1"
     (left,) = folder.glob("*.part")
     left.rename(left.with_suffix(""))  # as local mode does, and the next process with this server name
     (before,) = recordings(first.store).values()
     assert len(steps(before)) >= 10
     second = launch_session(launch, trial={"seed": 3}, SERVER="pair-2")
-    anna, bert = asyncio.run(both_play(second, 15))
+    anna, bert = await both_play(second, 15)
     assert second.wait() == 0
     (after,) = recordings(second.store, "pair-2").values()
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
@@ -266,17 +238,13 @@ def test_after_a_kill_the_game_goes_on_for_both_at_the_last_recorded_step(launch
 PLAY = ("left", "right")
 
 
-def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_process_stores(launch):
+async def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_next_process_stores(launch):
     first = launch_session(launch)
     form(first.store)
-
-    async def killed():
-        async with member(first, "anna") as anna, member(first, "bert") as bert:
-            await anna.say(command="start")
-            await wait_for_pictures(30, anna, bert)
-            first.process.kill()
-
-    asyncio.run(killed())
+    async with member(first, "anna") as anna, member(first, "bert") as bert:
+        await anna.say(command="start")
+        await wait_for_pictures(30, anna, bert)
+        first.process.kill()
     again = launch_session(launch)
     folder = first.store / f"study/sessions/{SID}/trials/pair-1"
     until(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")), 15)
@@ -302,11 +270,11 @@ Agent = Reporting
 
 
 @pytest.mark.parametrize("group", [None, 2])
-def test_the_agent_sees_the_session_and_its_group_and_no_participants_id(launch, group):
+async def test_the_agent_sees_the_session_and_its_group_and_no_participants_id(launch, group):
     agent = two_players() + REPORTING
     server = launch_session(launch, agent=agent, trial={})
     form(server.store, document(group=group))
-    asyncio.run(both_play(server))
+    await both_play(server)
     server.wait()
     (lines,) = recordings(server.store).values()
     reset = next(line for line in lines if line["kind"] == "reset")

@@ -22,50 +22,42 @@ def people_seen_by(client: Any) -> dict[str, str]:
     return found
 
 
-def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledgement_alone(launch):
+async def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledgement_alone(launch):
     server = launch_session(launch, trial={"startingFrameRate": 20})
     form(server.store)
-
-    async def run() -> None:
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await until_both_play(anna, bert)
-            await anna.until(lambda: len(anna.frames) > 5)
-            anna.acks = False
-            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "away"), 20)
-            assert bert.state["state"] == "paused"
-            held = len(bert.frames)
-            await anna.until(lambda: people_seen_by(anna).get("left") == "away")
-            await anna.say(ack=anna.frames[-1][1])
-            anna.acks = True
-            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "here"), 20)
-            await bert.until(lambda: bert.state["state"] == "playing" and len(bert.frames) > held + 5)
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await until_both_play(anna, bert)
+        await anna.until(lambda: len(anna.frames) > 5)
+        anna.acks = False
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "away"), 20)
+        assert bert.state["state"] == "paused"
+        held = len(bert.frames)
+        await anna.until(lambda: people_seen_by(anna).get("left") == "away")
+        await anna.say(ack=anna.frames[-1][1])
+        anna.acks = True
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "here"), 20)
+        await bert.until(lambda: bert.state["state"] == "playing" and len(bert.frames) > held + 5)
 
 
-def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launch):
+async def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launch):
     trial = {"startingFrameRate": 20, "substitute": "agent:Partner", "afterAbsent": "policy", "absent": 1}
     server = launch_session(launch, trial=trial)
     form(server.store)
-
-    async def run() -> None:
-        async with member(server, "bert") as bert:
-            async with member(server, "anna") as anna:
-                await until_both_play(anna, bert)
-            await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "policy"), 20)
-            await bert.until(lambda: bert.state["state"] == "playing")
-            seen = len(bert.frames)
-            await bert.until(lambda: len(bert.frames) > seen + 5)
-            async with member(server, "anna") as anna:
-                await anna.say(action="up", held=True)
-                seen = len(anna.frames)
-                await anna.until(lambda: len(anna.frames) > seen + 5)
-                assert people_seen_by(anna) == {"left": "here", "right": "here"}
-                await anna.say(command="stop")
-                await anna.until(lambda: anna.done)
-                await bert.until(lambda: bert.done)
-
-    asyncio.run(run())
+    async with member(server, "bert") as bert:
+        async with member(server, "anna") as anna:
+            await until_both_play(anna, bert)
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "policy"), 20)
+        await bert.until(lambda: bert.state["state"] == "playing")
+        seen = len(bert.frames)
+        await bert.until(lambda: len(bert.frames) > seen + 5)
+        async with member(server, "anna") as anna:
+            await anna.say(action="up", held=True)
+            seen = len(anna.frames)
+            await anna.until(lambda: len(anna.frames) > seen + 5)
+            assert people_seen_by(anna) == {"left": "here", "right": "here"}
+            await anna.say(command="stop")
+            await anna.until(lambda: anna.done)
+            await bert.until(lambda: bert.done)
     assert server.wait() == 0, server.log_text()
     lines = [line for found in recordings(server.store).values() for line in found]
     head = next(line for line in lines if line["kind"] == "header")
@@ -86,7 +78,7 @@ def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launc
 
 
 @pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
-def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
+async def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
     """Acknowledgements control the pace of a member's own pictures alone."""
     server = launch_session(launch, trial={"startingFrameRate": 20})
     form(server.store)
@@ -97,17 +89,14 @@ def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, fo
             await bert.say(ack=newest + (1000 if forged == "of what was not sent" else 0))
             await asyncio.sleep(0.02)
 
-    async def run():
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            bert.acks = False
-            tasks = [asyncio.create_task(forge(bert)), asyncio.create_task(bert.watch(60))]
-            await anna.until(lambda: len(anna.frames) > 10)
-            first = len(anna.frames)
-            while len(anna.frames) < first + 80:  # four seconds: after these, a page that does not answer is away
-                await anna.take()
-                assert anna.state["people"] == {"left": "here", "right": "here"}
-            for task in tasks:
-                task.cancel()
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        bert.acks = False
+        tasks = [asyncio.create_task(forge(bert)), asyncio.create_task(bert.watch(60))]
+        await anna.until(lambda: len(anna.frames) > 10)
+        first = len(anna.frames)
+        while len(anna.frames) < first + 80:  # four seconds: after these, a page that does not answer is away
+            await anna.take()
+            assert anna.state["people"] == {"left": "here", "right": "here"}
+        for task in tasks:
+            task.cancel()
     assert "Traceback" not in server.log_text()

@@ -40,29 +40,21 @@ WARM = {"SESSION": "", "SPARE": "on", "SERVER": "warm-1"}
 # ---- before the session is formed
 
 
-def test_no_client_is_let_in_before_the_session_is_formed(launch, open_client):
+async def test_no_client_is_let_in_before_the_session_is_formed(launch, open_client):
     server = launch_session(launch)
-
-    async def everybody():
-        assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
-        await refused(server, open_client, 1013, **hello_of("stranger"))
-        await refused(server, open_client, token="wrong", userId="anna")
-
-    asyncio.run(everybody())
+    assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
+    await refused(server, open_client, 1013, **hello_of("stranger"))
+    await refused(server, open_client, token="wrong", userId="anna")
     assert server.process.poll() is None
     assert not server.store.exists(), "nothing is recorded"
 
 
-def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_formed(launch, open_client):
+async def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_formed(launch, open_client):
     server = launch_session(launch)
-
-    async def run():
-        await refused(server, open_client, 1013, **hello_of("anna"))
-        form(server.store)
-        async with member(server, "anna") as client:
-            assert client.controls["player"] == "left"
-
-    asyncio.run(run())
+    await refused(server, open_client, 1013, **hello_of("anna"))
+    form(server.store)
+    async with member(server, "anna") as client:
+        assert client.controls["player"] == "left"
 
 
 def test_the_server_looks_for_the_session_by_itself(launch):
@@ -85,7 +77,7 @@ def test_a_session_whose_members_never_come_ends_the_server(launch):
     assert "ending: idle" in server.log_text()
 
 
-def test_a_member_who_comes_while_the_server_reads_old_recordings_is_not_sent_away(
+async def test_a_member_who_comes_while_the_server_reads_old_recordings_is_not_sent_away(
     tmp_path, open_client, monkeypatch, capsys
 ):
     (tmp_path / "agent.py").write_text(two_players())
@@ -100,20 +92,17 @@ def test_a_member_who_comes_while_the_server_reads_old_recordings_is_not_sent_aw
     monkeypatch.setattr(server, "_leftovers", slowly)
     monkeypatch.setattr("trial.server.server.set_environment", lambda *told: None)  # it would be that of the tests
 
-    async def run():
-        serving = asyncio.create_task(server.run())
-        while not (said := capsys.readouterr().out):
-            await asyncio.sleep(0.01)
-        async with open_client(f"ws://127.0.0.1:{json.loads(said)['port']}/") as client:
-            await client.hello(**hello_of("anna"))
-            await client.watch(0.3)
-            looks.set()
-            await client.until(lambda: client.controls)
-        server.end("enough")
-        assert await serving == 0
-
     monkeypatch.setattr("trial.server.server.exit_hard_after", lambda seconds: None)
-    asyncio.run(run())
+    serving = asyncio.create_task(server.run())
+    while not (said := capsys.readouterr().out):
+        await asyncio.sleep(0.01)
+    async with open_client(f"ws://127.0.0.1:{json.loads(said)['port']}/") as client:
+        await client.hello(**hello_of("anna"))
+        await client.watch(0.3)
+        looks.set()
+        await client.until(lambda: client.controls)
+    server.end("enough")
+    assert await serving == 0
 
 
 THIRD = """
@@ -137,14 +126,14 @@ Agent = Trio
 """
 
 
-def test_the_policies_of_all_groups_are_loaded_before_the_group_is_known(launch):
+async def test_the_policies_of_all_groups_are_loaded_before_the_group_is_known(launch):
     players = {"left": "human", "right": "human"}
     groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
     server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
     until(lambda: "the agent is ready" in server.log_text(), 15)
     assert "the third player's policy is made" in server.log_text()
     form(server.store, document(group=1))
-    asyncio.run(both_play(server))
+    await both_play(server)
     assert server.wait() == 0
     assert server.log_text().count("the third player's policy is made") == 1
     (lines,) = recordings(server.store).values()
@@ -174,67 +163,55 @@ def test_a_document_that_is_no_session_of_this_server_lets_no_client_in(name):
         assignment._read(settings, BAD[name])
 
 
-def test_a_bad_document_is_logged_once_and_a_good_one_is_taken_later(launch, open_client):
+async def test_a_bad_document_is_logged_once_and_a_good_one_is_taken_later(launch, open_client):
     server = launch_session(launch)
     put(server.store, f"study/sessions/{SID}/session.json", BAD["one seat twice"])
-
-    async def run():
-        for _ in range(2):
-            await refused(server, open_client, 1013, **hello_of("anna"))
-        assert server.log_text().count("cannot see whose this server is") == 1
-        form(server.store)
-        async with member(server, "anna"):
-            pass
-
-    asyncio.run(run())
+    for _ in range(2):
+        await refused(server, open_client, 1013, **hello_of("anna"))
+    assert server.log_text().count("cannot see whose this server is") == 1
+    form(server.store)
+    async with member(server, "anna"):
+        pass
     assert "anna" not in server.log_text()
 
 
 # ---- warm servers
 
 
-def test_a_warm_server_that_is_handed_to_a_session_plays_that_session(launch, open_client):
+async def test_a_warm_server_that_is_handed_to_a_session_plays_that_session(launch, open_client):
     server = launch_session(launch, **WARM)
-
-    async def run():
-        await refused(server, open_client, 1013, **hello_of("anna"))
-        put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
-        assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
-        await refused(server, open_client, userId="anna", token=TOKEN)
-        form(server.store)
-        await refused(server, open_client, **hello_of("carl"))
-        await both_play(server)
-
-    asyncio.run(run())
+    await refused(server, open_client, 1013, **hello_of("anna"))
+    put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
+    assert "not open yet" in await refused(server, open_client, 1013, **hello_of("anna"))
+    await refused(server, open_client, userId="anna", token=TOKEN)
+    form(server.store)
+    await refused(server, open_client, **hello_of("carl"))
+    await both_play(server)
     assert server.wait() == 0
     assert "this server is assigned to a session now" in server.log_text()
     assert {answer(server.store, each)["answers"]["session"] for each in MEMBERS} == {SID}
     assert recordings(server.store)
 
 
-def test_a_warm_server_that_is_handed_to_a_participant_takes_no_member_token(launch, open_client):
+async def test_a_warm_server_that_is_handed_to_a_participant_takes_no_member_token(launch, open_client):
     server = launch(trial={}, **{**WARM, "SESSION": "", "SPARE_SECONDS": "60", "USER_ID": ""})
-
-    async def run():
-        await refused(server, open_client, 1013, **hello_of("P1"))
-        put(server.store, handover_key("study", "warm-1"), Handover("P1", None, "a-1").to_json())
-        await refused(server, open_client, **hello_of("P1"))
-        async with open_client(server.address) as client:
-            await client.play()
-
-    asyncio.run(run())
+    await refused(server, open_client, 1013, **hello_of("P1"))
+    put(server.store, handover_key("study", "warm-1"), Handover("P1", None, "a-1").to_json())
+    await refused(server, open_client, **hello_of("P1"))
+    async with open_client(server.address) as client:
+        await client.play()
 
 
-def test_the_idle_time_begins_when_the_session_is_formed_not_at_the_handover(launch):
+async def test_the_idle_time_begins_when_the_session_is_formed_not_at_the_handover(launch):
     server = launch_session(launch, **WARM, IDLE_SECONDS="1", GRACE_SECONDS="1")
     time.sleep(0.5)
     put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
-    asyncio.run(make_the_server_look(server))
+    await make_the_server_look(server)
     until(lambda: "assigned to a session now" in server.log_text(), 15)
     time.sleep(1.5)
     assert server.process.poll() is None
     form(server.store)
-    asyncio.run(make_the_server_look(server))
+    await make_the_server_look(server)
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 
@@ -250,29 +227,21 @@ async def make_the_server_look(server):
 # ---- how long it stays
 
 
-def test_the_server_stays_while_a_member_is_connected_and_ends_when_all_are_gone(launch):
+async def test_the_server_stays_while_a_member_is_connected_and_ends_when_all_are_gone(launch):
     server = launch_session(launch, IDLE_SECONDS="1", GRACE_SECONDS="1")
-
-    async def run():
-        async with member(server, "anna", forms=True):
-            async with member(server, "bert"):
-                pass
-            await asyncio.sleep(2)
-            assert server.process.poll() is None
-
-    asyncio.run(run())
+    async with member(server, "anna", forms=True):
+        async with member(server, "bert"):
+            pass
+        await asyncio.sleep(2)
+        assert server.process.poll() is None
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 
 
-def test_a_server_does_not_wait_gather_seconds_for_members_who_all_left_before_the_game(launch):
+async def test_a_server_does_not_wait_gather_seconds_for_members_who_all_left_before_the_game(launch):
     server = launch_session(launch, trial={"gather": 300}, IDLE_SECONDS="1", GRACE_SECONDS="1")
-
-    async def run():
-        async with member(server, "anna", forms=True) as anna:
-            assert anna.controls["people"] == {"left": "here", "right": "awaited"}
-
-    asyncio.run(run())
+    async with member(server, "anna", forms=True) as anna:
+        assert anna.controls["people"] == {"left": "here", "right": "awaited"}
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 

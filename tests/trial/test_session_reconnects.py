@@ -23,26 +23,21 @@ async def connects(server, open_client, user_id):
     return None
 
 
-def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(launch, open_client):
+async def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(launch, open_client):
     server = launch_session(launch, trial=ON)
     form(server.store)
-
-    async def run():
-        async with member(server, "bert") as bert:
-            async with bert.reading():
-                codes, began = [], time.monotonic()
-                while codes.count(4429) < 100:
-                    codes.append(await connects(server, open_client, "anna"))
-                lasted = time.monotonic() - began
-            await bert.until(lambda: len(bert.frames) > 5)
-            assert bert.websocket.close_code is None
-            await asyncio.sleep(SECONDS_EACH)
-            async with member(server, "anna") as anna:
-                await anna.say(command="stop")
-                await asyncio.gather(anna.closed(), bert.closed())
-        return codes, lasted
-
-    codes, lasted = asyncio.run(run())
+    async with member(server, "bert") as bert:
+        async with bert.reading():
+            codes, began = [], time.monotonic()
+            while codes.count(4429) < 100:
+                codes.append(await connects(server, open_client, "anna"))
+            lasted = time.monotonic() - began
+        await bert.until(lambda: len(bert.frames) > 5)
+        assert bert.websocket.close_code is None
+        await asyncio.sleep(SECONDS_EACH)
+        async with member(server, "anna") as anna:
+            await anna.say(command="stop")
+            await asyncio.gather(anna.closed(), bert.closed())
     assert set(codes[:AT_ONCE]) == {None}
     assert codes.count(None) <= AT_ONCE + 1 + lasted / SECONDS_EACH
     (lines,) = recordings(server.store).values()
@@ -50,36 +45,28 @@ def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_
     assert len([line for line in of_anna if line["what"] in ("joined", "returned")]) <= codes.count(None) + 1
 
 
-def test_one_members_connections_are_not_counted_against_another(launch, open_client):
+async def test_one_members_connections_are_not_counted_against_another(launch, open_client):
     server = launch_session(launch, trial=ON)
     form(server.store)
-
-    async def run():
-        async with member(server, "anna") as anna, anna.reading():
-            while (code := await connects(server, open_client, "bert")) is None:
-                pass
-            async with member(server, "anna"):
-                return code
-
-    assert asyncio.run(run()) == 4429
+    async with member(server, "anna") as anna, anna.reading():
+        while (code := await connects(server, open_client, "bert")) is None:
+            pass
+        async with member(server, "anna"):
+            assert code == 4429
 
 
-def test_a_refused_connection_does_not_replace_the_one_that_plays(launch, open_client):
+async def test_a_refused_connection_does_not_replace_the_one_that_plays(launch, open_client):
     server = launch_session(launch, trial=ON)
     form(server.store)
-
-    async def run():
-        async with contextlib.AsyncExitStack() as stack:
-            newest, refused = None, None
-            while refused is None:
-                playing = newest
-                newest = await stack.enter_async_context(open_client(server.address))
-                await newest.hello(**hello_of("anna"))
-                try:
-                    await newest.until(lambda client=newest: client.controls)
-                except ConnectionClosed:
-                    refused = newest.websocket.close_code
-            await playing.watch(0.3)
-            return refused, playing.websocket.close_code
-
-    assert asyncio.run(run()) == (4429, None)
+    async with contextlib.AsyncExitStack() as stack:
+        newest, refused = None, None
+        while refused is None:
+            playing = newest
+            newest = await stack.enter_async_context(open_client(server.address))
+            await newest.hello(**hello_of("anna"))
+            try:
+                await newest.until(lambda client=newest: client.controls)
+            except ConnectionClosed:
+                refused = newest.websocket.close_code
+        await playing.watch(0.3)
+        assert refused, playing.websocket.close_code == (4429, None)

@@ -33,17 +33,13 @@ async def near_and_far(server, seconds):
         yield anna, bert
 
 
-def test_the_recording_holds_each_members_round_trips(launch):
+async def test_the_recording_holds_each_members_round_trips(launch):
     server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 5000})
     form(server.store)
-
-    async def run():
-        async with near_and_far(server, 0.3) as (anna, bert):
-            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
-            await anna.say(command="stop")
-            await asyncio.gather(anna.closed(), bert.closed())
-
-    asyncio.run(run())
+    async with near_and_far(server, 0.3) as (anna, bert):
+        await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
+        await anna.say(command="stop")
+        await asyncio.gather(anna.closed(), bert.closed())
     assert server.wait() == 0
     (lines,) = recordings(server.store).values()
     trips = {}
@@ -55,63 +51,51 @@ def test_the_recording_holds_each_members_round_trips(launch):
     assert trips["left"] < trips["right"]
 
 
-def test_a_member_who_is_too_far_away_and_the_others_are_told_so(launch):
+async def test_a_member_who_is_too_far_away_and_the_others_are_told_so(launch):
     server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700})
     form(server.store)
-
-    async def run():
-        async with near_and_far(server, 0.4) as (anna, bert):
-            assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
-            assert (anna.done["outcome"], bert.done["outcome"]) == ("partnerLeft", "ping")
-            assert anna.errors
-            assert bert.errors
-
-    asyncio.run(run())
+    async with near_and_far(server, 0.4) as (anna, bert):
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+        assert (anna.done["outcome"], bert.done["outcome"]) == ("partnerLeft", "ping")
+        assert anna.errors
+        assert bert.errors
     assert server.wait() == 0
     found = {each: answer(server.store, each)["answers"] for each in MEMBERS}
     assert {each: said["outcome"] for each, said in found.items()} == {"anna": "partnerLeft", "bert": "ping"}
     assert {said["session"] for said in found.values()} == {SID}
 
 
-def test_the_others_play_on_without_a_member_who_is_too_far_away(launch):
+async def test_the_others_play_on_without_a_member_who_is_too_far_away(launch):
     instead = {"substitute": "idle", "afterAbsent": "policy"}
     server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700, **instead})
     form(server.store)
-
-    async def run():
-        async with near_and_far(server, 0.4) as (anna, bert):
-            assert await bert.closed() == 1000
-            assert answer(server.store, "bert")["answers"]["outcome"] == "ping"
-            await anna.until(lambda: len(anna.frames) > 20)
-            assert not (server.store / "study/users/anna/answers/3.json").exists()
-            await anna.say(command="stop")
-            assert await anna.closed() == 1000
-
-    asyncio.run(run())
+    async with near_and_far(server, 0.4) as (anna, bert):
+        assert await bert.closed() == 1000
+        assert answer(server.store, "bert")["answers"]["outcome"] == "ping"
+        await anna.until(lambda: len(anna.frames) > 20)
+        assert not (server.store / "study/users/anna/answers/3.json").exists()
+        await anna.say(command="stop")
+        assert await anna.closed() == 1000
     assert server.wait() == 0
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
 
-def test_a_member_who_is_too_far_away_is_refused_in_the_later_games_too(launch):
+async def test_a_member_who_is_too_far_away_is_refused_in_the_later_games_too(launch):
     """They come to the next game before the others, who still play, and would be sent away again and again."""
     instead = {"substitute": "idle", "afterAbsent": "policy"}
     trial = {"pingSamples": 3, "maxPing": 150, "countdown": 0, **instead}
     server = launch_session(launch, trial=trial, GAME_STEPS="3,5,7")
     form(server.store)
     later = {"outcome": "ping", "player": "right", "session": SID}
-
-    async def run():
-        async with near_and_far(server, 0.15) as (anna, bert):
-            assert await bert.closed() == 1000
-            assert [answer(server.store, "bert", step)["answers"] for step in "57"] == [later, later]
-            await anna.until(lambda: len(anna.frames) > 5)
-            await anna.say(command="stop")
-            assert await anna.closed() == 1000
-        async with member(server, "anna", step="5") as anna:
-            await anna.until(lambda: anna.state.get("state") == "playing")
-            assert anna.state["people"]["right"] == "policy"
-
-    asyncio.run(run())
+    async with near_and_far(server, 0.15) as (anna, bert):
+        assert await bert.closed() == 1000
+        assert [answer(server.store, "bert", step)["answers"] for step in "57"] == [later, later]
+        await anna.until(lambda: len(anna.frames) > 5)
+        await anna.say(command="stop")
+        assert await anna.closed() == 1000
+    async with member(server, "anna", step="5") as anna:
+        await anna.until(lambda: anna.state.get("state") == "playing")
+        assert anna.state["people"]["right"] == "policy"
 
 
 class CountsPings(ClientConnection):
@@ -122,7 +106,7 @@ class CountsPings(ClientConnection):
         super().process_event(event)
 
 
-def test_only_a_session_sends_pings_of_its_own(launch):
+async def test_only_a_session_sends_pings_of_its_own(launch):
     """A server of one participant sends no ping of its own."""
 
     async def pings(server, hello, most=math.inf, seconds=2):
@@ -137,7 +121,7 @@ def test_only_a_session_sends_pings_of_its_own(launch):
             return websocket.pings
 
     alone = launch()
-    assert asyncio.run(pings(alone, {"userId": "P1", "token": TOKEN, "step": "3"})) == 0
+    assert await pings(alone, {"userId": "P1", "token": TOKEN, "step": "3"}) == 0
     server = launch_session(launch)
     form(server.store)
-    assert asyncio.run(pings(server, hello_of("anna"), 5, 20)) == 5
+    assert await pings(server, hello_of("anna"), 5, 20) == 5

@@ -1,6 +1,5 @@
 """The break between two episodes: the score is shown, no key acts, and the agent is not called."""
 
-import asyncio
 import time
 from itertools import groupby
 
@@ -118,20 +117,16 @@ async def play_until_the_break(client):
     return began
 
 
-def test_a_client_is_told_of_a_break_that_lasts_its_time(launch, open_client, grid):
+async def test_a_client_is_told_of_a_break_that_lasts_its_time(launch, open_client, grid):
     server = launch(grid(8), {"maxEpisodes": 3, "startingFrameRate": 60, "betweenEpisodes": 0.5})
-
-    async def play():
-        async with open_client(server.address) as client:
-            began = await play_until_the_break(client)
-            told = client.state
-            await client.until(lambda: client.state["state"] == "playing")
-            lasted = time.monotonic() - began
-            await client.until(lambda: client.done)
-            return client, told, lasted, time.monotonic() - launched
-
     launched = time.monotonic()
-    client, told, lasted, elapsed = asyncio.run(play())
+    async with open_client(server.address) as client:
+        began = await play_until_the_break(client)
+        told = client.state
+        await client.until(lambda: client.state["state"] == "playing")
+        lasted = time.monotonic() - began
+        await client.until(lambda: client.done)
+        elapsed = time.monotonic() - launched
     assert (told["episode"], told["score"], told["episodeScore"]) == (1, 12, 12)
     assert 0.3 < told["nextIn"] <= 0.5
     assert lasted > 0.5
@@ -150,7 +145,7 @@ def test_a_client_is_told_of_a_break_that_lasts_its_time(launch, open_client, gr
     assert [lines[-1]["why"] for lines in recorded.values()] == ["over", "over", "terminated"]
 
 
-def test_the_game_stands_still_in_a_break_and_feedback_belongs_to_the_episode_before(
+async def test_the_game_stands_still_in_a_break_and_feedback_belongs_to_the_episode_before(
     launch, open_client, grid, tmp_path
 ):
     calls = tmp_path / "calls.txt"
@@ -163,26 +158,21 @@ def test_the_game_stands_still_in_a_break_and_feedback_belongs_to_the_episode_be
         "    setattr(Agent, _name, _spied(_name, getattr(Agent, _name)))\n"
     )
     server = launch(grid(8) + spy, LONG)
-
-    async def play():
-        async with open_client(server.address) as client:
-            await play_until_the_break(client)
-            await client.until(lambda: client.frame[8, 8, 0] == 255)  # the picture of the last step
-            before, frames = calls.read_text(), len(client.frames)
-            await client.say(action="left", held=True)
-            await client.say(action="up")
-            await client.say(command="good")
-            await client.watch(0.4)
-            assert calls.read_text() == before
-            assert len(client.frames) == frames
-            await client.say(command="requestUI")
-            await client.until(lambda: "UI" in client.state)
-            assert 590 < client.state["nextIn"] < 600
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-            return client
-
-    client = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await play_until_the_break(client)
+        await client.until(lambda: client.frame[8, 8, 0] == 255)  # the picture of the last step
+        before, frames = calls.read_text(), len(client.frames)
+        await client.say(action="left", held=True)
+        await client.say(action="up")
+        await client.say(command="good")
+        await client.watch(0.4)
+        assert calls.read_text() == before
+        assert len(client.frames) == frames
+        await client.say(command="requestUI")
+        await client.until(lambda: "UI" in client.state)
+        assert 590 < client.state["nextIn"] < 600
+        await client.say(command="start")
+        await client.until(lambda: client.done)
     assert client.errors == []
     server.wait()
     assert calls.read_text().split().count("feedback") == 1
@@ -195,48 +185,38 @@ def test_the_game_stands_still_in_a_break_and_feedback_belongs_to_the_episode_be
 
 
 @pytest.mark.parametrize("how", ["pause", "disconnect"])
-def test_after_leaving_in_a_break_the_next_episode_waits(launch, open_client, grid, how):
+async def test_after_leaving_in_a_break_the_next_episode_waits(launch, open_client, grid, how):
     server = launch(grid(8), LONG)
-
-    async def play():
-        async with open_client(server.address) as client:
-            await play_until_the_break(client)
-            if how == "pause":
-                await client.say(command="pause")
-                await client.until(lambda: client.state["state"] == "paused")
-                assert client.state["episode"] == 2
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            if client.state["state"] != "paused" or client.state["episode"] != 2:
-                await client.until(lambda: client.state["state"] == "paused" and client.state["episode"] == 2)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-            return client
-
-    assert asyncio.run(play()).done["episodes"] == 2
+    async with open_client(server.address) as client:
+        await play_until_the_break(client)
+        if how == "pause":
+            await client.say(command="pause")
+            await client.until(lambda: client.state["state"] == "paused")
+            assert client.state["episode"] == 2
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        if client.state["state"] != "paused" or client.state["episode"] != 2:
+            await client.until(lambda: client.state["state"] == "paused" and client.state["episode"] == 2)
+        await client.say(command="start")
+        await client.until(lambda: client.done)
+        assert client.done["episodes"] == 2
 
 
 @pytest.mark.parametrize("kill", [True, False])
-def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(launch, open_client, grid, kill):
+async def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(launch, open_client, grid, kill):
     first = launch(grid(8), LONG, SERVER="a-1")
-
-    async def play():
-        async with open_client(first.address) as client:
-            await play_until_the_break(client)
-            await client.say(command="good")
-            if kill:
-                (part,) = first.store.rglob("*.part")
-                while kinds(recording.read(part.read_bytes()))[-1:] != [
-                    "end"
-                ]:  # the recording is written every half second
-                    await client.watch(0.05)
-                first.process.kill()
-            else:
-                first.terminate()
-                assert await client.closed() == 1001
-
-    asyncio.run(play())
+    async with open_client(first.address) as client:
+        await play_until_the_break(client)
+        await client.say(command="good")
+        if kill:
+            (part,) = first.store.rglob("*.part")
+            while kinds(recording.read(part.read_bytes()))[-1:] != ["end"]:  # it is written every half second
+                await client.watch(0.05)
+            first.process.kill()
+        else:
+            first.terminate()
+            assert await client.closed() == 1001
     first.wait()
     for part in first.store.rglob("*.part"):
         part.rename(part.with_suffix(""))
@@ -246,22 +226,17 @@ def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_episode(la
         assert lines[-1]["why"] == "shutdown"
         assert any(message.get("command") == "good" for message in lines[-1]["messages"])
     second = launch(grid(8), LONG, SERVER="a-2")
-
-    async def go_on():
-        async with open_client(second.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            assert (client.state["state"], client.state["episode"], client.state["score"]) == ("ready", 2, 12)
-            await client.say(command="start")
-            await client.until(lambda: client.done)
-            return client
-
-    client = asyncio.run(go_on())
+    async with open_client(second.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        assert (client.state["state"], client.state["episode"], client.state["score"]) == ("ready", 2, 12)
+        await client.say(command="start")
+        await client.until(lambda: client.done)
     assert client.errors == []
     assert client.done == {"done": True, "episodes": 2, "score": 24}
 
 
-def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client, grid):
+async def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client, grid):
     first = launch(grid(8), LONG, SERVER="a-1")
 
     async def play(server, start):
@@ -273,40 +248,32 @@ def test_a_stop_in_a_break_is_remembered_by_the_next_server(launch, open_client,
                 await client.hello()
             await client.until(lambda: client.done)
 
-    asyncio.run(play(first, True))
+    await play(first, True)
     first.wait()
     assert first.answer()["answers"]["outcome"] == "stopped"
     (first.store / "study/users/P1/answers/3.json").unlink()  # as if the server had been lost just before
     second = launch(grid(8), LONG, SERVER="a-2")
-    asyncio.run(play(second, False))
+    await play(second, False)
     assert second.answer()["answers"]["outcome"] == "stopped"
     assert second.answer()["answers"]["score"] == 12
 
 
-def test_the_deadline_ends_a_break(launch, open_client, grid):
+async def test_the_deadline_ends_a_break(launch, open_client, grid):
     server = launch(grid(8), LONG, DEADLINE=str(time.time() + 10))
-
-    async def play():
-        async with open_client(server.address) as client:
-            await play_until_the_break(client)
-            assert await client.closed() == 1001
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await play_until_the_break(client)
+        assert await client.closed() == 1001
     assert server.wait() == 0
     assert not server.answered()
 
 
-def test_a_client_without_the_subprotocol_plays_through_a_break(launch, open_client, grid):
+async def test_a_client_without_the_subprotocol_plays_through_a_break(launch, open_client, grid):
     server = launch(grid(8), {"maxEpisodes": 2, "startingFrameRate": 60, "betweenEpisodes": 0.3})
-
-    async def play():
-        async with open_client(server.address, subprotocols=None) as client:
-            await client.hello()
-            await client.say(command="start")
-            assert await client.closed() == 1000
-            return client
-
-    assert asyncio.run(play()).done == "done"
+    async with open_client(server.address, subprotocols=None) as client:
+        await client.hello()
+        await client.say(command="start")
+        assert await client.closed() == 1000
+        assert client.done == "done"
 
 
 def test_an_episode_is_over_if_its_last_step_is_recorded_but_not_its_end():

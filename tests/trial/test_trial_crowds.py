@@ -75,12 +75,11 @@ async def connect_and_play(server, open_client):
         await client.play(20)
 
 
-def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_client):
+async def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_client):
     """Silent and slow connections, and strangers who shake hands and say nothing: all at once, while the participant plays."""
     server = launch(HELLO_SECONDS="10")
     crowd = []
-
-    async def play():
+    try:
         async with open_client(server.address) as client:
             await client.play()
             before = memory(server)
@@ -96,9 +95,6 @@ def test_a_thousand_connections_do_not_keep_the_participant_out(launch, open_cli
             await client.until(lambda: len(client.frames) > seen + 20)
             assert memory(server) - before < 100_000_000
         await connect_and_play(server, open_client)
-
-    try:
-        asyncio.run(play())
     finally:
         cut = close_all(crowd)
     assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
@@ -125,14 +121,13 @@ def close_all(crowd):
     return cut
 
 
-def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client, tmp_path):
+async def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client, tmp_path):
     """asyncio keeps 256 KB for each, however little it says."""
     chain = put(tmp_path / "store" / "ssl", 1)
     server = launch(**KEYS)
     trusted = ssl.create_default_context(cadata=chain.decode())
     crowd = []
-
-    async def play():
+    try:
         async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
             await client.play()
             before = memory(server)
@@ -145,28 +140,21 @@ def test_a_thousand_silent_connections_with_tls_cost_little(launch, open_client,
             assert memory(server) - before < 100_000_000
         async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
             await client.play()
-
-    try:
-        asyncio.run(play())
     finally:
         cut = close_all(crowd)
     assert cut >= 1000 - MAX_UNAUTHENTICATED_SOCKETS
     assert "Traceback" not in server.log_text()
 
 
-def test_a_connection_that_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
+async def test_a_connection_that_says_nothing_before_tls_is_cut_off(launch, open_client, tmp_path):
     chain = put(tmp_path / "store" / "ssl", 1)
     server = launch(HELLO_SECONDS="3", **KEYS)
     crowd = [
         connect(server.port, first) for first in (SILENT, b"\x16\x03\x01", b"GET / HTTP/1.1\r\n\r\n") for _ in range(20)
     ]
     trusted = ssl.create_default_context(cadata=chain.decode())
-
-    async def play():
-        async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
-            await client.play()
-
-    asyncio.run(play())
+    async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
+        await client.play()
     for connection in crowd:
         connection.settimeout(15)
         with contextlib.suppress(ConnectionError):
@@ -176,7 +164,7 @@ def test_a_connection_that_says_nothing_before_tls_is_cut_off(launch, open_clien
     assert "Traceback" not in server.log_text()
 
 
-def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
+async def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
     """The server reads the size in the header, and keeps nothing of such a frame; in fragments they are refused, too."""
     server = launch()
     before = memory(server)
@@ -188,11 +176,11 @@ def test_giant_frames_are_refused_before_they_arrive(launch, open_client):
     ):
         assert send_frames(server.port, *frames)[0] == 1009
     assert memory(server) - before < 20_000_000
-    asyncio.run(connect_and_play(server, open_client))
+    await connect_and_play(server, open_client)
     assert "Traceback" not in server.log_text()
 
 
-def test_frames_that_break_the_protocol_close_the_connection(launch, open_client):
+async def test_frames_that_break_the_protocol_close_the_connection(launch, open_client):
     server = launch()
     for frame, code in (
         (masked(9, b"x" * 200), 1002),  # a ping of more than 125 bytes
@@ -204,7 +192,7 @@ def test_frames_that_break_the_protocol_close_the_connection(launch, open_client
         (masked(1, b"\xff\xfe"), 1007),
     ):
         assert send_frames(server.port, frame)[0] == code, frame
-    asyncio.run(connect_and_play(server, open_client))
+    await connect_and_play(server, open_client)
 
 
 def test_compressed_frames_are_not_agreed_to(launch):
@@ -215,7 +203,7 @@ def test_compressed_frames_are_not_agreed_to(launch):
     assert code == 1002
 
 
-def test_a_flood_of_pings_or_tiny_fragments_ends_the_connection(launch, open_client):
+async def test_a_flood_of_pings_or_tiny_fragments_ends_the_connection(launch, open_client):
     server = launch(HELLO_SECONDS="2")
     before = memory(server)
     code, _ = send_frames(
@@ -223,11 +211,11 @@ def test_a_flood_of_pings_or_tiny_fragments_ends_the_connection(launch, open_cli
     )
     assert code in (4408, 1009, 1006, None)
     assert memory(server) - before < 50_000_000
-    asyncio.run(connect_and_play(server, open_client))
+    await connect_and_play(server, open_client)
     assert "Traceback" not in server.log_text()
 
 
-def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):
+async def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):
     server = launch(HELLO_SECONDS="2")
     for endless in (b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 100_000, b"GET /" + b"a" * 1_000_000, b"\0" * 1_000_000):
         with contextlib.suppress(ConnectionError):
@@ -235,5 +223,5 @@ def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):
             while connection.recv(65536):
                 pass
             connection.close()
-    asyncio.run(connect_and_play(server, open_client))
+    await connect_and_play(server, open_client)
     assert "Traceback" not in server.log_text()

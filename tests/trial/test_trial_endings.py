@@ -13,17 +13,13 @@ def steps_of(lines):
     return [line for line in lines if line["kind"] == "step"]
 
 
-def test_sigterm_keeps_the_whole_recording_and_closes_with_1001(launch, open_client):
+async def test_sigterm_keeps_the_whole_recording_and_closes_with_1001(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(30)
-            server.terminate()
-            assert await client.closed() == 1001
-            return client.frames[-1][1]
-
-    last = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(30)
+        server.terminate()
+        assert await client.closed() == 1001
+        last = client.frames[-1][1]
     begun = time.monotonic()
     assert server.wait() == 0
     assert time.monotonic() - begun < 10
@@ -35,35 +31,27 @@ def test_sigterm_keeps_the_whole_recording_and_closes_with_1001(launch, open_cli
     assert not list(server.store.rglob("*.part"))
 
 
-def test_sigterm_ends_a_server_while_its_agent_starts(launch, open_client, grid):
+async def test_sigterm_ends_a_server_while_its_agent_starts(launch, open_client, grid):
     source = grid().replace("def start(self, game):", "def start(self, game):\n        import time; time.sleep(60)")
     server = launch(source)
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.watch(0.3)
-            server.terminate()
-            assert await client.closed() == 1001
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.watch(0.3)
+        server.terminate()
+        assert await client.closed() == 1001
     begun = time.monotonic()
     assert server.wait() == 0
     assert time.monotonic() - begun < 10
     assert not server.answered()
 
 
-def test_a_spool_that_cannot_be_written_ends_the_trial_with_a_sentence(launch, open_client, tmp_path):
+async def test_a_spool_that_cannot_be_written_ends_the_trial_with_a_sentence(launch, open_client, tmp_path):
     (tmp_path / "file").write_text("")
     server = launch(SPOOL=str(tmp_path / "file" / "spool"))
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            assert await client.closed() == 1011
-            assert "cannot be started" in client.errors[0]
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        assert await client.closed() == 1011
+        assert "cannot be started" in client.errors[0]
     assert server.wait() == 1
     assert not server.answered()
 
@@ -76,30 +64,22 @@ def test_sigterm_ends_a_server_before_its_participant_comes(launch):
     assert "Traceback" not in server.log_text()
 
 
-def test_a_killed_server_loses_a_second_at_most(launch, open_client):
+async def test_a_killed_server_loses_a_second_at_most(launch, open_client):
     server = launch(trial={"startingFrameRate": 50})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(80)
-            server.process.kill()
-            return client.frames[-1][1]
-
-    last = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(80)
+        server.process.kill()
+        last = client.frames[-1][1]
     server.wait()
     (part,) = server.store.rglob("*.part")
     left = recording.read(part.read_bytes())
     assert last - steps_of(left)[-1]["frame"] <= 50
     # The next process of this server stores the recording that is left, and begins a file of its own.
     again = launch(trial={"startingFrameRate": 50, "ui": UI})
-
-    async def play_again():
-        async with open_client(again.address) as client:
-            await client.play(5)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-
-    asyncio.run(play_again())
+    async with open_client(again.address) as client:
+        await client.play(5)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     assert again.wait() == 0
     kept = again.recordings()
     assert len(kept) == 2
@@ -113,50 +93,42 @@ def test_a_server_to_which_no_participant_comes_ends_as_idle(launch):
     assert "idle" in server.log_text()
 
 
-def test_a_server_waits_for_a_participant_who_leaves(launch, open_client):
+async def test_a_server_waits_for_a_participant_who_leaves(launch, open_client):
     server = launch(IDLE_SECONDS="3", GRACE_SECONDS="6")
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            await client.watch(3.2)
+    async with open_client(server.address) as client:
+        await client.play()
+        await client.watch(3.2)
+    left = time.monotonic()
+    await asyncio.sleep(1.5)
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        assert client.controls["state"] == "paused"
+        assert time.monotonic() - left < 6, "this machine is too slow for the test"
         left = time.monotonic()
-        await asyncio.sleep(1.5)
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            assert client.controls["state"] == "paused"
-            assert time.monotonic() - left < 6, "this machine is too slow for the test"
-            return time.monotonic()
-
-    left = asyncio.run(play())
     assert server.wait() == 0
     assert time.monotonic() - left > 5.9
     (lines,) = server.recordings().values()
     assert lines[-1]["why"] == "shutdown"
 
 
-def test_a_server_ends_at_its_deadline(launch, open_client):
+async def test_a_server_ends_at_its_deadline(launch, open_client):
     server = launch(DEADLINE=str(time.time() + 8))
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            assert await client.closed() == 1001
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        assert await client.closed() == 1001
     assert server.wait() == 0
     assert "deadline" in server.log_text()
     assert server.recordings()
     assert not server.answered()
 
 
-def test_without_s3upload_recordings_stay_on_the_server(launch, open_client, grid, tmp_path):
+async def test_without_s3upload_recordings_stay_on_the_server(launch, open_client, grid, tmp_path):
     server = launch(
         grid(5), {"maxEpisodes": 1, "s3upload": False, "startingFrameRate": 60}, SPOOL=str(tmp_path / "spool")
     )
 
-    play_to_the_end(server, open_client)
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answered()
     assert server.recordings() == {}
@@ -165,26 +137,22 @@ def test_without_s3upload_recordings_stay_on_the_server(launch, open_client, gri
     assert len(steps_of(recording.read(path.read_bytes()))) == 5
 
 
-def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_path):
+async def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_path):
     server = launch(trial={"ui": UI}, SPOOL=str(tmp_path / "spool"))
     blocked = server.store / "study/users/P1/trials"
     blocked.parent.mkdir(parents=True)
     blocked.write_text("a file where a folder must be: no recording can be stored")
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(10)
-            await client.say(command="stop")
-            await client.until(lambda: client.state["state"] == "ended")
-            while "trying again" not in server.log_text():
-                await client.watch(0.05)
-            assert not server.answered()
-            assert client.done is None, "not done before the data are safe"
-            blocked.unlink()
-            assert await client.closed() == 1000
-            assert client.done is not None
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(10)
+        await client.say(command="stop")
+        await client.until(lambda: client.state["state"] == "ended")
+        while "trying again" not in server.log_text():
+            await client.watch(0.05)
+        assert not server.answered()
+        assert client.done is None, "not done before the data are safe"
+        blocked.unlink()
+        assert await client.closed() == 1000
+        assert client.done is not None
     assert server.wait() == 0
     assert server.answered()
     (lines,) = server.recordings().values()
@@ -193,14 +161,10 @@ def test_a_store_that_fails_for_a_while_loses_nothing(launch, open_client, tmp_p
     assert "P1" not in server.log_text()
 
 
-def test_a_server_without_clients_uses_almost_no_processor_time(launch, open_client):
+async def test_a_server_without_clients_uses_almost_no_processor_time(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(10)
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(10)
     time.sleep(0.7)
     before = server.cpu_seconds()
     time.sleep(2)

@@ -1,6 +1,5 @@
 """Researchers' code that fails, hangs or is slow, and who is recorded as having chosen an action."""
 
-import asyncio
 import re
 import time
 from pathlib import Path
@@ -34,16 +33,12 @@ def agent_source(**methods):
     return BASE + "".join(f"    def {name}:\n        {body}\n" for name, body in methods.items())
 
 
-def failed_client(server, open_client):
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls or client.errors)
-            await client.say(command="start")
-            assert await client.closed(20) == 1000
-            return client
-
-    client = asyncio.run(play())
+async def failed_client(server, open_client):
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls or client.errors)
+        await client.say(command="start")
+        assert await client.closed(20) == 1000
     assert server.wait() == 0
     told = " ".join(client.errors)
     assert "went wrong" in told
@@ -52,12 +47,12 @@ def failed_client(server, open_client):
     return client
 
 
-def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_client):
+async def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_client):
     source = BASE.replace(
         "self.steps += 1", "self.steps += 1\n        if self.steps % 4 == 0: raise ValueError('boom')"
     )
     server = launch(source, NAMES)
-    client = failed_client(server, open_client)
+    client = await failed_client(server, open_client)
     assert client.done["episodes"] == 3
     assert len(client.errors) == 3
     answers = server.answer()["answers"]
@@ -72,13 +67,13 @@ def test_a_step_that_raises_ends_the_episode_and_then_the_trial(launch, open_cli
     assert end["why"] == "failed"
 
 
-def test_one_failure_among_good_episodes_does_not_fail_the_trial(launch, open_client):
+async def test_one_failure_among_good_episodes_does_not_fail_the_trial(launch, open_client):
     body = 'self.steps += 1; n = self.steps\n        if n == 4: raise ValueError("boom")\n        '
     source = BASE + (
         f"    def step(self, action):\n        {body}return None, 1.0, n % 3 == 0, {{}}\n"  # an old four-tuple
     )
     server = launch(source, {**NAMES, "maxEpisodes": 3})
-    failed_client(server, open_client)
+    await failed_client(server, open_client)
     assert server.answer()["answers"]["outcome"] == "finished"
 
 
@@ -111,28 +106,25 @@ BROKEN = {
 }
 
 
-def assert_does_not_begin(server, open_client, user, status=NO_AGENT):
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello(userId=user)
-            assert await client.closed(20) == 1011
-            (told,) = client.errors
-            assert "cannot be started" in told
-            assert "boom" not in told
-            assert not client.controls
-            assert client.done is None
-
-    asyncio.run(play())
+async def assert_does_not_begin(server, open_client, user, status=NO_AGENT):
+    async with open_client(server.address) as client:
+        await client.hello(userId=user)
+        assert await client.closed(20) == 1011
+        (told,) = client.errors
+        assert "cannot be started" in told
+        assert "boom" not in told
+        assert not client.controls
+        assert client.done is None
     assert server.wait() == status
     assert not (server.store / f"study/users/{user}/answers").exists()
     assert user not in server.log_text()
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
+async def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
     source, last_line = BROKEN[name]
     server = launch(source, NAMES, USER_ID=f"P-{name}")
-    assert_does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
+    await assert_does_not_begin(server, open_client, f"P-{name}", status=1 if name in ("reset", "render") else NO_AGENT)
     said = server.log_text().splitlines()
     assert said.count("Traceback (most recent call last):") == 1
     (begin,) = [n for n, line in enumerate(said) if line.startswith("Traceback")]
@@ -141,27 +133,27 @@ def test_a_trial_that_cannot_begin_writes_no_answer(launch, open_client, name):
     assert re.fullmatch(last_line, next(line for line in said[begin + 1 :] if not line.startswith(" "))), said
 
 
-def test_a_trial_does_not_begin_without_names_of_actions_or_with_an_unknown_game(launch, open_client):
-    assert_does_not_begin(launch(BASE, {"ui": UI}, USER_ID="P-names"), open_client, "P-names")
+async def test_a_trial_does_not_begin_without_names_of_actions_or_with_an_unknown_game(launch, open_client):
+    await assert_does_not_begin(launch(BASE, {"ui": UI}, USER_ID="P-names"), open_client, "P-names")
     server = launch("", {"game": "Nowhere-v1"}, USER_ID="P-none")
-    assert_does_not_begin(server, open_client, "P-none")
+    await assert_does_not_begin(server, open_client, "P-none")
     (server.log.parent / "agent" / "agent.py").unlink()
     server = launch(None, {"game": "Nowhere-v1"}, USER_ID="P-game")
-    assert_does_not_begin(server, open_client, "P-game")
+    await assert_does_not_begin(server, open_client, "P-game")
     assert "\ngymnasium.error.NameNotFound: " in server.log_text()
 
 
-def test_the_log_names_the_line_of_a_broken_helper(launch, open_client, tmp_path):
+async def test_the_log_names_the_line_of_a_broken_helper(launch, open_client, tmp_path):
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent" / "my_helper.py").write_text("x = (\n")
     server = launch("import my_helper\n", NAMES, USER_ID="P-help")
-    assert_does_not_begin(server, open_client, "P-help")
+    await assert_does_not_begin(server, open_client, "P-help")
     assert "\nmy_helper.py:1: SyntaxError: '(' was never closed\n" in server.log_text()
 
 
-def test_a_trial_whose_start_never_returns_does_not_begin(launch, open_client):
+async def test_a_trial_whose_start_never_returns_does_not_begin(launch, open_client):
     server = launch(BASE.replace("self.steps = 0", "time.sleep(1000)"), NAMES, START_SECONDS="1", USER_ID="P-slow")
-    assert_does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
+    await assert_does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
 
 
 def test_a_broken_agent_ends_a_server_without_clients(launch):
@@ -172,59 +164,51 @@ def test_a_broken_agent_ends_a_server_without_clients(launch):
     assert not server.answered()
 
 
-def test_an_answered_game_step_stays_done_with_a_broken_agent(launch, open_client):
+async def test_an_answered_game_step_stays_done_with_a_broken_agent(launch, open_client):
     server = launch("import boom\n", NAMES)
     path = server.store / "study/users/P1/answers/3.json"
     path.parent.mkdir(parents=True)
     path.write_text('{"answers": {"episodes": 1, "score": 2}}')
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            assert await client.closed() == 1000
-            assert client.done["score"] == 2
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        assert await client.closed() == 1000
+        assert client.done["score"] == 2
     assert server.wait() == 0
 
 
-def test_a_failure_in_mid_episode_is_recorded_and_the_log_names_its_line(launch, open_client):
+async def test_a_failure_in_mid_episode_is_recorded_and_the_log_names_its_line(launch, open_client):
     source = BASE.replace("self.steps += 1", "self.steps += 1\n        if self.steps > 3: raise ValueError('boom')")
     server = launch(source, NAMES)
-    failed_client(server, open_client)
+    await failed_client(server, open_client)
     assert server.answer()["answers"]["outcome"] == "failed"
     assert "\nagent.py:11: ValueError: boom\n" in server.log_text()
     assert server.log_text().count("Traceback") == 1, "the same failure again needs no traceback again"
 
 
-def test_a_step_that_never_returns_ends_the_trial(launch, open_client):
+async def test_a_step_that_never_returns_ends_the_trial(launch, open_client):
     source = BASE.replace("self.steps += 1", "self.steps += 1\n        while self.steps > 5: time.sleep(1)")
     server = launch(source, NAMES, STEP_SECONDS="1")
-    failed_client(server, open_client)
+    await failed_client(server, open_client)
     answers = server.answer()["answers"]
     assert (answers["outcome"], answers["frames"]) == ("failed", 5)
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     assert [line["kind"] for line in lines] == ["header", "reset"] + ["step"] * 5 + ["error", "end"]
 
 
-def test_a_step_that_hangs_does_not_delay_the_end_of_the_server(launch, open_client):
+async def test_a_step_that_hangs_does_not_delay_the_end_of_the_server(launch, open_client):
     source = BASE.replace(
         "self.steps += 1",
         "self.steps += 1\n        while self.steps > 5:\n            open('stuck', 'w').close()\n            time.sleep(1)",
     )
     server = launch(source, NAMES)
     stuck = server.log.with_name("stuck")  # the server's folder
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.say(command="start")
-            while not stuck.exists():
-                await client.watch(0.02)
-            server.terminate()
-            assert await client.closed() == 1001
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.say(command="start")
+        while not stuck.exists():
+            await client.watch(0.02)
+        server.terminate()
+        assert await client.closed() == 1001
     begun = time.monotonic()
     assert server.wait() == 0
     assert time.monotonic() - begun < 10
@@ -234,7 +218,7 @@ def test_a_step_that_hangs_does_not_delay_the_end_of_the_server(launch, open_cli
     assert not server.answered()
 
 
-def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_path):
+async def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_path):
     under_way, go_on = tmp_path / "under_way", tmp_path / "go_on"
     source = BASE.replace(
         "        self.steps += 1\n",
@@ -244,40 +228,32 @@ def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_path):
         f"            while not os.path.exists({str(go_on)!r}): time.sleep(0.02)\n",
     )
     server = launch("import os\n" + source, NAMES)
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(3)
-            while not under_way.exists():
-                await client.watch(0.02)
-            for _ in range(3):
-                client.controls = {}
-                await client.say(command="requestUI")
-                await client.until(lambda: client.controls)
-            go_on.touch()
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(3)
+        while not under_way.exists():
+            await client.watch(0.02)
+        for _ in range(3):
+            client.controls = {}
+            await client.say(command="requestUI")
+            await client.until(lambda: client.controls)
+        go_on.touch()
+        await client.say(command="stop")
+        assert await client.closed() == 1000
 
 
-def steps_by(launch, open_client, source):
+async def steps_by(launch, open_client, source):
     """How the steps of an episode say who chose the action; `left` is held in the later steps."""
     waits = "self.steps += 1\n        while self.steps == 20 and not os.path.exists('go_on'): time.sleep(0.02)"
     server = launch("import os\n" + source.replace("self.steps += 1", waits), {**NAMES, "maxEpisodes": 1})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls or client.errors)
-            await client.say(command="start")
-            await client.until(lambda: len(client.frames) > 3)
-            await client.say(action="left", held=True)
-            await client.wait_until_heard()
-            server.log.with_name("go_on").touch()
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls or client.errors)
+        await client.say(command="start")
+        await client.until(lambda: len(client.frames) > 3)
+        await client.say(action="left", held=True)
+        await client.wait_until_heard()
+        server.log.with_name("go_on").touch()
+        assert await client.closed() == 1000
     server.wait()
     _, reset, *steps, _ = server.recordings()["3-episode-0001.jsonl.gz"]
     assert reset["seed"] is None
@@ -288,34 +264,34 @@ def steps_by(launch, open_client, source):
 FORTY = BASE.replace('"done": False', '"done": self.steps == 40')
 
 
-def test_a_step_is_by_the_agent_if_it_names_its_action(launch, open_client):
+async def test_a_step_is_by_the_agent_if_it_names_its_action(launch, open_client):
     """Whether or not it is the action that the human asked for."""
     source = FORTY.replace('"info": {}', '"info": {"action": 1}')
-    assert steps_by(launch, open_client, source) == {(None, 1, "left", "agent"), (1, 1, "left", "agent")}
+    assert await steps_by(launch, open_client, source) == {(None, 1, "left", "agent"), (1, 1, "left", "agent")}
 
 
-def test_a_step_is_by_the_agent_if_it_overrides_the_human(launch, open_client):
+async def test_a_step_is_by_the_agent_if_it_overrides_the_human(launch, open_client):
     source = FORTY.replace('"info": {}', '"info": {}, "action": 0')
-    assert steps_by(launch, open_client, source) == {(None, 0, "noop", "agent"), (1, 0, "noop", "agent")}
+    assert await steps_by(launch, open_client, source) == {(None, 0, "noop", "agent"), (1, 0, "noop", "agent")}
 
 
-def test_a_step_is_by_the_human_if_the_agent_names_no_action(launch, open_client):
-    assert steps_by(launch, open_client, FORTY) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
+async def test_a_step_is_by_the_human_if_the_agent_names_no_action(launch, open_client):
+    assert await steps_by(launch, open_client, FORTY) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
 
 
-def test_a_step_is_by_the_human_if_the_environments_info_repeats_their_action(launch, open_client):
+async def test_a_step_is_by_the_human_if_the_environments_info_repeats_their_action(launch, open_client):
     """The info of reset has an action already: then only an action other than the human's is the agent's."""
     echo = FORTY.replace('"info": {}', '"info": {"action": action}').replace(
         "        pass\n    def step", '        return None, {"action": 0}\n    def step'
     )
-    assert steps_by(launch, open_client, echo) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
+    assert await steps_by(launch, open_client, echo) == {(None, 0, "noop", "none"), (1, 1, "left", "human")}
 
 
-def test_a_step_is_by_the_agent_if_such_an_info_has_another_action(launch, open_client):
+async def test_a_step_is_by_the_agent_if_such_an_info_has_another_action(launch, open_client):
     other = FORTY.replace('"info": {}', '"info": {"action": 1 - action}').replace(
         "        pass\n    def step", '        return None, {"action": 0}\n    def step'
     )
-    assert steps_by(launch, open_client, other) == {(None, 1, "left", "agent"), (1, 0, "noop", "agent")}
+    assert await steps_by(launch, open_client, other) == {(None, 1, "left", "agent"), (1, 0, "noop", "agent")}
 
 
 def test_without_an_agent_only_the_human_chooses():

@@ -114,19 +114,15 @@ async def reset_while_held(client):
     await wait_for_frames(client, 5)
 
 
-def test_feedback_between_a_pause_and_a_reset_belongs_to_the_episode_that_ends(launch, open_client):
+async def test_feedback_between_a_pause_and_a_reset_belongs_to_the_episode_that_ends(launch, open_client):
     server = launch(agent_source(), {**TRIAL, "dataFile": "trial"}, SERVER="a-1")
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(5)
-            await reset_while_held(client)
-            await client.say(command="bad")
-            await wait_for_frames(client, 5)
-            await client.say(command="stop")
-            await client.closed()
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(5)
+        await reset_while_held(client)
+        await client.say(command="bad")
+        await wait_for_frames(client, 5)
+        await client.say(command="stop")
+        await client.closed()
     assert server.wait() == 0
     lines = all_lines(server)
     assert words_heard_as_recorded(lines) == ["good", "bad"]
@@ -134,28 +130,19 @@ def test_feedback_between_a_pause_and_a_reset_belongs_to_the_episode_that_ends(l
     assert words_in(end) == ["good"]
 
 
-def test_after_a_kill_the_game_goes_on_although_feedback_came_before_a_reset(launch, open_client):
+async def test_after_a_kill_the_game_goes_on_although_feedback_came_before_a_reset(launch, open_client):
     first = launch(agent_source(), TRIAL, SERVER="a-1")
-
-    async def play():
-        async with open_client(first.address) as client:
-            await client.play(5)
-            await reset_while_held(client)
-            await client.say(command="bad")
-            await wait_for_frames(client, 50)
-
-    asyncio.run(play())
+    async with open_client(first.address) as client:
+        await client.play(5)
+        await reset_while_held(client)
+        await client.say(command="bad")
+        await wait_for_frames(client, 50)
     killed(first)
     second = launch(agent_source(), TRIAL, SERVER="a-2")
-
-    async def go_on():
-        async with open_client(second.address) as client:
-            await client.play(5)
-            await client.say(command="stop")
-            await client.closed()
-            return client
-
-    client = asyncio.run(go_on())
+    async with open_client(second.address) as client:
+        await client.play(5)
+        await client.say(command="stop")
+        await client.closed()
     assert client.errors == []
     after = all_lines(second, "a-2")
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
@@ -164,7 +151,7 @@ def test_after_a_kill_the_game_goes_on_although_feedback_came_before_a_reset(lau
 
 
 @pytest.mark.parametrize("fail_at", [0, 7])
-def test_the_agent_hears_every_word_at_the_step_where_the_recording_has_it(launch, open_client, fail_at):
+async def test_the_agent_hears_every_word_at_the_step_where_the_recording_has_it(launch, open_client, fail_at):
     trial = {**TRIAL, "dataFile": "trial", "maxEpisodes": 1000}
     server = launch(agent_source(length=12, fail_at=fail_at), trial, SERVER="a-1")
     said = []
@@ -179,16 +166,13 @@ def test_the_agent_hears_every_word_at_the_step_where_the_recording_has_it(launc
             while len(client.frames) == seen:  # a server that stood still would take all waiting messages for a flood
                 await asyncio.sleep(0.01)
 
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(1)
-            talking = asyncio.create_task(talk(client))
-            await client.until(lambda: len(said) > 40 and client.state["episode"] > 4)
-            talking.cancel()
-            await client.say(command="stop")
-            await client.until(lambda: client.done)
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(1)
+        talking = asyncio.create_task(talk(client))
+        await client.until(lambda: len(said) > 40 and client.state["episode"] > 4)
+        talking.cancel()
+        await client.say(command="stop")
+        await client.until(lambda: client.done)
     assert server.wait() == 0
     lines = all_lines(server)
     assert len(words_heard_as_recorded(lines)) > 20
@@ -196,35 +180,26 @@ def test_the_agent_hears_every_word_at_the_step_where_the_recording_has_it(launc
 
 
 @pytest.mark.parametrize("steps", [0, 5])
-def test_the_next_server_gives_the_agent_the_feedback_that_it_has_not_heard(launch, open_client, steps):
+async def test_the_next_server_gives_the_agent_the_feedback_that_it_has_not_heard(launch, open_client, steps):
     first = launch(agent_source(), TRIAL, SERVER="a-1")
-
-    async def play():
-        async with open_client(first.address) as client:
-            if steps:
-                await client.play(steps)
-                await pause(client)
-            else:
-                await client.hello()
-                await client.until(lambda: client.frame is not None)
-            await client.say(command="good")
-            await client.say(command="requestUI")
-            await client.until(lambda: "UI" in client.state)
-            first.terminate()
-            await client.closed()
-
-    asyncio.run(play())
+    async with open_client(first.address) as client:
+        if steps:
+            await client.play(steps)
+            await pause(client)
+        else:
+            await client.hello()
+            await client.until(lambda: client.frame is not None)
+        await client.say(command="good")
+        await client.say(command="requestUI")
+        await client.until(lambda: "UI" in client.state)
+        first.terminate()
+        await client.closed()
     assert first.wait() == 0
     assert words_in(all_lines(first)[-1]) == ["good"]
     for attempt in (2, 3):
         server = launch(agent_source(), TRIAL, SERVER=f"a-{attempt}")
-
-        async def go_on(address=server.address):
-            async with open_client(address) as client:
-                await client.play(5)
-                return client
-
-        client = asyncio.run(go_on())
+        async with open_client(server.address) as client:
+            await client.play(5)
         server.terminate()
         server.wait()
         assert client.errors == []

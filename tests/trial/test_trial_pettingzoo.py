@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 from typing import Any
 
@@ -20,28 +19,23 @@ TICTACTOE = {
 }
 
 
-def test_a_game_in_turns_against_a_file_with_legal_actions_alone(launch: Any, open_client: Any, tmp_path: Any) -> None:
+async def test_a_game_in_turns_against_a_file_with_legal_actions_alone(
+    launch: Any, open_client: Any, tmp_path: Any
+) -> None:
     """The file prefers square 8, then 7 …; the participant takes the first row, and tries a square that is taken."""
     agent = tmp_path / "agent"
     file = onnx_files.constant(agent / "policies/p.onnx", np.arange(9, dtype=np.float32)[None], size=18)
     server = launch(None, trial=TICTACTOE, SDL_VIDEODRIVER="dummy", AGENT_DIR=str(agent))
-
-    async def run() -> Any:
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            for press in ("0", "8", "1", "2"):  # the file has taken square 8 by then
-                await client.until(lambda: client.state.get("toAct"))
-                await client.say(action=press)
-                refused = press == "8"
-                await client.until(
-                    lambda no=refused: client.errors if no else client.done or not client.state.get("toAct")
-                )
-            await client.until(lambda: client.done)
-            return client
-
-    client = asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        await client.say(command="start")
+        for press in ("0", "8", "1", "2"):  # the file has taken square 8 by then
+            await client.until(lambda: client.state.get("toAct"))
+            await client.say(action=press)
+            refused = press == "8"
+            await client.until(lambda no=refused: client.errors if no else client.done or not client.state.get("toAct"))
+        await client.until(lambda: client.done)
     assert server.wait() == 0, server.log_text()
     assert len(client.errors) == 1, "square 8 is taken"
     (lines,) = server.recordings().values()

@@ -51,41 +51,37 @@ def messages_in(server):
 # ---- what it sends
 
 
-def test_hippos_page_plays_a_whole_session_that_is_recorded(launch, grid):
+async def test_hippos_page_plays_a_whole_session_that_is_recorded(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
-
-    async def play():
-        async with hippo_page(server.address) as page:
-            await page.frames(1)
-            assert sorted(page.ui) == sorted(UI)
-            assert page.state == "ready"
-            await page.mouse()
-            await page.command("start")
-            await page.frames(5)
-            assert page.state == "playing"
-            await page.key_down("ArrowLeft", "ArrowLeft")
-            await page.wait_until_heard()
-            await page.frames(20)
-            await page.key_up("ArrowLeft", "ArrowLeft")
-            await page.frames(10)
-            await page.button("right")
-            await page.wait_until_heard()
-            await page.frames(15)
-            await page.command("pause")
-            await page.until(lambda: page.state == "paused")
-            await page.frame_rate("40")
-            await page.until(lambda: page.said[-1].get("frameRate") == 40)
-            await page.command("start")
-            await page.frames(5)
-            await page.command("reset")
-            await page.until(lambda: page.said[-1].get("episode") == 2)
-            await page.frames(5)
-            assert page.errors == []
-            await page.command("stop")
-            assert await page.closed() == 1000
-            assert page.ended
-
-    asyncio.run(play())
+    async with hippo_page(server.address) as page:
+        await page.frames(1)
+        assert sorted(page.ui) == sorted(UI)
+        assert page.state == "ready"
+        await page.mouse()
+        await page.command("start")
+        await page.frames(5)
+        assert page.state == "playing"
+        await page.key_down("ArrowLeft", "ArrowLeft")
+        await page.wait_until_heard()
+        await page.frames(20)
+        await page.key_up("ArrowLeft", "ArrowLeft")
+        await page.frames(10)
+        await page.button("right")
+        await page.wait_until_heard()
+        await page.frames(15)
+        await page.command("pause")
+        await page.until(lambda: page.state == "paused")
+        await page.frame_rate("40")
+        await page.until(lambda: page.said[-1].get("frameRate") == 40)
+        await page.command("start")
+        await page.frames(5)
+        await page.command("reset")
+        await page.until(lambda: page.said[-1].get("episode") == 2)
+        await page.frames(5)
+        assert page.errors == []
+        await page.command("stop")
+        assert await page.closed() == 1000
+        assert page.ended
     assert server.wait() == 0
     taken = steps_in(server)
     assert [step["human"] is not None for step in taken[:3]] == [False] * 3
@@ -105,82 +101,66 @@ def test_hippos_page_plays_a_whole_session_that_is_recorded(launch, grid):
     assert "P1" not in json.dumps(said), "who plays stands in the folder's name alone"
 
 
-def test_the_game_goes_on_when_hippos_page_connects_again(launch, grid):
+async def test_the_game_goes_on_when_hippos_page_connects_again(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE, LINGER_SECONDS="60")
-
-    async def play():
-        async with hippo_page(server.address) as page:
-            await page.command("start")
-            await page.frames(10)
-            last = page.frame_id
-        async with hippo_page(server.address) as page:
-            await page.frames(1)
-            assert page.state == "paused"
-            assert page.frame_id >= last
-            await page.command("start")
-            await page.frames(5)
-            await page.command("stop")
-            assert await page.closed() == 1000
-        async with hippo_page(server.address) as page:  # before the process is gone
-            assert await page.closed() == 1000
-
-    asyncio.run(play())
+    async with hippo_page(server.address) as page:
+        await page.command("start")
+        await page.frames(10)
+        last = page.frame_id
+    async with hippo_page(server.address) as page:
+        await page.frames(1)
+        assert page.state == "paused"
+        assert page.frame_id >= last
+        await page.command("start")
+        await page.frames(5)
+        await page.command("stop")
+        assert await page.closed() == 1000
+    async with hippo_page(server.address) as page:  # before the process is gone
+        assert await page.closed() == 1000
 
 
-def test_two_pages_of_one_participant_are_one_player(launch, grid):
+async def test_two_pages_of_one_participant_are_one_player(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
-
-    async def play():
-        async with hippo_page(server.address) as first:
-            await first.frames(1)  # it is the first that the server knows
-            async with hippo_page(server.address) as second:
-                await second.frames(1)
-                assert await first.closed() == 4409
-                await second.command("start")
-                await second.frames(5)
-
-    asyncio.run(play())
+    async with hippo_page(server.address) as first:
+        await first.frames(1)  # it is the first that the server knows
+        async with hippo_page(server.address) as second:
+            await second.frames(1)
+            assert await first.closed() == 4409
+            await second.command("start")
+            await second.frames(5)
 
 
-def test_an_unknown_action_ends_the_last_one_as_with_hippo(launch, grid):
+async def test_an_unknown_action_ends_the_last_one_as_with_hippo(launch, grid):
     server = launch(grid(None), {**TRIAL, "ui": {**UI}}, PLAIN_ORIGINS=HERE)
-
-    async def play():
-        async with hippo_page(server.address) as page:
-            await page.command("start")
-            await page.button("left")
-            await page.wait_until_heard()
-            await page.frames(5)
-            await page.button("rotate")
-            await page.until(lambda: page.errors)
-            await page.frames(5)
-            await page.command("stop")
-            await page.closed()
-
-    asyncio.run(play())
+    async with hippo_page(server.address) as page:
+        await page.command("start")
+        await page.button("left")
+        await page.wait_until_heard()
+        await page.frames(5)
+        await page.button("rotate")
+        await page.until(lambda: page.errors)
+        await page.frames(5)
+        await page.command("stop")
+        await page.closed()
     assert server.wait() == 0
     actions = [step["actionName"] for step in steps_in(server)]
     assert "left" in actions
     assert actions[-2:] == ["noop", "noop"]
 
 
-def test_a_client_of_our_own_protocol_gets_errors_for_hippos_forms(launch, open_client):
+async def test_a_client_of_our_own_protocol_gets_errors_for_hippos_forms(launch, open_client):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            for message in ({"command": "start", "frameCount": 3}, {"changeFrameRate": "40"}):
-                client.errors.clear()
-                await client.say(**message)
-                await client.until(lambda: client.errors)
-            await client.say(action="left")
-            await client.wait_until_heard()
-            await client.see(5)
-            await client.say(command="stop")
-            await client.closed()
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        for message in ({"command": "start", "frameCount": 3}, {"changeFrameRate": "40"}):
+            client.errors.clear()
+            await client.say(**message)
+            await client.until(lambda: client.errors)
+        await client.say(action="left")
+        await client.wait_until_heard()
+        await client.see(5)
+        await client.say(command="stop")
+        await client.closed()
     assert server.wait() == 0
     assert [step["actionName"] for step in steps_in(server)].count("left") == 1
 
@@ -313,16 +293,12 @@ def test_the_first_action_is_asked_for_where_no_action_is_called_noop():
 # ---- who may play without a token
 
 
-def first_answer(server, **options):
+async def first_answer(server, **options):
     """Open a page; return the sentence that refuses it, or None if it gets a frame."""
-
-    async def play():
-        async with hippo_page(server.address, **options) as page:
-            await page.until(lambda: page.frame_count)
-            assert bool(page.ui) != bool(page.instructions)
-            return page.instructions[0] if page.instructions else None
-
-    return asyncio.run(play())
+    async with hippo_page(server.address, **options) as page:
+        await page.until(lambda: page.frame_count)
+        assert bool(page.ui) != bool(page.instructions)
+        return page.instructions[0] if page.instructions else None
 
 
 @pytest.mark.parametrize(
@@ -343,12 +319,12 @@ def first_answer(server, **options):
         (HERE, "P1 ", HERE, OTHER_ID),
     ],
 )
-def test_the_id_and_the_origin_open_the_server_where_that_is_allowed(launch, origins, user_id, origin, words):
+async def test_the_id_and_the_origin_open_the_server_where_that_is_allowed(launch, origins, user_id, origin, words):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=origins)
-    assert first_answer(server, user_id=user_id, origin=origin) == words
+    assert await first_answer(server, user_id=user_id, origin=origin) == words
 
 
-def test_a_page_of_another_study_cannot_play_this_one(launch):
+async def test_a_page_of_another_study_cannot_play_this_one(launch):
     """A participant's DNS name leads to one server, whatever studies they take part in."""
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
 
@@ -357,46 +333,43 @@ def test_a_page_of_another_study_cannot_play_this_one(launch):
             await websocket.send(json.dumps({"userId": "P1", "projectId": project_id}))
             return json.loads(await websocket.recv())
 
-    assert asyncio.run(come("other"))["Instructions"] == [OTHER_STUDY]
-    assert "actionSpace" in asyncio.run(come("study"))
+    assert (await come("other"))["Instructions"] == [OTHER_STUDY]
+    assert "actionSpace" in await come("study")
 
 
-def test_a_request_with_two_origins_is_refused(launch):
+async def test_a_request_with_two_origins_is_refused(launch):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
     with pytest.raises(InvalidStatus) as refused:
-        first_answer(server, headers={"Origin": "https://evil.example"})
+        await first_answer(server, headers={"Origin": "https://evil.example"})
     assert refused.value.response.status_code == 400
 
 
-def closed_with(server, hello, **options):
-    async def play():
-        async with connect(server.address, proxy=None, **options) as websocket:
-            await websocket.send(json.dumps(hello))
-            said = []
-            with contextlib.suppress(ConnectionClosed):
-                while True:
-                    said.append(await websocket.recv())
-            return said, websocket.close_code, websocket.close_reason
-
-    return asyncio.run(play())
+async def closed_with(server, hello, **options):
+    async with connect(server.address, proxy=None, **options) as websocket:
+        await websocket.send(json.dumps(hello))
+        said = []
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                said.append(await websocket.recv())
+        return said, websocket.close_code, websocket.close_reason
 
 
 @pytest.mark.parametrize("token", ["", "wrong", "the-secret-toke"])
-def test_a_wrong_token_is_refused_whatever_the_origin(launch, token):
+async def test_a_wrong_token_is_refused_whatever_the_origin(launch, token):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
-    _, code, _ = closed_with(server, {"userId": "P1", "token": token}, origin=HERE)
+    _, code, _ = await closed_with(server, {"userId": "P1", "token": token}, origin=HERE)
     assert code == 4401
 
 
-def test_our_own_page_always_needs_its_token(launch):
+async def test_our_own_page_always_needs_its_token(launch):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
-    _, code, _ = closed_with(server, {"userId": "P1"}, origin=HERE, subprotocols=["hippodrome.2"])
+    _, code, _ = await closed_with(server, {"userId": "P1"}, origin=HERE, subprotocols=["hippodrome.2"])
     assert code == 4401
 
 
-def test_a_program_without_a_token_is_closed_and_told_what_is_missing(launch):
+async def test_a_program_without_a_token_is_closed_and_told_what_is_missing(launch):
     server = launch(trial=TRIAL)
-    said, code, reason = closed_with(server, {"userId": "P1"})
+    said, code, reason = await closed_with(server, {"userId": "P1"})
     assert said == [messages.error(NEEDS_PROOF)]
     assert code == 4401
     assert NEEDS_PROOF.startswith(reason)
@@ -418,82 +391,62 @@ def test_a_warm_server_lets_no_page_in_without_the_token():
     assert TrialSettings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
 
 
-def test_a_refused_page_shows_the_sentence_and_stays_connected(launch):
+async def test_a_refused_page_shows_the_sentence_and_stays_connected(launch):
     server = launch(trial=TRIAL)
-
-    async def play():
-        async with hippo_page(server.address) as page:
-            await page.until(lambda: page.instructions)
-            assert page.instructions == [NEEDS_PROOF]
-            assert page.ui == []
-            await page.command("start")
-            await page.watch(1.5)
-            assert page.frame_count == 1
-            picture = Image.open(io.BytesIO(base64.b64decode(page.said[1]["frame"]))).convert("L")
-            assert picture.size == (600, 400)
-            assert 0.01 < sum(picture.histogram()[:100]) / (600 * 400) < 0.2, "words, black on white"
-            left, top, right, bottom = picture.point(lambda grey: 255 * (grey < 100)).getbbox()
-            assert left > 10
-            assert top > 10
-            assert right < 590
-            assert bottom < 390
-            assert not page.ended
-            assert page.websocket.close_code is None
-
-    asyncio.run(play())
+    async with hippo_page(server.address) as page:
+        await page.until(lambda: page.instructions)
+        assert page.instructions == [NEEDS_PROOF]
+        assert page.ui == []
+        await page.command("start")
+        await page.watch(1.5)
+        assert page.frame_count == 1
+        picture = Image.open(io.BytesIO(base64.b64decode(page.said[1]["frame"]))).convert("L")
+        assert picture.size == (600, 400)
+        assert 0.01 < sum(picture.histogram()[:100]) / (600 * 400) < 0.2, "words, black on white"
+        left, top, right, bottom = picture.point(lambda grey: 255 * (grey < 100)).getbbox()
+        assert left > 10
+        assert top > 10
+        assert right < 590
+        assert bottom < 390
+        assert not page.ended
+        assert page.websocket.close_code is None
     server.terminate()
     assert server.wait() == 0
 
 
-def test_refused_pages_neither_flood_the_server_nor_keep_the_participant_out(launch):
+async def test_refused_pages_neither_flood_the_server_nor_keep_the_participant_out(launch):
     server = launch(trial=TRIAL)
-
-    async def flood():
-        async with hippo_page(server.address) as page:
-            with contextlib.suppress(ConnectionClosed):
-                for _ in range(2000):
-                    await page.command("start")
-                    await asyncio.sleep(0)
-            return await page.closed()
-
-    assert asyncio.run(flood()) == 4429
-
-    async def crowd():
-        async with asyncio.TaskGroup() as group:
-            pages = [hippo_page(server.address) for _ in range(80)]
-            for page in pages:
-                await page.__aenter__()
-            async with connect(f"{server.address}?token=the-secret-token", proxy=None) as websocket:
-                await websocket.send('{"userId": "P1"}')
-                assert "UI" in json.loads(await websocket.recv())
-            for page in pages:
-                group.create_task(page.__aexit__(None, None, None))
-
-    asyncio.run(crowd())
+    async with hippo_page(server.address) as page:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(2000):
+                await page.command("start")
+                await asyncio.sleep(0)
+        assert await page.closed() == 4429
+    async with asyncio.TaskGroup() as group:
+        pages = [hippo_page(server.address) for _ in range(80)]
+        for page in pages:
+            await page.__aenter__()
+        async with connect(f"{server.address}?token=the-secret-token", proxy=None) as websocket:
+            await websocket.send('{"userId": "P1"}')
+            assert "UI" in json.loads(await websocket.recv())
+        for page in pages:
+            group.create_task(page.__aexit__(None, None, None))
 
 
-def test_a_flood_of_fields_ends_the_connection_and_the_recording_stays_small(launch, grid):
+async def test_a_flood_of_fields_ends_the_connection_and_the_recording_stays_small(launch, grid):
     server = launch(grid(None), TRIAL, PLAIN_ORIGINS=HERE)
-
-    async def flood():
-        async with hippo_page(server.address) as page:
-            await page.command("start")
-            await page.frames(2)
-            with contextlib.suppress(ConnectionClosed):
-                for number in range(2000):
-                    await page.send(junk="x" * 3500, number=number)
-            return await page.closed()
-
-    assert asyncio.run(flood()) == 4429
-
-    async def finish():
-        async with hippo_page(server.address) as page:
-            await page.command("start")
-            await page.frames(3)
-            await page.command("stop")
-            await page.closed()
-
-    asyncio.run(finish())
+    async with hippo_page(server.address) as page:
+        await page.command("start")
+        await page.frames(2)
+        with contextlib.suppress(ConnectionClosed):
+            for number in range(2000):
+                await page.send(junk="x" * 3500, number=number)
+        assert await page.closed() == 4429
+    async with hippo_page(server.address) as page:
+        await page.command("start")
+        await page.frames(3)
+        await page.command("stop")
+        await page.closed()
     assert server.wait() == 0
     assert "xxxx" not in json.dumps(messages_in(server))
     assert any(each.get("fieldsDropped") == 4 for each in messages_in(server))

@@ -22,25 +22,20 @@ TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z")
 UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "good": True}
 
 
-def test_a_participant_plays_from_the_hello_to_the_answer(launch, open_client, grid):
+async def test_a_participant_plays_from_the_hello_to_the_answer(launch, open_client, grid):
     server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI}, GROUP="1")
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            assert client.controls["state"] == "ready"
-            assert client.controls["actionSpace"] == ["noop", "up", "right", "left", "down", "upright"]
-            assert client.controls["UI"] == [key.name for key in keys(Ui) if key.name in UI]
-            assert client.controls["maxEpisodes"] == 2
-            assert client.frame.shape == (20, 30, 3)
-            await client.watch(0.3)
-            assert len(client.frames) == 1, "nothing moves before start"
-            await client.say(command="start")
-            code = await client.closed()
-            return client, code
-
-    client, code = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        assert client.controls["state"] == "ready"
+        assert client.controls["actionSpace"] == ["noop", "up", "right", "left", "down", "upright"]
+        assert client.controls["UI"] == [key.name for key in keys(Ui) if key.name in UI]
+        assert client.controls["maxEpisodes"] == 2
+        assert client.frame.shape == (20, 30, 3)
+        await client.watch(0.3)
+        assert len(client.frames) == 1, "nothing moves before start"
+        await client.say(command="start")
+        code = await client.closed()
     assert code == 1000
     assert client.done == {"done": True, "episodes": 2, "score": 60}
     assert "ended" in client.states
@@ -61,25 +56,21 @@ def test_a_participant_plays_from_the_hello_to_the_answer(launch, open_client, g
     assert "P1" not in server.log_text()
 
 
-def test_the_recording_says_what_happened(launch, open_client, grid, tmp_path):
+async def test_the_recording_says_what_happened(launch, open_client, grid, tmp_path):
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent/requirements.txt").write_text("pillow\n")
     server = launch(grid(None), {"ui": UI, "recordObservations": True, "startingFrameRate": 40})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            await client.say(action="left", held=True)
-            await client.say(command="good")
-            seen = len(client.frames)
-            await client.until(lambda: len(client.frames) > seen + 8)
-            await client.say(action="left", held=False)
-            await client.say(command="reset")
-            await client.until(lambda: client.state.get("episode") == 2)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        await client.say(action="left", held=True)
+        await client.say(command="good")
+        seen = len(client.frames)
+        await client.until(lambda: len(client.frames) > seen + 8)
+        await client.say(action="left", held=False)
+        await client.say(command="reset")
+        await client.until(lambda: client.state.get("episode") == 2)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     assert server.wait() == 0
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     header, reset, *steps, end = lines
@@ -115,10 +106,9 @@ def test_the_recording_says_what_happened(launch, open_client, grid, tmp_path):
     assert server.answer()["group"] is None
 
 
-def test_with_data_file_trial_a_trial_has_one_file(launch, open_client, grid):
+async def test_with_data_file_trial_a_trial_has_one_file(launch, open_client, grid):
     server = launch(grid(5), {"maxEpisodes": 3, "dataFile": "trial", "startingFrameRate": 60})
-
-    play_to_the_end(server, open_client)
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0
     recordings = server.recordings()
     assert list(recordings) == ["3-trial.jsonl.gz"]
@@ -128,42 +118,34 @@ def test_with_data_file_trial_a_trial_has_one_file(launch, open_client, grid):
     assert len(set(seeds)) == 3
 
 
-def test_pause_holds_the_game_and_start_goes_on(launch, open_client):
+async def test_pause_holds_the_game_and_start_goes_on(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            await client.say(command="pause")
-            await client.until(lambda: client.state["state"] == "paused")
-            taken = round(client.state["score"] / 1.5)
-            await client.until(lambda: client.frame[taken % 20, taken % 30, 0] == 255)
-            seen = client.frames[-1]
-            await client.watch(0.4)
-            assert client.frames[-1][1] <= seen[1] + 1, "the step that was under way is the last"
-            await client.say(command="start")
-            await client.until(lambda: client.state["state"] == "playing")
-            await client.until(lambda: client.frames[-1][1] > seen[1] + 3)
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        await client.say(command="pause")
+        await client.until(lambda: client.state["state"] == "paused")
+        taken = round(client.state["score"] / 1.5)
+        await client.until(lambda: client.frame[taken % 20, taken % 30, 0] == 255)
+        seen = client.frames[-1]
+        await client.watch(0.4)
+        assert client.frames[-1][1] <= seen[1] + 1, "the step that was under way is the last"
+        await client.say(command="start")
+        await client.until(lambda: client.state["state"] == "playing")
+        await client.until(lambda: client.frames[-1][1] > seen[1] + 3)
 
 
-def test_the_frame_rate_stays_within_its_limits(launch, open_client):
+async def test_the_frame_rate_stays_within_its_limits(launch, open_client):
     limits = {"minFrameRate": 5, "maxFrameRate": 40, "frameRateStepSize": 10, "allowFrameRateChange": True}
     controls = {"fpsUp": True, "fpsDown": True, "fpsSet": True}
     server = launch(trial={**limits, "startingFrameRate": 30, "ui": controls})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            for wish, rate in (("faster", 40), ("slower", 30), (1, 5), (1e9, 40), (12, 12)):
-                await client.say(changeFrameRate=wish)
-                await client.until(lambda rate=rate: client.state["frameRate"] == rate)
-            await client.see(18)
-            server.terminate()
-            await client.closed()
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        for wish, rate in (("faster", 40), ("slower", 30), (1, 5), (1e9, 40), (12, 12)):
+            await client.say(changeFrameRate=wish)
+            await client.until(lambda rate=rate: client.state["frameRate"] == rate)
+        await client.see(18)
+        server.terminate()
+        await client.closed()
     server.wait()
     (lines,) = server.recordings().values()
     times = [line["ns"] / 1e9 for line in lines if line["kind"] == "step"][-16:]  # the first picture may be older
@@ -171,31 +153,27 @@ def test_the_frame_rate_stays_within_its_limits(launch, open_client):
     assert 1 / 16 < gap < 1 / 8, "a step that comes late changes no other"
 
 
-def test_changing_a_fixed_frame_rate_is_refused_with_a_sentence(launch, open_client):
+async def test_changing_a_fixed_frame_rate_is_refused_with_a_sentence(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            await client.say(changeFrameRate="faster")
-            await client.say(command="stop")
-            await client.say(command="good")
-            await client.say(action="jump")
-            await client.until(lambda: len(client.errors) == 4)
-            await client.say(command="requestUI")
-            client.controls = {}
-            await client.until(lambda: client.controls)
-            return client.errors
-
-    errors = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        await client.say(changeFrameRate="faster")
+        await client.say(command="stop")
+        await client.say(command="good")
+        await client.say(action="jump")
+        await client.until(lambda: len(client.errors) == 4)
+        await client.say(command="requestUI")
+        client.controls = {}
+        await client.until(lambda: client.controls)
+        errors = client.errors
     assert "fixed" in errors[0]
     assert "stop" in errors[1]
     assert "good" in errors[2]
     assert "actionSpace" in errors[3]
 
 
-def test_controls_that_are_missing_in_ui_are_refused_and_do_nothing(launch, open_client):
+async def test_controls_that_are_missing_in_ui_are_refused_and_do_nothing(launch, open_client):
     server = launch(trial={"allowFrameRateChange": True, "startingFrameRate": 60, "ui": {"up": True, "pause": False}})
     off = [
         ("pause", {"command": "pause"}),
@@ -207,26 +185,21 @@ def test_controls_that_are_missing_in_ui_are_refused_and_do_nothing(launch, open
         ("fpsDown", {"changeFrameRate": "slower"}),
         ("fpsSet", {"changeFrameRate": 10}),
     ]
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play()
-            for _, message in off:
-                await client.say(**message)
-            await client.until(lambda: len(client.errors) == len(off))
-            seen = len(client.frames)
-            await client.until(lambda: len(client.frames) > seen + 5)
-            assert (client.state["state"], client.state["episode"], client.state["frameRate"]) == ("playing", 1, 60)
-            errors = client.errors
-        async with open_client(server.address) as client:  # a client that leaves pauses the game in any case
-            await client.hello()
-            await client.until(lambda: client.controls)
-            assert client.controls["state"] == "paused"
-            await client.say(command="start")
-            await client.until(lambda: client.state["state"] == "playing")
-        return errors
-
-    errors = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play()
+        for _, message in off:
+            await client.say(**message)
+        await client.until(lambda: len(client.errors) == len(off))
+        seen = len(client.frames)
+        await client.until(lambda: len(client.frames) > seen + 5)
+        assert (client.state["state"], client.state["episode"], client.state["frameRate"]) == ("playing", 1, 60)
+        errors = client.errors
+    async with open_client(server.address) as client:  # a client that leaves pauses the game in any case
+        await client.hello()
+        await client.until(lambda: client.controls)
+        assert client.controls["state"] == "paused"
+        await client.say(command="start")
+        await client.until(lambda: client.state["state"] == "playing")
     assert errors == [f"{name} is not offered in this game" for name, _ in off]
     server.terminate()
     server.wait()
@@ -234,27 +207,23 @@ def test_controls_that_are_missing_in_ui_are_refused_and_do_nothing(launch, open
     assert {line["actionName"] for line in lines if line["kind"] == "step"} == {"noop"}
 
 
-def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client, grid):
+async def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client, grid):
     server = launch(grid(None), {"ui": UI})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(10)
-            score = client.state["score"]
-        await asyncio.sleep(0.3)
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frames)
-            assert client.controls["state"] == "paused"
-            assert client.controls["score"] >= score > 0
-            await client.watch(0.3)
-            assert len(client.frames) == 1
-            await client.say(command="start")
-            await client.until(lambda: len(client.frames) > 5)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(10)
+        score = client.state["score"]
+    await asyncio.sleep(0.3)
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frames)
+        assert client.controls["state"] == "paused"
+        assert client.controls["score"] >= score > 0
+        await client.watch(0.3)
+        assert len(client.frames) == 1
+        await client.say(command="start")
+        await client.until(lambda: len(client.frames) > 5)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     assert server.wait() == 0
     (lines,) = server.recordings().values()
     events = [said.get("event") for line in lines for said in line.get("messages", [])]
@@ -264,84 +233,63 @@ def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client, grid)
     assert steps == list(range(1, len(steps) + 1))
 
 
-def test_a_second_tab_takes_over(launch, open_client):
+async def test_a_second_tab_takes_over(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as first, open_client(server.address) as second:
-            await first.play()
-            await second.hello()
-            await second.until(lambda: second.frames)
-            assert second.controls["state"] == "paused"
-            assert await first.closed() == 4409
-            assert "another tab" in first.errors[-1]
-            await second.say(command="start")
-            await second.until(lambda: len(second.frames) > 5)
-
-    asyncio.run(play())
+    async with open_client(server.address) as first, open_client(server.address) as second:
+        await first.play()
+        await second.hello()
+        await second.until(lambda: second.frames)
+        assert second.controls["state"] == "paused"
+        assert await first.closed() == 4409
+        assert "another tab" in first.errors[-1]
+        await second.say(command="start")
+        await second.until(lambda: len(second.frames) > 5)
 
 
-def test_a_slow_client_gets_fewer_frames_and_no_late_ones(launch, open_client):
+async def test_a_slow_client_gets_fewer_frames_and_no_late_ones(launch, open_client):
     server = launch(trial={"startingFrameRate": 60})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(20)
-            client.acks = False
-            for _ in range(8):  # a client that needs a quarter of a second for each frame
-                await client.say(ack=client.frames[-1][1])
-                seen = len(client.frames)
-                await client.watch(0.25)
-                assert len(client.frames) - seen <= 6
-            return [frame_id for _, frame_id in client.frames]
-
-    ids = asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(20)
+        client.acks = False
+        for _ in range(8):  # a client that needs a quarter of a second for each frame
+            await client.say(ack=client.frames[-1][1])
+            seen = len(client.frames)
+            await client.watch(0.25)
+            assert len(client.frames) - seen <= 6
+        ids = [frame_id for _, frame_id in client.frames]
     assert ids == sorted(set(ids))
     assert ids[-1] - ids[20] > len(ids[21:]), "the game went on at its own pace"
 
 
-def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_client):
+async def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_client):
     server = launch()
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(10)
-            client.acks = False
-            await client.until(lambda: client.state["state"] == "paused", 8)
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(10)
+        client.acks = False
+        await client.until(lambda: client.state["state"] == "paused", 8)
 
 
-def test_a_client_that_never_acknowledges_gets_frames(launch, open_client):
+async def test_a_client_that_never_acknowledges_gets_frames(launch, open_client):
     server = launch(trial={"startingFrameRate": 60})
-
-    async def play():
-        async with open_client(server.address) as client:
-            client.acks = False
-            await client.play(60)
-            assert client.state["state"] == "playing"
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        client.acks = False
+        await client.play(60)
+        assert client.state["state"] == "playing"
 
 
-def test_a_client_without_a_subprotocol_gets_jpegs_in_json(launch, open_client, grid):
+async def test_a_client_without_a_subprotocol_gets_jpegs_in_json(launch, open_client, grid):
     """HIPPO's own pages: no subprotocol, JPEG in JSON, and the text `done`."""
     server = launch(grid(None), {"maxEpisodes": 1, "ui": UI})
-
-    async def play():
-        async with open_client(f"{server.address}?token=the-secret-token", subprotocols=None) as client:
-            await client.say(userId="P1", projectId="study")
-            await client.until(lambda: client.jpegs)
-            await client.say(command="start")
-            await client.say(action="left")
-            await client.wait_until_heard()
-            seen = len(client.jpegs)
-            await client.until(lambda: len(client.jpegs) >= seen + 15)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-            return client
-
-    client = asyncio.run(play())
+    async with open_client(f"{server.address}?token=the-secret-token", subprotocols=None) as client:
+        await client.say(userId="P1", projectId="study")
+        await client.until(lambda: client.jpegs)
+        await client.say(command="start")
+        await client.say(action="left")
+        await client.wait_until_heard()
+        seen = len(client.jpegs)
+        await client.until(lambda: len(client.jpegs) >= seen + 15)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     import base64
     import io
 
@@ -362,25 +310,21 @@ def test_a_client_without_a_subprotocol_gets_jpegs_in_json(launch, open_client, 
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_ms_pacman_with_the_example_agent(launch, open_client):
+async def test_ms_pacman_with_the_example_agent(launch, open_client):
     server = launch(
         EXAMPLE.read_text(), {"game": "MsPacman-v0", "maxEpisodes": 1, "ui": {**UI, "up": True, "right": True}}
     )
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(15)
-            assert client.frame.shape == (210, 160, 3)
-            assert len({tuple(pixel) for row in client.frame for pixel in row}) > 3
-            assert "upleft" in client.controls["actionSpace"]
-            for key in ("left", "up", "right"):
-                await client.say(action=key, held=True)
-                await client.wait_until_heard()
-                await client.see(5)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(15)
+        assert client.frame.shape == (210, 160, 3)
+        assert len({tuple(pixel) for row in client.frame for pixel in row}) > 3
+        assert "upleft" in client.controls["actionSpace"]
+        for key in ("left", "up", "right"):
+            await client.say(action=key, held=True)
+            await client.wait_until_heard()
+            await client.see(5)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "stopped"
     # The recording is enough to play the episode again.
@@ -398,37 +342,29 @@ def test_ms_pacman_with_the_example_agent(launch, open_client):
         assert info["lives"] == line["info"]["lives"]
 
 
-def test_without_agent_py_any_game_of_gymnasium_is_played(launch, open_client):
+async def test_without_agent_py_any_game_of_gymnasium_is_played(launch, open_client):
     server = launch(None, {"game": "ALE/Freeway-v5", "ui": UI})
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.play(3)
-            assert client.controls["actionSpace"] == ["noop", "up", "down"]
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        await client.play(3)
+        assert client.controls["actionSpace"] == ["noop", "up", "down"]
 
 
-def test_an_answered_game_step_is_not_played_again(launch, open_client):
+async def test_an_answered_game_step_is_not_played_again(launch, open_client):
     answer = {"schema": 1, "answers": {"episodes": 4, "score": 12}}
 
     server = launch()
     path = server.store / "study/users/P1/answers/3.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(answer))
-
-    async def play():
-        async with open_client(server.address) as client:
-            await client.hello()
-            assert await client.closed() == 1000
-            return client.done
-
-    assert asyncio.run(play()) == {"done": True, "episodes": 4, "score": 12}
+    async with open_client(server.address) as client:
+        await client.hello()
+        assert await client.closed() == 1000
+        assert client.done == {"done": True, "episodes": 4, "score": 12}
     assert server.wait() == 0
     assert server.answer() == answer
 
 
-def test_one_server_plays_two_game_steps(launch, open_client, grid):
+async def test_one_server_plays_two_game_steps(launch, open_client, grid):
     server = launch(grid(5), {"maxEpisodes": 1, "startingFrameRate": 60}, GAME_STEPS="2,4")
 
     async def play(step):
@@ -437,10 +373,10 @@ def test_one_server_plays_two_game_steps(launch, open_client, grid):
             await client.say(command="start")
             assert await client.closed() == 1000
 
-    asyncio.run(play("2"))
+    await play("2")
     assert server.answered("2")
     assert not server.answered("4")
-    asyncio.run(play("4"))
+    await play("4")
     assert server.wait() == 0
     assert server.answered("4")
     assert list(server.recordings()) == ["2-episode-0001.jsonl.gz", "4-episode-0001.jsonl.gz"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import itertools
 import statistics
@@ -14,23 +13,18 @@ from testing import onnx_files
 from tests.trial.two_players import TRIAL, two_players
 
 
-def play_and_end(server, open_client, *, frames=8, keys=(), stop=False):
+async def play_and_end(server, open_client, *, frames=8, keys=(), stop=False):
     """Play until `frames` pictures have come, with these keys held; end the server; return the client."""
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            for key in keys:
-                await client.say(action=key, held=True)
-            seen = len(client.frames)
-            await client.until(lambda: len(client.frames) >= seen + frames or client.done)
-            server.terminate()
-            await client.closed()
-            return client
-
-    client = asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        await client.say(command="start")
+        for key in keys:
+            await client.say(action=key, held=True)
+        seen = len(client.frames)
+        await client.until(lambda: len(client.frames) >= seen + frames or client.done)
+        server.terminate()
+        await client.closed()
     assert server.wait() == 0
     return client
 
@@ -40,9 +34,9 @@ def steps(server, name="a1"):
     return [line for line in lines if line["kind"] == "step"]
 
 
-def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
+async def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client):
     server = launch(two_players(), trial=TRIAL | {"startingFrameRate": 5})
-    client = play_and_end(server, open_client, frames=6, keys=["up"])
+    client = await play_and_end(server, open_client, frames=6, keys=["up"])
     assert client.errors == [], server.log_text()
     assert (client.controls["player"], client.controls["players"]) == ("left", ["left", "right"])
     lines = steps(server)
@@ -60,18 +54,18 @@ def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_client)
     assert client.state["score"] == sum(line["reward"] for line in lines), "the participant's own"
 
 
-def test_the_head_of_a_recording_says_who_plays(launch, open_client):
+async def test_the_head_of_a_recording_says_who_plays(launch, open_client):
     server = launch(two_players(), trial=TRIAL)
-    play_and_end(server, open_client, frames=2)
+    await play_and_end(server, open_client, frames=2)
     head, reset = next(iter(server.recordings().values()))[:2]
     assert head["players"] == {"left": {"kind": "human"}, "right": {"kind": "policy", "policy": "agent:Partner"}}
     assert reset["toAct"] == ["left", "right"]
 
 
-def test_the_head_of_a_recording_says_by_which_rules_players_act(launch, open_client):
+async def test_the_head_of_a_recording_says_by_which_rules_players_act(launch, open_client):
     rules = {"frameSkip": 3, "input": "single", "idleAction": {"right": "down"}, "seed": 4}
     server = launch(two_players(), trial=TRIAL | rules)
-    play_and_end(server, open_client, frames=2)
+    await play_and_end(server, open_client, frames=2)
     head, reset = next(iter(server.recordings().values()))[:2]
     assert (head["frameSkip"], head["input"], head["pace"]) == (3, "single", "realtime")
     assert head["idleActions"] == {"left": 0, "right": 2}
@@ -79,16 +73,11 @@ def test_the_head_of_a_recording_says_by_which_rules_players_act(launch, open_cl
     assert reset["players"] == {"left": {}, "right": {"seed": seed}}
 
 
-def test_a_recording_with_several_players_ends_with_all_scores(launch, open_client):
+async def test_a_recording_with_several_players_ends_with_all_scores(launch, open_client):
     server = launch(two_players(length=4), trial=TRIAL | {"seed": 14, "maxEpisodes": 2, "startingFrameRate": 60})
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.play(1)
-            await client.until(lambda: client.done)
-            return client
-
-    client = asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.play(1)
+        await client.until(lambda: client.done)
     assert server.wait() == 0
     episodes = list(server.recordings().values())
     paid = [[line["players"]["right"]["reward"] for line in lines if line["kind"] == "step"] for lines in episodes]
@@ -101,9 +90,9 @@ def test_a_recording_with_several_players_ends_with_all_scores(launch, open_clie
     assert [head["seed"] for head in heads] == [14, 15], "seed: the first; each after it has the next"
 
 
-def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
+async def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
     server = launch(two_players(act="time.sleep(0.2)"), trial=TRIAL | {"startingFrameRate": 20})
-    play_and_end(server, open_client, frames=30)
+    await play_and_end(server, open_client, frames=30)
     lines = steps(server)
     parts = [line["players"]["right"] for line in lines]
     assert "late" in {part["by"] for part in parts}
@@ -126,9 +115,9 @@ def test_a_slow_policy_is_late_and_delays_no_step(launch, open_client):
         ("return None", "None"),
     ],
 )
-def test_a_policy_that_fails_is_logged_once_and_the_game_goes_on(launch, open_client, act, said):
+async def test_a_policy_that_fails_is_logged_once_and_the_game_goes_on(launch, open_client, act, said):
     server = launch(two_players(act=act), trial=TRIAL | {"startingFrameRate": 10})
-    client = play_and_end(server, open_client, frames=8)
+    client = await play_and_end(server, open_client, frames=8)
     assert client.errors == [], "the participant can do nothing about it"
     parts = [line["players"]["right"] for line in steps(server)]
     assert len(parts) >= 6
@@ -144,32 +133,28 @@ def test_a_policy_that_fails_is_logged_once_and_the_game_goes_on(launch, open_cl
     assert any(line["kind"] == "error" and line.get("player") == "right" for line in lines)
 
 
-def test_the_log_of_a_policy_that_fails_does_not_hold_the_participants_id(launch, open_client):
+async def test_the_log_of_a_policy_that_fails_does_not_hold_the_participants_id(launch, open_client):
     server = launch(two_players(act="raise ValueError('not for ' + __import__('os').environ['USER_ID'])"), trial=TRIAL)
-    play_and_end(server, open_client)
+    await play_and_end(server, open_client)
     assert "ValueError: not for (participant)" in server.log_text()
     assert "P1" not in server.log_text()
 
 
-def test_a_policy_that_hangs_delays_no_step(launch, open_client):
+async def test_a_policy_that_hangs_delays_no_step(launch, open_client):
     server = launch(two_players(act="time.sleep(3600)"), trial=TRIAL | {"startingFrameRate": 30})
     began = time.monotonic()
-    play_and_end(server, open_client, frames=15)
+    await play_and_end(server, open_client, frames=15)
     assert time.monotonic() - began < 12
     assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
 
 
-def test_a_server_ends_well_although_a_policys_file_takes_hours(launch, open_client, tmp_path):
+async def test_a_server_ends_well_although_a_policys_file_takes_hours(launch, open_client, tmp_path):
     onnx_files.endless(tmp_path / "agent/policies/p.onnx")
     players = {"left": "human", "right": "policies/p.onnx"}
     server = launch(two_players(length=5), trial=TRIAL | {"players": players, "maxEpisodes": 1})
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.play(1)
-            await client.until(lambda: client.done)
-
-    asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.play(1)
+        await client.until(lambda: client.done)
     assert server.wait() == 0, server.log_text()
     assert {line["players"]["right"]["by"] for line in steps(server)} == {"late"}
 
@@ -183,21 +168,17 @@ def test_a_server_ends_well_although_a_policys_file_takes_hours(launch, open_cli
         ({"left": "human", "right": "policies/gone.onnx"}, "there is no file policies/gone.onnx"),
     ],
 )
-def test_players_that_do_not_fit_are_named_before_the_game(launch, open_client, players, said):
+async def test_players_that_do_not_fit_are_named_before_the_game(launch, open_client, players, said):
     server = launch(two_players(), trial={**TRIAL, "players": players})
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.hello()
-            return await client.closed()
-
-    assert asyncio.run(run()) == 1011
+    async with open_client(server.address) as client:
+        await client.hello()
+        assert await client.closed() == 1011
     assert server.wait() == 3, "the agent cannot be started"
     assert said in server.log_text()
     assert "Traceback" not in server.log_text()
 
 
-def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_client):
+async def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_client):
     trial = TRIAL | {"maxEpisodes": 1, "startingFrameRate": 10}
     server = launch(two_players(length=3), trial=trial, GAME_STEPS="2,3")
 
@@ -209,7 +190,7 @@ def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_cl
             await client.until(lambda: client.done)
 
     for step in ("2", "3"):
-        asyncio.run(run(step))
+        await run(step)
     assert server.wait() == 0
     for step in ("2", "3"):
         (lines,) = server.recordings(f"{step}-*.gz").values()
@@ -221,13 +202,13 @@ def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, open_cl
 # ---- an interrupted game
 
 
-def test_an_interrupted_game_of_two_players_goes_on_where_it_was(launch, open_client):
+async def test_an_interrupted_game_of_two_players_goes_on_where_it_was(launch, open_client):
     trial = TRIAL | {"startingFrameRate": 20, "frameSkip": 2}
     first = launch(two_players(), trial=trial, SERVER="a-1")
-    play_and_end(first, open_client, frames=9, keys=["down"])
+    await play_and_end(first, open_client, frames=9, keys=["down"])
     before = steps(first, "a-1")
     second = launch(two_players(), trial=trial, SERVER="a-2")
-    play_and_end(second, open_client, frames=6)
+    await play_and_end(second, open_client, frames=6)
     after = steps(second, "a-2")
     assert [line["step"] for line in before + after] == list(range(1, len(before + after) + 1)), second.log_text()
     parts = [line["players"]["right"] for line in before + after]
@@ -253,28 +234,24 @@ def steps_until_the_last_answer(lines):
 # ---- turn by turn
 
 
-def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(launch, open_client):
+async def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(launch, open_client):
     server = launch(two_players(turns=True), trial=TRIAL | {"pace": "turns", "startingFrameRate": 10})
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            assert client.controls["pace"] == "turns"
-            await client.say(command="start")
-            await client.until(lambda: client.state.get("toAct"))
-            waiting = len(client.frames)
-            await client.watch(0.5)
-            assert len(client.frames) == waiting, "no step for a participant who pressed nothing"
-            await client.say(action="up", held=True)
-            await client.until(lambda: len(client.frames) >= waiting + 2)
-            await client.until(lambda: client.state.get("toAct"))
-            await client.watch(0.4)
-            assert len(client.frames) == waiting + 2, "a key that is held acts once"
-            server.terminate()
-            await client.closed()
-
-    asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        assert client.controls["pace"] == "turns"
+        await client.say(command="start")
+        await client.until(lambda: client.state.get("toAct"))
+        waiting = len(client.frames)
+        await client.watch(0.5)
+        assert len(client.frames) == waiting, "no step for a participant who pressed nothing"
+        await client.say(action="up", held=True)
+        await client.until(lambda: len(client.frames) >= waiting + 2)
+        await client.until(lambda: client.state.get("toAct"))
+        await client.watch(0.4)
+        assert len(client.frames) == waiting + 2, "a key that is held acts once"
+        server.terminate()
+        await client.closed()
     assert server.wait() == 0
     mine, theirs = steps(server)
     assert theirs["ns"] - mine["ns"] > 50_000_000, "the participant sees each move"
@@ -284,24 +261,24 @@ def test_the_game_waits_for_the_participant_and_then_shows_the_partners_move(lau
     assert (theirs["players"]["left"]["action"], theirs["toAct"]) == (None, ["left"])
 
 
-def test_a_turn_of_limited_time_ends_without_a_press(launch, open_client):
+async def test_a_turn_of_limited_time_ends_without_a_press(launch, open_client):
     keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.2, "turnEnds": "random", "seed": 5}
     server = launch(two_players(turns=True), trial=TRIAL | keys)
-    play_and_end(server, open_client, frames=6)
+    await play_and_end(server, open_client, frames=6)
     mine = [line["players"]["left"] for line in steps(server)[::2]]
     assert {part["by"] for part in mine} == {"random"}
 
 
-def test_a_policy_has_policy_seconds_in_its_turn(launch, open_client):
+async def test_a_policy_has_policy_seconds_in_its_turn(launch, open_client):
     keys = {"pace": "turns", "startingFrameRate": 60, "turnSeconds": 0.1, "policySeconds": 0.3}
     server = launch(two_players(turns=True, act="time.sleep(3600)"), trial=TRIAL | keys)
-    play_and_end(server, open_client, frames=5)
+    await play_and_end(server, open_client, frames=5)
     assert [line["players"]["right"]["by"] for line in steps(server)[1::2]][:2] == ["late", "late"]
 
 
-def test_seeds_of_policies_follow_from_the_episodes(launch, open_client):
+async def test_seeds_of_policies_follow_from_the_episodes(launch, open_client):
     act = "return (self.seed + self.asked) % 3\n\n    def reset(self, seed):\n        self.seed, self.asked = seed, 0"
     server = launch(two_players(act=act), trial=TRIAL | {"seed": 4})
-    play_and_end(server, open_client, frames=3)
+    await play_and_end(server, open_client, frames=3)
     expected = int.from_bytes(hashlib.sha256(b"4\0right").digest()[:8], "big") % 2**31
     assert steps(server)[0]["players"]["right"]["action"] == (expected + 1) % 3

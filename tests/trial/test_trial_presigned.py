@@ -1,6 +1,5 @@
 """A server without rights reads and stores everything by presigned requests, which it asks for one by one."""
 
-import asyncio
 import contextlib
 import json
 import os
@@ -82,22 +81,19 @@ def town():
         yield made
 
 
-def play_game(launched, open_client, *, frames=10, stop=True):
-    async def run():
-        async with open_client(launched.address) as client:
-            await client.play(frames)
-            if stop:
-                await client.say(command="stop")
-                await client.until(lambda: client.done)
-            return client
-
-    return asyncio.run(run())
+async def play_game(launched, open_client, *, frames=10, stop=True):
+    async with open_client(launched.address) as client:
+        await client.play(frames)
+        if stop:
+            await client.say(command="stop")
+            await client.until(lambda: client.done)
+        return client
 
 
-def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
+async def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_client):
     record = town.start()
     running = launch(trial={"ui": UI}, **town.variables(record))
-    play_game(running, open_client)
+    await play_game(running, open_client)
     assert running.wait() == 0
     assert json.loads(town.body(ANSWER))["answers"]["outcome"] == "stopped"
     ((key, lines),) = town.recordings(record.name).items()
@@ -126,14 +122,14 @@ def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_clie
     }
 
 
-def test_neither_the_log_nor_the_agent_gets_a_secret(town, launch, open_client):
+async def test_neither_the_log_nor_the_agent_gets_a_secret(town, launch, open_client):
     record = town.start()
     spy = "\nimport os, sys\nprint(sorted(os.environ), file=sys.stderr, flush=True)\n"
     from tests.trial.conftest import grid_agent
 
     running = launch(agent=grid_agent() + spy, trial={"ui": UI}, **town.variables(record))
     town.failing = [500, 403]
-    play_game(running, open_client)
+    await play_game(running, open_client)
     assert running.wait() == 0
     said = running.log_text()
     assert "CREDENTIAL" not in said
@@ -142,17 +138,17 @@ def test_neither_the_log_nor_the_agent_gets_a_secret(town, launch, open_client):
         assert secret not in said
 
 
-def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
+async def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client):
     first = town.start()
     running = launch(trial={"ui": UI}, **town.variables(first))
-    play_game(running, open_client, frames=30, stop=False)
+    await play_game(running, open_client, frames=30, stop=False)
     lost = town.close(first, Reason.LOST)  # its end is known before it has stored what it recorded
     running.terminate()
     assert running.wait() == 0
     (before,) = town.recordings(first.name).values()
     second = town.start(attempt=2, before=lost)
     after = launch(trial={"ui": UI}, **town.variables(second))
-    client = play_game(after, open_client)
+    client = await play_game(after, open_client)
     assert after.wait() == 0
     assert client.errors == []
     (lines,) = town.recordings(second.name).values()
@@ -160,35 +156,31 @@ def test_the_next_server_goes_on_where_a_lost_one_was(town, launch, open_client)
     assert lines[0]["seed"] == before[0]["seed"]
 
 
-def test_the_answer_of_a_game_that_ended_before_the_stop_message_is_stored_after_it(town, launch, open_client):
+async def test_the_answer_of_a_game_that_ended_before_the_stop_message_is_stored_after_it(town, launch, open_client):
     record = town.start()
     running = launch(trial={"ui": UI}, LINGER_SECONDS="30", **town.variables(record))
-
-    async def run():
-        async with open_client(running.address) as client:
-            await client.play(10)
-            town.failing = [503] * 100_000  # S3 is busy while the game ends
-            await client.say(command="stop")
-            await client.until(lambda: client.state.get("state") == "ended")
-            assert town.body(ANSWER) is None
-            town.close(record)
-            running.terminate()
-            town.failing = []
-            with contextlib.suppress(Exception):
-                await client.closed()
-
-    asyncio.run(run())
+    async with open_client(running.address) as client:
+        await client.play(10)
+        town.failing = [503] * 100_000  # S3 is busy while the game ends
+        await client.say(command="stop")
+        await client.until(lambda: client.state.get("state") == "ended")
+        assert town.body(ANSWER) is None
+        town.close(record)
+        running.terminate()
+        town.failing = []
+        with contextlib.suppress(Exception):
+            await client.closed()
     assert running.wait(40) == 0
     assert town.body(ANSWER) is not None
     assert town.recordings(record.name)
 
 
-def test_a_warm_server_learns_its_participant_and_stores_in_their_folder(town, launch, open_client):
+async def test_a_warm_server_learns_its_participant_and_stores_in_their_folder(town, launch, open_client):
     warm_server = town.start_warm("the-secret-token")
     running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.variables(warm_server))
     time.sleep(0.5)
     own = town.hand_over(warm_server, USER)
-    play_game(running, open_client)
+    await play_game(running, open_client)
     assert running.wait() == 0
     assert town.body(ANSWER) is not None
     assert town.recordings(own)
@@ -212,7 +204,7 @@ def test_a_file_is_stored_whole(town, tmp_path):
     assert town.body(key) == path.read_bytes()
 
 
-def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(town, tmp_path, monkeypatch):
+async def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(town, tmp_path, monkeypatch):
     record, path, losses = town.start(), tmp_path / "recording", iter([True])
     key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
     path.write_bytes(b"the recording")
@@ -225,18 +217,18 @@ def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(town, t
         return reply
 
     monkeypatch.setattr(presigned, "_send", send_and_lose_the_first_put)
-    asyncio.run(store_file(town.store(record), key, path))
+    await store_file(town.store(record), key, path)
     assert [each for each in town.documents.kept if each.startswith(FOLDER)] == [key]
     assert not path.exists()
     assert town.store(record).create(key, b"the recording") is False
 
 
-def test_another_recording_with_the_same_name_is_stored_under_a_number(town, tmp_path):
+async def test_another_recording_with_the_same_name_is_stored_under_a_number(town, tmp_path):
     record, path = town.start(), tmp_path / "recording"
     folder = f"{FOLDER}/trials/{record.name}"
     town.documents.put(f"{folder}/3-trial.jsonl.gz", b"that of an earlier process")
     path.write_bytes(b"the recording")
-    asyncio.run(store_file(town.store(record), f"{folder}/3-trial.jsonl.gz", path))
+    await store_file(town.store(record), f"{folder}/3-trial.jsonl.gz", path)
     assert town.body(f"{folder}/3-trial.jsonl.gz") == b"that of an earlier process"
     assert town.body(f"{folder}/3-trial-2.jsonl.gz") == b"the recording"
 

@@ -1,6 +1,5 @@
 """After a server is lost, the game goes on where it was on the next server."""
 
-import asyncio
 import json
 
 import pytest
@@ -19,21 +18,16 @@ DICE = (
 )
 
 
-def play(server, open_client, frames, *, stop=False):
+async def play(server, open_client, frames, *, stop=False):
     """Play until `frames` pictures were seen, then end the server; return the client."""
-
-    async def run():
-        async with open_client(server.address) as client:
-            await client.play(frames)
-            if stop:
-                await client.say(command="stop")
-                await client.until(lambda: client.done)
-            else:
-                server.terminate()
-                await client.closed()
-            return client
-
-    client = asyncio.run(run())
+    async with open_client(server.address) as client:
+        await client.play(frames)
+        if stop:
+            await client.say(command="stop")
+            await client.until(lambda: client.done)
+        else:
+            server.terminate()
+            await client.closed()
     assert server.wait() == 0
     return client
 
@@ -43,13 +37,13 @@ def steps(lines):
 
 
 @pytest.mark.parametrize("data_file", ["episode", "trial"])
-def test_the_game_goes_on_after_the_last_recorded_step(launch, open_client, data_file):
+async def test_the_game_goes_on_after_the_last_recorded_step(launch, open_client, data_file):
     trial = {"ui": {"stop": True, "start": True}, "dataFile": data_file}
     first = launch(trial=trial, SERVER="a-1")
-    play(first, open_client, 30)
+    await play(first, open_client, 30)
     ((_, before),) = first.recordings(server="a-1").items()
     second = launch(trial=trial, SERVER="a-2")
-    client = play(second, open_client, 10, stop=True)
+    client = await play(second, open_client, 10, stop=True)
     ((_, after),) = second.recordings(server="a-2").items()
     assert client.errors == []
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
@@ -62,40 +56,35 @@ def test_the_game_goes_on_after_the_last_recorded_step(launch, open_client, data
     assert client.done["score"] == answers["score"]
 
 
-def test_the_first_picture_is_that_of_the_last_recorded_step(launch, open_client):
+async def test_the_first_picture_is_that_of_the_last_recorded_step(launch, open_client):
     first = launch(SERVER="a-1")
-    play(first, open_client, 30)
+    await play(first, open_client, 30)
     (before,) = first.recordings(server="a-1").values()
     second = launch(SERVER="a-2")
-
-    async def look():
-        async with open_client(second.address) as client:
-            await client.hello()
-            await client.until(lambda: client.frame is not None)
-            return client
-
-    client = asyncio.run(look())
+    async with open_client(second.address) as client:
+        await client.hello()
+        await client.until(lambda: client.frame is not None)
     reached = len(steps(before))
     assert client.frame[reached % 20, reached % 30].tolist() == [255, 255, 255]
     assert client.state["state"] == "ready"
     assert client.state["score"] == 1.5 * reached
 
 
-def test_a_third_server_goes_on_after_the_second(launch, open_client):
+async def test_a_third_server_goes_on_after_the_second(launch, open_client):
     total = 0
     for attempt in (1, 2):
         server = launch(SERVER=f"a-{attempt}")
-        play(server, open_client, 20)
+        await play(server, open_client, 20)
         (lines,) = server.recordings(server=f"a-{attempt}").values()
         total += len(steps(lines))
     third = launch(trial={"ui": {"stop": True, "start": True}}, SERVER="a-3")
-    play(third, open_client, 5, stop=True)
+    await play(third, open_client, 5, stop=True)
     (lines,) = third.recordings(server="a-3").values()
     assert lines[1]["steps"] == total
     assert third.answer()["answers"]["frames"] == total + len(steps(lines))
 
 
-def test_finished_episodes_are_not_played_again(launch, open_client, grid):
+async def test_finished_episodes_are_not_played_again(launch, open_client, grid):
     trial = {"maxEpisodes": 3, "startingFrameRate": 60}
     waits = (
         "\nimport os, time\nclass Agent(Agent):\n    def step(self, action):\n"
@@ -105,26 +94,18 @@ def test_finished_episodes_are_not_played_again(launch, open_client, grid):
         "        open('begun', 'w').close()\n        return super().reset(seed)\n"
     )
     first = launch(agent=grid(12) + waits, trial=trial, SERVER="a-1")
-
-    async def until_the_second_episode():
-        async with open_client(first.address) as client:
-            await client.play(1)
-            await client.until(lambda: client.state["episode"] == 2)
-            first.terminate()
-            first.log.with_name("go_on").touch()  # its step is over, and the server ends
-            await client.closed()
-
-    asyncio.run(until_the_second_episode())
+    async with open_client(first.address) as client:
+        await client.play(1)
+        await client.until(lambda: client.state["episode"] == 2)
+        first.terminate()
+        first.log.with_name("go_on").touch()  # its step is over, and the server ends
+        await client.closed()
     assert first.wait() == 0
     assert list(first.recordings(server="a-1")) == ["3-episode-0001.jsonl.gz", "3-episode-0002.jsonl.gz"]
     second = launch(agent=grid(12), trial=trial, SERVER="a-2")
-
-    async def finish():
-        async with open_client(second.address) as client:
-            await client.play(2)
-            await client.until(lambda: client.done)
-
-    asyncio.run(finish())
+    async with open_client(second.address) as client:
+        await client.play(2)
+        await client.until(lambda: client.done)
     assert second.wait() == 0
     assert list(second.recordings(server="a-2")) == ["3-episode-0002.jsonl.gz", "3-episode-0003.jsonl.gz"]
     answers = second.answer()["answers"]
@@ -132,13 +113,13 @@ def test_finished_episodes_are_not_played_again(launch, open_client, grid):
     assert answers["score"] == 54
 
 
-def test_the_next_server_stores_the_missing_answer_of_a_finished_game(launch, open_client, grid):
+async def test_the_next_server_stores_the_missing_answer_of_a_finished_game(launch, open_client, grid):
     first = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-1")
-    asyncio.run(_until_done(first, open_client))
+    await _until_done(first, open_client)
     assert first.wait() == 0
     (first.store / "study/users/P1/answers/3.json").unlink()  # as if the server had been lost just before
     second = launch(agent=grid(5), trial={"maxEpisodes": 1}, SERVER="a-2")
-    asyncio.run(_until_done(second, open_client, start=False))
+    await _until_done(second, open_client, start=False)
     assert second.answer()["answers"]["outcome"] == "finished"
     assert second.answer()["answers"]["frames"] == 5
 
@@ -151,12 +132,12 @@ async def _until_done(server, open_client, start=True):
         await client.until(lambda: client.done)
 
 
-def test_an_episode_whose_replay_differs_begins_again(launch, open_client, grid):
+async def test_an_episode_whose_replay_differs_begins_again(launch, open_client, grid):
     trial = {"ui": {"stop": True, "start": True}}
     first = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-1")
-    play(first, open_client, 20)
+    await play(first, open_client, 20)
     second = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-2")
-    client = play(second, open_client, 5, stop=True)
+    client = await play(second, open_client, 5, stop=True)
     assert [words for words in client.errors if "begins again" in words]
     (lines,) = second.recordings(server="a-2").values()
     assert [line["kind"] for line in lines[:2]] == ["header", "reset"]
@@ -165,13 +146,13 @@ def test_an_episode_whose_replay_differs_begins_again(launch, open_client, grid)
     assert "begins again" in second.log_text()
 
 
-def test_after_a_damaged_recording_the_next_server_still_plays(launch, open_client):
+async def test_after_a_damaged_recording_the_next_server_still_plays(launch, open_client):
     first = launch(SERVER="a-1")
-    play(first, open_client, 20)
+    await play(first, open_client, 20)
     (file,) = (first.store / "study/users/P1/trials/a-1").glob("*.gz")
     file.write_bytes(b"no gzip at all")
     second = launch(trial={"ui": {"stop": True, "start": True}}, SERVER="a-2")
-    play(second, open_client, 5, stop=True)
+    await play(second, open_client, 5, stop=True)
     assert second.answered()
 
 

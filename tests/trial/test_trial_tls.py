@@ -46,25 +46,21 @@ def put(folder, serial):
 KEYS = {"SSL_FULLCHAIN": "ssl/fullchain.pem", "SSL_PRIVKEY": "ssl/privkey.pem", "TLS": "on"}
 
 
-def test_a_participant_plays_over_tls(launch, open_client, grid, tmp_path):
+async def test_a_participant_plays_over_tls(launch, open_client, grid, tmp_path):
     chain = put(tmp_path / "store" / "ssl", 1)
     server = launch(grid(30), {"maxEpisodes": 9, "startingFrameRate": 60, "ui": {"stop": True}}, **KEYS)
     trusted = ssl.create_default_context(cadata=chain.decode())
-
-    async def play():
-        async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
-            await client.hello()
-            await client.say(command="start")
-            await client.until(lambda: len(client.frames) > 10 and client.state["episode"] > 1)
-            await client.say(command="stop")
-            assert await client.closed() == 1000
-            assert client.done["episodes"] >= 1
-
-    asyncio.run(play())
+    async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
+        await client.hello()
+        await client.say(command="start")
+        await client.until(lambda: len(client.frames) > 10 and client.state["episode"] > 1)
+        await client.say(command="stop")
+        assert await client.closed() == 1000
+        assert client.done["episodes"] >= 1
     assert server.wait() == 0
 
 
-def test_a_running_server_takes_a_renewed_certificate(tmp_path):
+async def test_a_running_server_takes_a_renewed_certificate(tmp_path):
     put(tmp_path / "ssl", 1)
     required = {
         "PROJECT_ID": "a",
@@ -78,21 +74,17 @@ def test_a_running_server_takes_a_renewed_certificate(tmp_path):
     served = Certificate(TrialSettings.from_env({**required, **KEYS}), FolderStore(tmp_path))
     assert served.load() is True
     assert served.load() is False
-
-    async def serial():
-        server = await asyncio.start_server(lambda r, w: w.close(), "127.0.0.1", 0, ssl=served.context)
-        port = server.sockets[0].getsockname()[1]
-        async with server:
-            serials = []
-            for number in (1, 2):
-                if number == 2:
-                    put(tmp_path / "ssl", 2)
-                    assert served.load() is True
-                pem = await asyncio.to_thread(ssl.get_server_certificate, ("127.0.0.1", port))
-                serials.append(x509.load_pem_x509_certificate(pem.encode()).serial_number)
-            return serials
-
-    assert asyncio.run(serial()) == [1, 2]
+    server = await asyncio.start_server(lambda r, w: w.close(), "127.0.0.1", 0, ssl=served.context)
+    port = server.sockets[0].getsockname()[1]
+    async with server:
+        serials = []
+        for number in (1, 2):
+            if number == 2:
+                put(tmp_path / "ssl", 2)
+                assert served.load() is True
+            pem = await asyncio.to_thread(ssl.get_server_certificate, ("127.0.0.1", port))
+            serials.append(x509.load_pem_x509_certificate(pem.encode()).serial_number)
+        assert serials == [1, 2]
 
 
 def test_a_missing_certificate_ends_the_process(tmp_path, launch):

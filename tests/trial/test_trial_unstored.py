@@ -34,12 +34,12 @@ def outcomes(store):
     return {each: answer(store, each)["answers"]["outcome"] for each in MEMBERS}
 
 
-def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_while(launch, tmp_path):
+async def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_while(launch, tmp_path):
     """The members go on, and the server stays until the store takes the recording."""
     server = launch_session(launch, SPOOL=str(tmp_path / "spool"), **{SECONDS: "1.5"})
     form(server.store)
     in_the_way = refuse_recordings(server.store)
-    codes, waited = asyncio.run(play_to_the_end(server))
+    codes, waited = await play_to_the_end(server)
     assert codes == [1000, 1000], server.log_text()
     assert waited > 1.4
     assert outcomes(server.store) == {"anna": "stopped", "bert": "partnerLeft"}
@@ -51,50 +51,42 @@ def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_while(lau
     assert lines[-1]["kind"] == "end"
 
 
-def test_a_server_that_is_told_to_end_keeps_the_answers_without_the_recording(launch, tmp_path):
+async def test_a_server_that_is_told_to_end_keeps_the_answers_without_the_recording(launch, tmp_path):
     server = launch_session(launch, SPOOL=str(tmp_path / "spool"), STOP_SECONDS="15")
     form(server.store)
     refuse_recordings(server.store)
-
-    async def run():
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
-            await anna.say(command="stop")
-            await asyncio.gather(*(each.until(lambda each=each: "ended" in each.states) for each in (anna, bert)))
-            server.terminate()
-            await asyncio.gather(anna.closed(), bert.closed())
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
+        await anna.say(command="stop")
+        await asyncio.gather(*(each.until(lambda each=each: "ended" in each.states) for each in (anna, bert)))
+        server.terminate()
+        await asyncio.gather(anna.closed(), bert.closed())
     server.wait()
     assert outcomes(server.store) == {"anna": "stopped", "bert": "partnerLeft"}
     (left,) = (tmp_path / "spool").rglob("*.part")
     assert recording.read(left.read_bytes())[-1]["kind"] == "end", "on one machine the next process stores it"
 
 
-def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
+async def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
     server = launch(trial={"ui": TRIAL["ui"]}, SPOOL=str(tmp_path / "spool"), **{SECONDS: "0.5"})
     in_the_way = server.store / "study/users/P1/trials"
     in_the_way.parent.mkdir(parents=True)
     in_the_way.touch()
-
-    async def run():
-        async with client_of(server.address) as client:
-            await client.play()
-            await client.say(command="stop")
-            return await client.closed()
-
-    assert asyncio.run(run()) == 1000
+    async with client_of(server.address) as client:
+        await client.play()
+        await client.say(command="stop")
+        assert await client.closed() == 1000
     assert server.answer()["answers"]["outcome"] == "stopped"
     in_the_way.unlink()
     assert server.wait(25) == 0
     assert server.recordings()
 
 
-def test_answers_are_stored_after_the_recording_if_that_can_be_stored(launch):
+async def test_answers_are_stored_after_the_recording_if_that_can_be_stored(launch):
     """The usual order: a program that reads the answer finds the recording."""
     server = launch_session(launch)
     form(server.store)
-    asyncio.run(play_to_the_end(server))
+    await play_to_the_end(server)
     assert server.wait() == 0
     (recorded,) = (server.store / f"study/sessions/{SID}/trials/pair-1").glob("*.gz")
     answers = [server.store / f"study/users/{each}/answers/3.json" for each in MEMBERS]
@@ -116,98 +108,82 @@ async def seen_by_both(anna, bert):
     await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
 
 
-def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
+async def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
     """The answer of one member is refused: they wait as a participant who plays alone does, until the store takes it."""
     server = launch_session(launch)
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
-
-    async def run():
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await seen_by_both(anna, bert)
-            await bert.say(command="stop")
-            assert await anna.closed() == 1000
-            assert anna.done["outcome"] == "partnerLeft"
-            async with member(server, "anna") as again:
-                assert await again.closed() == 1000, "also on another page"
-            async with member(server, "bert") as again:
-                assert (again.state["state"], again.done) == ("ended", None)
-                in_the_way.unlink()
-                assert await again.closed() == 1000
-                assert again.done["outcome"] == "stopped"
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await seen_by_both(anna, bert)
+        await bert.say(command="stop")
+        assert await anna.closed() == 1000
+        assert anna.done["outcome"] == "partnerLeft"
+        async with member(server, "anna") as again:
+            assert await again.closed() == 1000, "also on another page"
+        async with member(server, "bert") as again:
+            assert (again.state["state"], again.done) == ("ended", None)
+            in_the_way.unlink()
+            assert await again.closed() == 1000
+            assert again.done["outcome"] == "stopped"
     assert server.wait() == 0
     assert outcomes(server.store) == {"anna": "partnerLeft", "bert": "stopped"}
 
 
-def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_deadline(launch):
+async def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_deadline(launch):
     server = launch_session(launch, DEADLINE=str(time.time() + 8), STOP_SECONDS="15")
     form(server.store)
     refuse_answers_of(server.store, "bert")
-
-    async def run():
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await seen_by_both(anna, bert)
-            await anna.say(command="stop")
-            assert await anna.closed() == 1000
-            assert await bert.closed() == 1001
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await seen_by_both(anna, bert)
+        await anna.say(command="stop")
+        assert await anna.closed() == 1000
+        assert await bert.closed() == 1001
     assert server.wait(25) == 0
     assert "ending: deadline" in server.log_text()
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
 
-def test_the_next_game_step_is_played_while_a_members_answer_to_the_one_before_is_refused(launch):
+async def test_the_next_game_step_is_played_while_a_members_answer_to_the_one_before_is_refused(launch):
     section = {"gather": 4, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
     server = launch_session(launch, trial=section, GAME_STEPS="3,5", LINGER_SECONDS="4")
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
-
-    async def run():
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await seen_by_both(anna, bert)
-            await anna.say(command="stop")
-            await anna.closed()
-            async with member(server, "anna", step="5") as later, member(server, "bert") as again:
-                await later.until(lambda: len(later.frames) > 5)
-                await later.say(command="stop")
-                await later.closed()
-                assert (again.state["state"], again.done) == ("ended", None)
-                in_the_way.unlink()
-                assert await again.closed() == 1000
-            async with member(server, "bert", step="5") as later:
-                assert await later.closed() == 1000
-
-    asyncio.run(run())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await seen_by_both(anna, bert)
+        await anna.say(command="stop")
+        await anna.closed()
+        async with member(server, "anna", step="5") as later, member(server, "bert") as again:
+            await later.until(lambda: len(later.frames) > 5)
+            await later.say(command="stop")
+            await later.closed()
+            assert (again.state["state"], again.done) == ("ended", None)
+            in_the_way.unlink()
+            assert await again.closed() == 1000
+        async with member(server, "bert", step="5") as later:
+            assert await later.closed() == 1000
     assert server.wait() == 0
     steps = [{each: answer(server.store, each, step)["answers"]["outcome"] for each in MEMBERS} for step in "35"]
     assert steps == [{"anna": "stopped", "bert": "partnerLeft"}, {"anna": "stopped", "bert": "left"}]
 
 
-def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_before_the_game(launch):
+async def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_before_the_game(launch):
     """Their answer is given to the store while the others still play, and may be stored long after their game."""
     section = {"maxPing": 1000, "pingSamples": 3, "afterAbsent": "policy", "substitute": "idle"}
     server = launch_session(launch, trial=section)
     form(server.store)
     in_the_way = refuse_answers_of(server.store, "bert")
-
-    async def run():
-        async with (
-            far_away(server.port, 0.6) as port,
-            member(server, "anna") as anna,
-            member(server, "bert", port=port) as bert,
-        ):
-            reading = asyncio.create_task(bert.watch(60))
-            await anna.until(lambda: len(anna.frames) > 5)
-            await anna.say(command="stop")
-            assert await anna.closed() == 1000
-            reading.cancel()
-        await asyncio.sleep(1)  # well after LINGER_SECONDS
-        assert server.process.poll() is None, "an answer is not stored yet"
-        in_the_way.unlink()
-
-    asyncio.run(run())
+    async with (
+        far_away(server.port, 0.6) as port,
+        member(server, "anna") as anna,
+        member(server, "bert", port=port) as bert,
+    ):
+        reading = asyncio.create_task(bert.watch(60))
+        await anna.until(lambda: len(anna.frames) > 5)
+        await anna.say(command="stop")
+        assert await anna.closed() == 1000
+        reading.cancel()
+    await asyncio.sleep(1)  # well after LINGER_SECONDS
+    assert server.process.poll() is None, "an answer is not stored yet"
+    in_the_way.unlink()
     assert server.wait() == 0
     assert outcomes(server.store) == {"anna": "stopped", "bert": "ping"}

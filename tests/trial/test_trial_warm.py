@@ -98,38 +98,30 @@ def steps(lines):
 # ---- before the handover
 
 
-def test_a_warm_server_lets_no_client_in_before_it_is_handed_over(launch_warm_server, open_client):
+async def test_a_warm_server_lets_no_client_in_before_it_is_handed_over(launch_warm_server, open_client):
     server = launch_warm_server()
-
-    async def everybody():
-        assert "not open yet" in await refused(server, open_client, 1013)
-        await refused(server, open_client, 1013, userId="P2")
-        await refused(server, open_client, 1013, userId="")
-        await refused(server, open_client, 1013, userId=None)
-        await refused(server, open_client, 4401, token="wrong")
-        await refused(server, open_client, 4401, token="")
-        await refused(server, open_client, 4401, userId="", token=None)
-
-    asyncio.run(everybody())
+    assert "not open yet" in await refused(server, open_client, 1013)
+    await refused(server, open_client, 1013, userId="P2")
+    await refused(server, open_client, 1013, userId="")
+    await refused(server, open_client, 1013, userId=None)
+    await refused(server, open_client, 4401, token="wrong")
+    await refused(server, open_client, 4401, token="")
+    await refused(server, open_client, 4401, userId="", token=None)
     with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/healthz", timeout=20) as answer:
         assert answer.status == 200
     assert server.process.poll() is None
     assert not server.store.exists(), "nothing is recorded"
 
 
-def test_only_a_client_with_the_token_makes_a_warm_server_look(launch_warm_server, open_client):
+async def test_only_a_client_with_the_token_makes_a_warm_server_look(launch_warm_server, open_client):
     server = launch_warm_server()
-
-    async def strangers():
-        await refused(server, open_client, 1013)  # its first look is over
-        hand_over(server)
-        for _ in range(5):
-            await refused(server, open_client, 4401, token="wrong")
-        assert "assigned to a participant now" not in server.log_text()
-        await refused(server, open_client, 4401, userId="P2")
-        assert "assigned to a participant now" in server.log_text()
-
-    asyncio.run(strangers())
+    await refused(server, open_client, 1013)  # its first look is over
+    hand_over(server)
+    for _ in range(5):
+        await refused(server, open_client, 4401, token="wrong")
+    assert "assigned to a participant now" not in server.log_text()
+    await refused(server, open_client, 4401, userId="P2")
+    assert "assigned to a participant now" in server.log_text()
 
 
 def test_a_warm_server_waits_beyond_its_idle_time(launch_warm_server):
@@ -145,9 +137,9 @@ def test_the_deadline_ends_a_warm_server_without_a_participant(launch_warm_serve
     assert not server.store.exists()
 
 
-def test_sigterm_ends_a_warm_server_without_a_participant(launch_warm_server, open_client):
+async def test_sigterm_ends_a_warm_server_without_a_participant(launch_warm_server, open_client):
     server = launch_warm_server()
-    asyncio.run(refused(server, open_client, 1013))
+    await refused(server, open_client, 1013)
     server.terminate()
     assert server.wait() == 0
     assert "Traceback" not in server.log_text()
@@ -163,10 +155,10 @@ def test_a_warm_server_whose_agent_does_not_start_is_replaced(launch_warm_server
 # ---- after the handover
 
 
-def test_the_participant_plays_and_the_files_are_where_other_servers_store_them(launch_warm_server, open_client):
+async def test_the_participant_plays_and_the_files_are_where_other_servers_store_them(launch_warm_server, open_client):
     server = launch_warm_server()
     hand_over(server, group=2)
-    asyncio.run(play_to_the_end(server, open_client))
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answer()["group"] == 2
     assert server.answer()["answers"]["outcome"] == "stopped"
@@ -178,56 +170,45 @@ def test_the_participant_plays_and_the_files_are_where_other_servers_store_them(
     assert "P1" not in server.log_text()
 
 
-def test_no_other_participant_gets_in_with_the_same_token(launch_warm_server, open_client):
+async def test_no_other_participant_gets_in_with_the_same_token(launch_warm_server, open_client):
     server = launch_warm_server()
-
-    async def others():
-        await refused(server, open_client, 1013, userId="P2")
-        hand_over(server)
-        for user_id in ("P2", "", None, WARM_SERVER):
-            await refused(server, open_client, 4401, userId=user_id)
-        await refused(server, open_client, 4401, token="wrong")
-        await play_to_the_end(server, open_client)
-
-    asyncio.run(others())
+    await refused(server, open_client, 1013, userId="P2")
+    hand_over(server)
+    for user_id in ("P2", "", None, WARM_SERVER):
+        await refused(server, open_client, 4401, userId=user_id)
+    await refused(server, open_client, 4401, token="wrong")
+    await play_to_the_end(server, open_client)
 
 
-def test_a_page_that_came_too_early_gets_in_the_next_time(launch_warm_server, open_client):
+async def test_a_page_that_came_too_early_gets_in_the_next_time(launch_warm_server, open_client):
     server = launch_warm_server()
-
-    async def come_twice():
-        await refused(server, open_client, 1013)
-        hand_over(server)
-        await play_to_the_end(server, open_client)
-
-    asyncio.run(come_twice())
+    await refused(server, open_client, 1013)
+    hand_over(server)
+    await play_to_the_end(server, open_client)
     assert server.answered()
 
 
-def test_the_participant_gets_in_when_many_clients_come_at_the_handover(launch_warm_server, open_client):
+async def test_the_participant_gets_in_when_many_clients_come_at_the_handover(launch_warm_server, open_client):
     server = launch_warm_server(LINGER_SECONDS="60")
 
     async def come():
         with contextlib.suppress(AssertionError):  # too early, like a page that is opened again and again
             await refused(server, open_client, 0)
 
-    async def all_of_them():
-        coming = [asyncio.create_task(come()) for _ in range(20)]
-        await asyncio.sleep(0.02)
-        hand_over(server)
-        async with asyncio.timeout(30):  # no client may wait for a look that never comes
-            for _ in coming:
-                async with open_client(server.address) as client:
-                    with contextlib.suppress(ConnectionClosedError):
-                        await client.play()
-                        await client.say(command="stop")
-                    code = await client.closed()
-                assert code in (1000, 4409)
-                if code == 1000:
-                    break  # else one of the others came late, and took the game over
-            await asyncio.gather(*coming)
-
-    asyncio.run(all_of_them())
+    coming = [asyncio.create_task(come()) for _ in range(20)]
+    await asyncio.sleep(0.02)
+    hand_over(server)
+    async with asyncio.timeout(30):  # no client may wait for a look that never comes
+        for _ in coming:
+            async with open_client(server.address) as client:
+                with contextlib.suppress(ConnectionClosedError):
+                    await client.play()
+                    await client.say(command="stop")
+                code = await client.closed()
+            assert code in (1000, 4409)
+            if code == 1000:
+                break  # else one of the others came late, and took the game over
+        await asyncio.gather(*coming)
 
 
 class SlowStore:
@@ -242,34 +223,30 @@ class SlowStore:
         return self.answers.get(timeout=10)
 
 
-def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_look_finds_nothing():
+async def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_look_finds_nothing():
     """A look that began before a client asked may have missed a handover that was written just then."""
+    store, given_to = SlowStore(), []
 
-    async def run():
-        store, given_to = SlowStore(), []
+    async def hand_over(settings, given):
+        given_to.append(given)
 
-        async def hand_over(settings, given):
-            given_to.append(given)
-
-        search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
-        searching = asyncio.create_task(search.run(hand_over))
-        async with asyncio.timeout(10):
-            while not store.looks:
-                await asyncio.sleep(0.01)
-            first = asyncio.create_task(search.look())
+    search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
+    searching = asyncio.create_task(search.run(hand_over))
+    async with asyncio.timeout(10):
+        while not store.looks:
             await asyncio.sleep(0.01)
-            store.answers.put(None)
-            while store.looks < 2:
-                await asyncio.sleep(0.01)
-            assert not first.done()
-            second = asyncio.create_task(search.look())
+        first = asyncio.create_task(search.look())
+        await asyncio.sleep(0.01)
+        store.answers.put(None)
+        while store.looks < 2:
             await asyncio.sleep(0.01)
-            store.answers.put(json.dumps(GOOD).encode())
-            await asyncio.gather(first, second, searching)
-        assert given_to == [Handover("P1", None, OWN)]
-        assert store.looks == 2
-
-    asyncio.run(run())
+        assert not first.done()
+        second = asyncio.create_task(search.look())
+        await asyncio.sleep(0.01)
+        store.answers.put(json.dumps(GOOD).encode())
+        await asyncio.gather(first, second, searching)
+    assert given_to == [Handover("P1", None, OWN)]
+    assert store.looks == 2
 
 
 def test_the_idle_time_begins_at_the_handover(launch_warm_server):
@@ -284,79 +261,75 @@ def test_the_idle_time_begins_at_the_handover(launch_warm_server):
     assert not (server.store / "study/users").exists()
 
 
-def test_the_agent_starts_before_the_handover_and_knows_the_participant_at_the_first_reset(
+async def test_the_agent_starts_before_the_handover_and_knows_the_participant_at_the_first_reset(
     launch_warm_server, open_client, grid
 ):
     server = launch_warm_server(grid() + REPORTING, GROUP="7", USER_ID="somebody-else")
     assert server.process.stdout.readline() == "started\n", "before anybody comes"
     hand_over(server, group=1)
-    asyncio.run(play_to_the_end(server, open_client))
+    await play_to_the_end(server, open_client)
     (lines,) = server.recordings(server=OWN).values()
     nobody = {"USER_ID": None, "GROUP": None}
     assert lines[1]["info"]["before"] == [nobody, nobody]
     assert lines[1]["info"]["now"] == {"USER_ID": "P1", "GROUP": "1", "TOKEN": None}
 
 
-def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client, grid):
+async def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_client, grid):
     server = launch_warm_server(grid() + REPORTING)
     hand_over(server)
-    asyncio.run(play_to_the_end(server, open_client))
+    await play_to_the_end(server, open_client)
     (lines,) = server.recordings(server=OWN).values()
     assert lines[1]["info"]["now"]["GROUP"] == ""
     assert server.answer()["group"] is None
 
 
-def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
+async def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
     server = launch(SPARE="off", SERVER=WARM_SERVER)
     hand_over(server, user_id="P2")
-    asyncio.run(refused(server, open_client, 4401, userId="P2"))
+    await refused(server, open_client, 4401, userId="P2")
 
 
 # ---- one game on several servers
 
 
-def test_a_warm_server_goes_on_with_the_game_of_a_lost_server(launch, launch_warm_server, open_client):
+async def test_a_warm_server_goes_on_with_the_game_of_a_lost_server(launch, launch_warm_server, open_client):
     first = launch(trial={"ui": UI}, SERVER="a-1")
-    asyncio.run(play_and_end(first, open_client, 30))
+    await play_and_end(first, open_client, 30)
     assert first.wait() == 0
     (before,) = first.recordings(server="a-1").values()
     second = launch_warm_server()
     hand_over(second, own="a-2")
-    asyncio.run(play_to_the_end(second, open_client, 10))
+    await play_to_the_end(second, open_client, 10)
     (after,) = second.recordings(server="a-2").values()
     assert [line["kind"] for line in after[:2]] == ["header", "resume"]
     assert steps(before) + steps(after) == list(range(1, len(steps(before)) + len(steps(after)) + 1))
     assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
 
 
-def test_another_server_goes_on_with_the_game_of_a_lost_warm_server(launch, launch_warm_server, open_client):
+async def test_another_server_goes_on_with_the_game_of_a_lost_warm_server(launch, launch_warm_server, open_client):
     first = launch_warm_server()
     hand_over(first, own="a-1")
-    asyncio.run(play_and_end(first, open_client, 30))
+    await play_and_end(first, open_client, 30)
     assert first.wait() == 0
     (before,) = first.recordings(server="a-1").values()
     second = launch(trial={"ui": UI}, SERVER="a-2")
-    asyncio.run(play_to_the_end(second, open_client, 10))
+    await play_to_the_end(second, open_client, 10)
     (after,) = second.recordings(server="a-2").values()
     assert after[1]["kind"] == "resume"
     assert second.answer()["answers"]["frames"] == len(steps(before)) + len(steps(after))
 
 
-def test_a_warm_server_that_is_killed_and_started_again_keeps_what_it_recorded(launch_warm_server, open_client):
+async def test_a_warm_server_that_is_killed_and_started_again_keeps_what_it_recorded(launch_warm_server, open_client):
     first = launch_warm_server()
     hand_over(first)
-
-    async def play():
-        async with open_client(first.address) as client:
-            await client.play(40)
-            await client.watch(1)
-            first.process.kill()
-
-    asyncio.run(play())
+    async with open_client(first.address) as client:
+        await client.play(40)
+        await client.watch(1)
+        first.process.kill()
     first.wait()
     (part,) = first.store.rglob("*.part")
     again = launch_warm_server()
-    asyncio.run(play_to_the_end(again, open_client))
+    await play_to_the_end(again, open_client)
     assert again.wait() == 0
     assert not part.exists()
     assert len(again.recordings(server=OWN)) == 2
@@ -413,55 +386,43 @@ def test_any_document_is_read_or_refused(body):
     assert own.user_id or own.session
 
 
-def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_client):
+async def test_a_half_written_document_is_looked_at_again(launch_warm_server, open_client):
     server = launch_warm_server()
-
-    async def come():
-        for name in ("half", "nothing", "too deep", "a participant like a path"):
-            write_handover(server, HOSTILE[name])
-            await refused(server, open_client, 1013)
-        hand_over(server)
-        await play_to_the_end(server, open_client)
-
-    asyncio.run(come())
+    for name in ("half", "nothing", "too deep", "a participant like a path"):
+        write_handover(server, HOSTILE[name])
+        await refused(server, open_client, 1013)
+    hand_over(server)
+    await play_to_the_end(server, open_client)
     said = server.log_text()
     assert "cannot see whose this server is (its document is not JSON)" in said
     assert "Traceback" not in said
     assert "P1" not in said
 
 
-def test_the_server_asks_a_store_that_fails_again(launch_warm_server, open_client):
+async def test_the_server_asks_a_store_that_fails_again(launch_warm_server, open_client):
     server = launch_warm_server(SPARE_SECONDS="0.1")
     blocked = server.store / "study/spares"
     blocked.parent.mkdir(parents=True)
     blocked.write_text("a file where a folder must be")
-
-    async def come():
-        await refused(server, open_client, 1013)
-        await asyncio.sleep(0.5)
-        blocked.unlink()
-        hand_over(server)
-        await play_to_the_end(server, open_client)
-
-    asyncio.run(come())
+    await refused(server, open_client, 1013)
+    await asyncio.sleep(0.5)
+    blocked.unlink()
+    hand_over(server)
+    await play_to_the_end(server, open_client)
     said = server.log_text()
     assert said.count("cannot see whose this server is (NotADirectoryError") == 1, "said once, not at every look"
     assert WARM_SERVER not in said
 
 
-def test_clients_do_not_wait_long_for_a_store_that_hangs(launch_warm_server, open_client):
+async def test_clients_do_not_wait_long_for_a_store_that_hangs(launch_warm_server, open_client):
     server = launch_warm_server(HELLO_SECONDS="3")
     path = server.store / f"study/spares/{WARM_SERVER}.json"
     path.parent.mkdir(parents=True)
     os.mkfifo(path)  # a process that opens it waits for one that writes
-
-    async def come():
+    try:
         began = time.monotonic()
         await refused(server, open_client, 1013)
         assert 2.9 < time.monotonic() - began < 7
-
-    try:
-        asyncio.run(come())
     finally:
         server.terminate()
         waited_for = os.open(path, os.O_RDWR)  # frees the thread that waits, and later looks

@@ -57,24 +57,19 @@ async def steps(websocket: ClientConnection, count: int) -> list[dict[str, Any]]
     return found
 
 
-def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
+async def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
     server = launch(grid(20), {"gym": "watch", "maxEpisodes": 1, "recordObservations": True, "startingFrameRate": 60})
-
-    async def play() -> list[dict[str, Any]]:
-        async with program(server) as websocket:
-            assert await ask(websocket, "watch") is True
-            async with open_client(server.address) as client:
-                await client.hello()
-                await client.until(lambda: client.controls)
-                await client.say(action="right", held=True)
-                await client.say(command="start")
-                lines = [await next_line(websocket)]
-                while lines[-1]["kind"] != "end":
-                    lines.append(await next_line(websocket))
-                await client.closed()
-        return lines
-
-    lines = asyncio.run(play())
+    async with program(server) as websocket:
+        assert await ask(websocket, "watch") is True
+        async with open_client(server.address) as client:
+            await client.hello()
+            await client.until(lambda: client.controls)
+            await client.say(action="right", held=True)
+            await client.say(command="start")
+            lines = [await next_line(websocket)]
+            while lines[-1]["kind"] != "end":
+                lines.append(await next_line(websocket))
+            await client.closed()
     assert server.wait() == 0
     (recorded,) = server.recordings().values()
     assert lines == recorded[1:]  # without the header
@@ -82,14 +77,8 @@ def test_a_program_sees_each_step_as_it_is_recorded(launch, open_client, grid):
     assert {"reward", "action", "terminated", "observation"} <= lines[1].keys()
 
 
-def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(launch, open_client, grid):
+async def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(launch, open_client, grid):
     server = launch(grid(None), {"gym": "advise", "startingFrameRate": 30})
-
-    async def play() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        async with program(server) as websocket, open_client(server.address) as client:
-            await client.play()
-            async with client.reading():
-                return await advise(websocket, client)
 
     async def advise(websocket: ClientConnection, client: Any) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         assert await ask(websocket, "action_space") == {
@@ -106,7 +95,10 @@ def test_advice_is_taken_for_one_step_while_no_key_acts_and_recorded_as_such(lau
         await ask(websocket, "advise", action=3)
         return alone, await steps(websocket, 3)
 
-    alone, together = asyncio.run(play())
+    async with program(server) as websocket, open_client(server.address) as client:
+        await client.play()
+        async with client.reading():
+            alone, together = await advise(websocket, client)
     advised = [line for line in alone if line["by"] == "advice"]
     assert [(line["action"], line["actionName"], line["advice"], line["human"]) for line in advised] == [
         (3, "left", 3, None)
@@ -135,86 +127,59 @@ def test_a_resumed_trial_takes_the_recorded_advice_again() -> None:
         ([], 'a request is {"method": ..., "params": {...}}'),
     ],
 )
-def test_a_wrong_request_gets_a_sentence(launch, open_client, grid, request_, words):
+async def test_a_wrong_request_gets_a_sentence(launch, open_client, grid, request_, words):
     server = launch(grid(None), {"gym": "advise"})
-
-    async def play() -> Any:
-        async with program(server) as websocket, open_client(server.address) as client:
-            await client.play(1)
-            await websocket.send(json.dumps(request_))
-            return await next_line(websocket), await ask(websocket, "watch")
-
-    error, watching = asyncio.run(play())
+    async with program(server) as websocket, open_client(server.address) as client:
+        await client.play(1)
+        await websocket.send(json.dumps(request_))
+        error, watching = await next_line(websocket), await ask(websocket, "watch")
     assert error["error"]["message"] == words
     assert watching is True
 
 
-def test_a_program_may_not_advise_where_only_watching_is_allowed(launch, open_client, grid):
+async def test_a_program_may_not_advise_where_only_watching_is_allowed(launch, open_client, grid):
     server = launch(grid(None), {"gym": "watch"})
-
-    async def play() -> Any:
-        async with program(server) as websocket, open_client(server.address) as client:
-            await client.play(1)
-            return await ask(websocket, "advise", action=1)
-
-    assert "the project allows no advice" in asyncio.run(play())["error"]["message"]
+    async with program(server) as websocket, open_client(server.address) as client:
+        await client.play(1)
+        assert "the project allows no advice" in (await ask(websocket, "advise", action=1))["error"]["message"]
 
 
-def test_advice_before_the_game_is_refused(launch, grid):
+async def test_advice_before_the_game_is_refused(launch, grid):
     server = launch(grid(None), {"gym": "advise"})
-
-    async def play() -> Any:
-        async with program(server) as websocket:
-            return await ask(websocket, "advise", action=1), await ask(websocket, "action_space")
-
-    assert [answer["error"]["message"] for answer in asyncio.run(play())] == ["no game is going on"] * 2
+    async with program(server) as websocket:
+        answers = await ask(websocket, "advise", action=1), await ask(websocket, "action_space")
+    assert [answer["error"]["message"] for answer in answers] == ["no game is going on"] * 2
 
 
 @pytest.mark.parametrize("query", ["", "?token=", "?token=other"])
-def test_a_program_without_the_token_may_not_watch(launch, grid, query):
+async def test_a_program_without_the_token_may_not_watch(launch, grid, query):
     server = launch(grid(None), {"gym": "watch"})
-
-    async def come() -> int | None:
-        async with program(server, query) as websocket:
-            return await closed(websocket)
-
-    assert asyncio.run(come()) == 4401
+    async with program(server, query) as websocket:
+        assert await closed(websocket) == 4401
 
 
-def test_the_path_for_programs_exists_only_if_the_project_allows_it(launch, grid):
+async def test_the_path_for_programs_exists_only_if_the_project_allows_it(launch, grid):
     server = launch(grid(None))
-
-    async def come() -> int:
-        with pytest.raises(InvalidStatus) as found:
-            async with program(server):
-                pass
-        return found.value.response.status_code
-
-    assert asyncio.run(come()) == 404
+    with pytest.raises(InvalidStatus) as found:
+        async with program(server):
+            pass
+    assert found.value.response.status_code == 404
 
 
-def test_the_number_of_programs_that_watch_is_limited(launch, grid):
+async def test_the_number_of_programs_that_watch_is_limited(launch, grid):
     server = launch(grid(None), {"gym": "watch"})
-
-    async def come() -> int | None:
-        async with contextlib.AsyncExitStack() as stack:
-            for _ in range(MAX_PROGRAMS):
-                await ask(await stack.enter_async_context(program(server)), "watch")
-            async with program(server) as websocket:
-                return await closed(websocket)
-
-    assert asyncio.run(come()) == 1013
-
-
-def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch, grid):
-    server = launch(grid(None), {"gym": "watch"}, IDLE_SECONDS="4")
-
-    async def come() -> int | None:
+    async with contextlib.AsyncExitStack() as stack:
+        for _ in range(MAX_PROGRAMS):
+            await ask(await stack.enter_async_context(program(server)), "watch")
         async with program(server) as websocket:
-            await ask(websocket, "watch")
-            return await closed(websocket)
+            assert await closed(websocket) == 1013
 
-    assert asyncio.run(come()) == 1001
+
+async def test_a_program_does_not_keep_the_server_for_a_participant_who_stays_away(launch, grid):
+    server = launch(grid(None), {"gym": "watch"}, IDLE_SECONDS="4")
+    async with program(server) as websocket:
+        await ask(websocket, "watch")
+        assert await closed(websocket) == 1001
     assert server.wait() == 0
 
 
@@ -230,13 +195,13 @@ def test_a_program_that_reads_nothing_is_cut_off() -> None:
         assert (cut, len(lines)) == ([True], 1000)
 
 
-def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
+async def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
     cut = []
     watchers = Watchers()
     with watchers.lines(lambda: cut.append(True)) as lines:
         watchers.tell(b"x" * 20_000_000)  # one line may be of any length
         assert not cut
-        assert len(asyncio.run(lines.get())) == 20_000_000
+        assert len(await lines.get()) == 20_000_000
         for _ in range(16):
             watchers.tell(b"x" * 1_000_000)
         assert not cut
@@ -244,28 +209,23 @@ def test_a_program_that_reads_nothing_fills_no_memory_with_long_lines() -> None:
         assert (cut, len(lines)) == ([True], 16)
 
 
-def test_a_program_plays_one_of_two_players_in_its_turns(launch, open_client):
+async def test_a_program_plays_one_of_two_players_in_its_turns(launch, open_client):
     players = {"left": "human", "right": "gym://learner"}
     keys = {"gym": "advise", "pace": "turns", "players": players, "startingFrameRate": 30, "policySeconds": 60}
     server = launch(two_players(turns=True), trial=TRIAL | keys)
-
-    async def run() -> list[dict[str, Any]]:
-        async with open_client(server.address) as client, program(server) as learner:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            assert await ask(learner, "watch") is True
-            assert (await ask(learner, "action_space", player="right"))["names"] == ["noop", "up", "down"]
-            assert "no such player" in (await ask(learner, "advise", action=1, player="middle"))["error"]["message"]
-            await client.say(command="start")
-            await client.until(lambda: client.state.get("toAct"))
-            await client.say(action="up")
-            (mine,) = await steps(learner, 1)
-            assert mine["toAct"] == ["right"], "the program sees that it is its turn"
-            assert await ask(learner, "advise", action=2) is True
-            (its,) = await steps(learner, 1)
-            return [mine, its]
-
-    _, its = asyncio.run(run())
+    async with open_client(server.address) as client, program(server) as learner:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        assert await ask(learner, "watch") is True
+        assert (await ask(learner, "action_space", player="right"))["names"] == ["noop", "up", "down"]
+        assert "no such player" in (await ask(learner, "advise", action=1, player="middle"))["error"]["message"]
+        await client.say(command="start")
+        await client.until(lambda: client.state.get("toAct"))
+        await client.say(action="up")
+        (mine,) = await steps(learner, 1)
+        assert mine["toAct"] == ["right"], "the program sees that it is its turn"
+        assert await ask(learner, "advise", action=2) is True
+        (its,) = await steps(learner, 1)
     part = its["players"]["right"]
     assert (part["action"], part["actionName"], part["by"]) == (2, "down", "advice")
     assert its["players"]["left"]["action"] is None

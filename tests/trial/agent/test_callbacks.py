@@ -1,6 +1,5 @@
 """Callbacks of the agent: when they are called, what they record, and that none of them ends the game."""
 
-import asyncio
 import dataclasses
 import json
 import logging
@@ -355,21 +354,17 @@ def recorded_values(found):
     return [(line["name"], line["value"]) for line in found if line["kind"] == "callback" and line["name"] != "t"]
 
 
-def test_a_real_recording_holds_the_values_that_callbacks_recorded(launch, grid, open_client):
+async def test_a_real_recording_holds_the_values_that_callbacks_recorded(launch, grid, open_client):
     agent = grid(30) + CALLBACKS + WAITS
     server = launch(agent, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
-
-    async def journey():
-        async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
-            await client.say(command="good")
-            await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
-
-    asyncio.run(journey())
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        await client.say(command="start")
+        await client.say(command="good")
+        await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
     server.log.with_name("go_on").touch()
-    play_to_the_end(server, open_client)
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0
     first, second = server.recordings().values()
     assert recorded_values(first) == [
@@ -393,15 +388,14 @@ def test_a_real_recording_holds_the_values_that_callbacks_recorded(launch, grid,
         assert steps == [(kind, step) for step in range(1, 31) for kind in ("step", "callback")]
 
 
-def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, open_client):
+async def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, open_client):
     agent = grid(20) + (
         "\nimport time\nclass Agent(Agent):\n"
         "    def on_tick(self, session):\n        raise ValueError('no such thing')\n"
         "    def on_episode_end(self, session):\n        while True: time.sleep(1)\n"
     )
     server = launch(agent, {**TRIAL, "callbackSeconds": 0.05})
-
-    play_to_the_end(server, open_client)
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "finished"
     assert server.answer()["answers"]["frames"] == 40
@@ -411,25 +405,23 @@ def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, grid, ope
     assert said.count("on_episode_end has not returned within callbackSeconds") == 1
 
 
-def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_again_and_again(launch, grid, open_client):
+async def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_again_and_again(
+    launch, grid, open_client
+):
     slow = "\nimport time\nclass Agent(Agent):\n    def on_join(self, session, player):\n        time.sleep(0.4)\n"
     agent = grid(20) + slow + "        return True\n    on_leave = on_return = on_join\n"
     server = launch(agent, {**TRIAL, "maxEpisodes": 1})
-
-    async def journey():
-        for _ in range(40):
-            async with open_client(server.address) as client:
-                await client.hello()
-                await client.until(lambda: client.controls)
+    for _ in range(40):
         async with open_client(server.address) as client:
             await client.hello()
             await client.until(lambda: client.controls)
-            await client.say(command="start")
-            began = time.monotonic()
-            await client.until(lambda: client.done)
-            return time.monotonic() - began
-
-    assert asyncio.run(journey()) < 10, "81 calls would take half a minute"
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.until(lambda: client.controls)
+        await client.say(command="start")
+        began = time.monotonic()
+        await client.until(lambda: client.done)
+        assert time.monotonic() - began < 10, "81 calls would take half a minute"
     assert server.wait() == 0
     (found,) = server.recordings().values()
     moves = [line["name"] for line in found if line["kind"] == "callback"]
@@ -447,7 +439,7 @@ class Agent(Agent):
 """
 
 
-def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid, open_client):
+async def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid, open_client):
     deterministic = grid(60) + RESUMED + WAITS
 
     async def play_a_little(server):
@@ -459,12 +451,12 @@ def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch, grid
 
     trial = {**TRIAL, "maxEpisodes": 1}
     first = launch(deterministic, trial, SERVER="a-1")
-    asyncio.run(play_a_little(first))
+    await play_a_little(first)
     first.terminate()
     first.log.with_name("go_on").touch()
     first.wait()
     second = launch(deterministic, trial, SERVER="a-2")
-    play_to_the_end(second, open_client)
+    await play_to_the_end(second, open_client)
     assert second.wait() == 0
     (early,), (late,) = (list(second.recordings(server=name).values()) for name in ("a-1", "a-2"))
     recorded = [[line["value"] for line in found if line["kind"] == "callback"] for found in (early, late)]

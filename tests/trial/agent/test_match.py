@@ -86,7 +86,7 @@ def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: li
     assert match.groups(found["match"], {"id": "0" * 20, "players": 2, "waiting": PEOPLE}) == (chosen, "")
 
 
-def stored_answer(
+async def stored_answer(
     tmp_path: Path, function: Callable[..., Any], seconds: float = 20, question: bytes | None = None
 ) -> Any:
     """The answer that a server without members stores; None if it stores none within `seconds`."""
@@ -96,41 +96,38 @@ def stored_answer(
     class Open:
         project_id, session, assigned, agent_dir = "maze", "s." + "0" * 20, False, tmp_path
 
-    async def run() -> None:
-        server = Matching(store, lambda: cast(TrialSettings, Open), function)
-        working = asyncio.create_task(server.run())
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while not server._answered:
-                    await asyncio.sleep(0.01)
-        working.cancel()
-
-    asyncio.run(run())
+    server = Matching(store, lambda: cast(TrialSettings, Open), function)
+    working = asyncio.create_task(server.run())
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while not server._answered:
+                await asyncio.sleep(0.01)
+    working.cancel()
     found = store.get(groups_key("maze", "0" * 20))
     return None if found is None else json.loads(found)
 
 
-def test_a_server_stores_what_match_chooses(tmp_path: Path) -> None:
-    assert stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["a", "c"]]}
+async def test_a_server_stores_what_match_chooses(tmp_path: Path) -> None:
+    assert await stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["a", "c"]]}
 
 
-def test_the_answer_of_another_server_is_not_overwritten(tmp_path: Path) -> None:
+async def test_the_answer_of_another_server_is_not_overwritten(tmp_path: Path) -> None:
     FolderStore(tmp_path).create(groups_key("maze", "0" * 20), b'{"groups": [["b", "d"]]}')
-    assert stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["b", "d"]]}
+    assert await stored_answer(tmp_path, lambda waiting: [["a", "c"]]) == {"groups": [["b", "d"]]}
 
 
-def test_a_match_that_raises_matches_no_participants_and_is_reported(
+async def test_a_match_that_raises_matches_no_participants_and_is_reported(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert stored_answer(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
+    assert await stored_answer(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
     assert "KeyError: 'age'" in caplog.text
 
 
-def test_a_match_that_hangs_is_given_up(
+async def test_a_match_that_hangs_is_given_up(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(match, "SECONDS", 0.1)
-    assert stored_answer(tmp_path, lambda waiting: time.sleep(1) or []) == {"groups": []}
+    assert await stored_answer(tmp_path, lambda waiting: time.sleep(1) or []) == {"groups": []}
     assert "match() has not returned within 0.1 s" in caplog.text
 
 
@@ -138,6 +135,6 @@ def test_a_match_that_hangs_is_given_up(
     "body",
     [b"", b"[" * 100_000, b"[]", b'{"id": "../../x", "players": 2, "waiting": []}', b'{"id": "00000000000000000000"}'],
 )
-def test_a_wrong_question_is_not_answered(tmp_path: Path, body: bytes) -> None:
+async def test_a_wrong_question_is_not_answered(tmp_path: Path, body: bytes) -> None:
     assert matching.read(body) is None
-    assert stored_answer(tmp_path, lambda waiting: [], 0.3, question=body) is None
+    assert await stored_answer(tmp_path, lambda waiting: [], 0.3, question=body) is None

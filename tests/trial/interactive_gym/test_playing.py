@@ -40,11 +40,11 @@ def make_project(folder: Path, source: str) -> Path:
     return folder / "experiment-study"
 
 
-def play_project(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
+async def play_project(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
     """Play the project's game to its end on a server; return the server."""
     server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
 
-    play_to_the_end(server, open_client)
+    await play_to_the_end(server, open_client)
     assert server.wait() == 0, server.log_text()
     return server
 
@@ -52,10 +52,10 @@ def play_project(launch: Any, open_client: Any, made: Path, trial: dict[str, Any
 SCENE = {"width": 600, "height": 400}
 
 
-def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch: Any, open_client: Any) -> None:
+async def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch: Any, open_client: Any) -> None:
     made = make_project(tmp_path / "mine", ALONE)
     trial = {"actionSpace": ["left", "noop", "right"], "idleAction": "noop", "maxEpisodes": 2, "scene": SCENE}
-    server = play_project(launch, open_client, made, trial)
+    server = await play_project(launch, open_client, made, trial)
     first, second = server.recordings().values()
     for found in (first, second):
         values = [(line["step"], line["name"], line["value"]) for line in found if line["kind"] == "callback"]
@@ -65,7 +65,7 @@ def test_an_experiment_is_played_and_its_callback_records(tmp_path: Path, launch
         ]
 
 
-def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_client: Any) -> None:
+async def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_client: Any) -> None:
     made = make_project(tmp_path / "mine", TOGETHER)
     trial = {
         "actionSpace": ["0", "1", "2"],
@@ -74,7 +74,7 @@ def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_clien
         "input": "single",
         "scene": SCENE,
     }
-    server = play_project(launch, open_client, made, trial)
+    server = await play_project(launch, open_client, made, trial)
     (found,) = server.recordings().values()
     assert found[0]["players"]["1"]["policy"] == "agent:Policy1"
     steps = [line for line in found if line["kind"] == "step"]
@@ -91,7 +91,7 @@ def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open_clien
     ]
 
 
-def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
+async def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
     made = make_project(tmp_path / "mine", PEOPLE)
     told = yaml.safe_load((made / "config.yml").read_text())["trial"] | {"instructions": None, "countdown": 0}
     members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60"}
@@ -99,13 +99,9 @@ def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client:
         None, {key: value for key, value in told.items() if value is not None}, AGENT_DIR=str(made), **members
     )
     form(server.store)
-
-    async def journey() -> None:
-        async with member(server, "anna") as anna, member(server, "bert") as bert:
-            await anna.say(key="ArrowUp", held=True)
-            await asyncio.gather(*(each.until(lambda each=each: each.done) for each in (anna, bert)))
-
-    asyncio.run(journey())
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await anna.say(key="ArrowUp", held=True)
+        await asyncio.gather(*(each.until(lambda each=each: each.done) for each in (anna, bert)))
     assert server.wait() == 0, server.log_text()
     assert [answer(server.store, name)["answers"]["outcome"] for name in ("anna", "bert")] == ["finished"] * 2
     (found,) = recordings(server.store).values()

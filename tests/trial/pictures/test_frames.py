@@ -401,36 +401,28 @@ def textured(seen: Any) -> Any:
     return picture
 
 
-def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_client: Any) -> None:
+async def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_client: Any) -> None:
     server = launch(agent=TEXTURED, trial=SPACE)
-
-    async def play() -> None:
-        async with open_client(server.address) as new:
-            assert new.websocket.subprotocol == "hippodrome.3"
-            await new.play(1)
-            # Where the game is late, as on a busy machine, rows make its picture exact, and the next one may be a difference.
-            await new.until(lambda: new.kinds[-20:] == [JPEG] * 20)
-        async with open_client(server.address, subprotocols=("hippodrome.1",)) as old:
-            await old.play(20)
-            assert set(old.kinds) == EXACT
-            await old.say(command="pause")
-            await old.until(lambda: old.state["state"] == "paused")
-        async with open_client(server.address) as later:
-            await later.hello()
-            await later.until(lambda: later.frames and np.array_equal(later.frame, textured(later.frame)))
-            assert later.kinds[0] == JPEG
-            assert set(later.kinds[1:]) == {ROWS}
-
-    asyncio.run(play())
+    async with open_client(server.address) as new:
+        assert new.websocket.subprotocol == "hippodrome.3"
+        await new.play(1)
+        # Where the game is late, as on a busy machine, rows make its picture exact, and the next one may be a difference.
+        await new.until(lambda: new.kinds[-20:] == [JPEG] * 20)
+    async with open_client(server.address, subprotocols=("hippodrome.1",)) as old:
+        await old.play(20)
+        assert set(old.kinds) == EXACT
+        await old.say(command="pause")
+        await old.until(lambda: old.state["state"] == "paused")
+    async with open_client(server.address) as later:
+        await later.hello()
+        await later.until(lambda: later.frames and np.array_equal(later.frame, textured(later.frame)))
+        assert later.kinds[0] == JPEG
+        assert set(later.kinds[1:]) == {ROWS}
 
 
-def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> None:
+async def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> None:
     server = launch(agent=TEXTURED, trial={**SPACE, "lossless": True})
-
-    async def play() -> None:
-        async with open_client(server.address) as client:
-            assert client.websocket.subprotocol == "hippodrome.3"
-            await client.play(30)
-            assert set(client.kinds) == EXACT
-
-    asyncio.run(play())
+    async with open_client(server.address) as client:
+        assert client.websocket.subprotocol == "hippodrome.3"
+        await client.play(30)
+        assert set(client.kinds) == EXACT

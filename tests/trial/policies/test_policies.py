@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
 import types
 from collections import Counter
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -431,19 +433,17 @@ class PolicyByObservation:
         return {}
 
 
-def run_script(script: Any) -> tuple[PolicyByObservation, list[Any]]:
-    """Run `script(thread, answers)` on an event loop."""
-    policy, answers = PolicyByObservation(), []
-
-    async def run() -> None:
-        thread = PolicyThread(policy, lambda *answer: answers.append(answer), name="policy player_1")
-        try:
-            await asyncio.wait_for(script(thread, answers), 20)
-        finally:
-            thread.close()
-
-    asyncio.run(run())
-    return policy, answers
+@contextlib.asynccontextmanager
+async def policy_thread() -> AsyncIterator[tuple[PolicyByObservation, PolicyThread, list[Any]]]:
+    """Run a policy on its thread within the block; give the policy, the thread, and the list of its answers."""
+    policy, answers = PolicyByObservation(), list[Any]()
+    thread = PolicyThread(policy, lambda *answer: answers.append(answer), name="policy player_1")
+    try:
+        async with asyncio.timeout(20):
+            yield policy, thread, answers
+    finally:
+        thread.close()
+        await asyncio.sleep(0)  # the event loop makes the calls that wait
 
 
 async def until(condition: Any) -> None:
@@ -451,24 +451,21 @@ async def until(condition: Any) -> None:
         await asyncio.sleep(0.001)
 
 
-def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() -> None:
+async def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() -> None:
     loops = []
-
-    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+    async with policy_thread() as (policy, thread, answers):
         told = thread._done
         thread._done = lambda *answer: (loops.append(asyncio.get_running_loop()), told(*answer))
         thread.reset(5)
         for number in range(3):
             thread.ask(number, number, {}, None)
         await until(lambda: len(answers) == 3)
-
-    policy, answers = run_script(script)
     assert answers == [(0, 0, None), (1, 1, None), (2, 2, None)]
     assert (policy.seeds, policy.threads, len(loops)) == ([5], {"policy player_1"}, 3)
     assert policy.closed.wait(10)
 
 
-def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
+async def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
     told = []
 
     class Ended:
@@ -479,27 +476,23 @@ def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
             told.append(tell)
             raise RuntimeError("Event loop is closed")
 
-    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+    async with policy_thread() as (policy, thread, answers):
         thread._loop = Ended()  # type: ignore[assignment]
         thread.ask(1, 1, {}, None)
         await until(lambda: told)
-
-    policy, answers = run_script(script)
     assert policy.closed.wait(10)
     assert answers == []
 
 
-def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
+async def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
     def end() -> None:
         raise SystemExit(3)
 
-    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+    async with policy_thread() as (_, thread, answers):
         thread.ask(1, lambda: 1 / 0, {}, None)
         thread.ask(2, end, {}, None)
         thread.ask(3, 7, {}, None)
         await until(lambda: len(answers) == 3)
-
-    _, answers = run_script(script)
     assert [(ask, action, repr(error)) for ask, action, error in answers] == [
         (1, None, "ZeroDivisionError('division by zero')"),
         (2, None, "RuntimeError('SystemExit(3)')"),
@@ -507,22 +500,19 @@ def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
     ]
 
 
-def test_a_failed_reset_is_the_answer_until_the_next_reset() -> None:
-    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+async def test_a_failed_reset_is_the_answer_until_the_next_reset() -> None:
+    async with policy_thread() as (_, thread, answers):
         thread.reset(-1)
         thread.ask(1, 1, {}, None)
         thread.reset(2)
         thread.ask(2, 1, {}, None)
         await until(lambda: len(answers) == 2)
-
-    _, answers = run_script(script)
     assert [(ask, action, str(error)) for ask, action, error in answers] == [(1, None, "no such seed"), (2, 1, "None")]
 
 
-def test_a_policy_that_hangs_holds_up_nothing_but_its_answers() -> None:
+async def test_a_policy_that_hangs_holds_up_nothing_but_its_answers() -> None:
     go_on = threading.Event()
-
-    async def script(thread: PolicyThread, answers: list[Any]) -> None:
+    async with policy_thread() as (policy, thread, answers):
         thread.ask(1, go_on.wait, {}, None)
         began = time.monotonic()
         await asyncio.sleep(0.05)
@@ -532,8 +522,6 @@ def test_a_policy_that_hangs_holds_up_nothing_but_its_answers() -> None:
         go_on.set()
         await asyncio.to_thread(thread._thread.join, 10)
         await asyncio.sleep(0)
-
-    policy, answers = run_script(script)
     assert answers == [], "nothing is told after close"
     assert policy.closed.is_set()
 

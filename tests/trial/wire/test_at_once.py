@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import json
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
 import numpy as np
@@ -55,40 +55,29 @@ async def linked() -> AsyncIterator[tuple[Connection, Any]]:
             f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}", subprotocols=names[:1], compression=None
         ) as client,
     ):
-        yield await made.get(), client
+        async with asyncio.timeout(20):
+            yield await made.get(), client
 
 
-def talk_over_a_connection(talk: Callable[[Connection, Any], Coroutine[Any, Any, None]]) -> None:
-    async def within() -> None:
-        async with asyncio.timeout(20), linked() as (connection, client):
-            await talk(connection, client)
-
-    asyncio.run(within())
-
-
-def test_a_picture_is_written_before_the_event_that_shows_it_is_over() -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_a_picture_is_written_before_the_event_that_shows_it_is_over() -> None:
+    async with linked() as (connection, client):
         connection.put_picture(picture(7), 1)
         connection.send_now()
         assert connection.window.newest == 1, "no task had to wake up"
         assert np.array_equal(Decoder().decode(await client.recv())[1], picture(7))
 
-    talk_over_a_connection(talk)
 
-
-def test_a_message_of_the_same_event_goes_first() -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_a_message_of_the_same_event_goes_first() -> None:
+    async with linked() as (connection, client):
         connection.put_picture(picture(7), 1)
         connection.send_state("state")
         connection.send_now()
         assert await client.recv() == "state"
         assert Decoder().decode(await client.recv())[0] == 1
 
-    talk_over_a_connection(talk)
 
-
-def test_after_a_full_socket_the_newest_picture_is_sent() -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_after_a_full_socket_the_newest_picture_is_sent() -> None:
+    async with linked() as (connection, client):
         for end, option in ((connection.websocket, socket.SO_SNDBUF), (client, socket.SO_RCVBUF)):
             # The kernel's own limits differ: some machines take 50 MB before a socket is full.
             end.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, 1 << 16)
@@ -106,21 +95,17 @@ def test_after_a_full_socket_the_newest_picture_is_sent() -> None:
             if seen > sent:
                 assert seen == 199, "a picture that is old by now is dropped"
 
-    talk_over_a_connection(talk)
 
-
-def test_a_picture_that_cannot_be_packed_ends_its_connection_alone(caplog: pytest.LogCaptureFixture) -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_a_picture_that_cannot_be_packed_ends_its_connection_alone(caplog: pytest.LogCaptureFixture) -> None:
+    async with linked() as (connection, client):
         connection.put_picture(np.zeros((2, 3, 0), np.uint8), 1)
         connection.send_now()
         await client.wait_closed()
-
-    talk_over_a_connection(talk)
     assert "a picture cannot be sent" in caplog.text
 
 
-def test_an_acknowledgement_is_read_as_it_comes_and_other_messages_are_left_to_the_parser() -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_an_acknowledgement_is_read_as_it_comes_and_other_messages_are_left_to_the_parser() -> None:
+    async with linked() as (connection, client):
         connection.hear_acknowledgements(Inbound(connection.window))
         connection.put_picture(picture(7), 1)
         connection.send_now()
@@ -131,11 +116,9 @@ def test_an_acknowledgement_is_read_as_it_comes_and_other_messages_are_left_to_t
         assert left == others
         assert connection.window.acknowledging
 
-    talk_over_a_connection(talk)
 
-
-def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def talk(connection: Connection, _: Any) -> None:
+async def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with linked() as (connection, _):
         parsed: list[bytes] = []
         monkeypatch.setattr(connection.websocket.protocol, "receive_data", parsed.append)
         connection.hear_acknowledgements(Inbound(connection.window))
@@ -146,19 +129,16 @@ def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: pytest
         assert connection.window.acknowledging
         assert parsed == [of_no_frame]
 
-    talk_over_a_connection(talk)
-
 
 def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes:
     """A message of a client, or a part of one, as it comes from the network."""
     return RawFrame(opcode, said.encode(), fin=last).serialize(mask=True)
 
 
-def test_acknowledgements_are_read_however_the_network_cuts_them() -> None:
+async def test_acknowledgements_are_read_however_the_network_cuts_them() -> None:
     said = [text('{"ack": 1}'), text('{"ack": 2}'), text("other"), text('{"ack": 3}')]
     whole = b"".join(said)
-
-    async def talk(connection: Connection, _: Any) -> None:
+    async with linked() as (connection, _):
         heard: list[int] = []
         connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
         connection.hear_acknowledgements(Inbound(connection.window))
@@ -174,8 +154,6 @@ def test_acknowledgements_are_read_however_the_network_cuts_them() -> None:
             connection.websocket.data_received(part)
         assert (heard, await connection.websocket.recv()) == ([1, 2, 3], "other")
 
-    talk_over_a_connection(talk)
-
 
 @pytest.mark.parametrize(
     ("before", "code"),
@@ -185,8 +163,8 @@ def test_acknowledgements_are_read_however_the_network_cuts_them() -> None:
     ],
     ids=["within a message of several parts", "after the close"],  # masks are random
 )
-def test_an_acknowledgement_where_no_message_may_come_is_not_read(before: bytes, code: int) -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_an_acknowledgement_where_no_message_may_come_is_not_read(before: bytes, code: int) -> None:
+    async with linked() as (connection, client):
         heard: list[int] = []
         connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
         connection.hear_acknowledgements(Inbound(connection.window))
@@ -197,14 +175,11 @@ def test_an_acknowledgement_where_no_message_may_come_is_not_read(before: bytes,
         await client.wait_closed()
         assert client.close_code == code
 
-    talk_over_a_connection(talk)
 
-
-def test_bytes_like_an_acknowledgement_within_another_message_are_not_read() -> None:
+async def test_bytes_like_an_acknowledgement_within_another_message_are_not_read() -> None:
     inner = text('{"ack": 1}')
     header = bytes((0x82, 0x80 | len(inner), 0, 0, 0, 0))  # binary, masked by zeros
-
-    async def talk(connection: Connection, _: Any) -> None:
+    async with linked() as (connection, _):
         heard: list[int] = []
         connection.acknowledged = lambda frame_id, now: heard.append(frame_id)  # type: ignore[method-assign]
         connection.hear_acknowledgements(Inbound(connection.window))
@@ -215,11 +190,9 @@ def test_bytes_like_an_acknowledgement_within_another_message_are_not_read() -> 
                     connection.websocket.data_received(part)
             assert (heard, await connection.websocket.recv()) == ([], inner)
 
-    talk_over_a_connection(talk)
 
-
-def test_messages_of_all_lengths_are_sent() -> None:
-    async def talk(connection: Connection, client: Any) -> None:
+async def test_messages_of_all_lengths_are_sent() -> None:
+    async with linked() as (connection, client):
         socket = connection.websocket
         assert isinstance(socket, PlayerSocket)
         for length in (0, 1, 125, 126, 65_535, 65_536, 200_000):
@@ -229,18 +202,13 @@ def test_messages_of_all_lengths_are_sent() -> None:
             socket.send_now(data)
             assert await client.recv() == data
 
-    talk_over_a_connection(talk)
 
-
-def test_acknowledgements_count_among_the_messages_of_a_second() -> None:
-    async def count() -> tuple[int, int]:
-        connection = Connection(_Socket())  # type: ignore[arg-type]
-        inbound = Inbound(connection.window)
-        connection.window.sent(1, 0.0)
-        heard = [inbound.acknowledged(b'{"ack":1}', 5.0) for _ in range(MESSAGES_A_SECOND + 1)]
-        return heard.count(1), heard.count(None)
-
-    assert asyncio.run(count()) == (MESSAGES_A_SECOND, 1)
+async def test_acknowledgements_count_among_the_messages_of_a_second() -> None:
+    connection = Connection(_Socket())  # type: ignore[arg-type]
+    inbound = Inbound(connection.window)
+    connection.window.sent(1, 0.0)
+    heard = [inbound.acknowledged(b'{"ack":1}', 5.0) for _ in range(MESSAGES_A_SECOND + 1)]
+    assert heard.count(1), heard.count(None) == (MESSAGES_A_SECOND, 1)
 
 
 class _Socket:

@@ -29,21 +29,18 @@ class SentMessages:
 
 
 @pytest.mark.parametrize("code", [1000, 4409])
-def test_a_connection_keeps_few_messages_but_never_loses_the_last_ones(code):
-    async def talk():
-        websocket = SentMessages()
-        connection = Connection(websocket)
-        for number in range(10_000):
-            connection.send(str(number))
-            connection.send_state(f"state {number}")
-            connection.put_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
-            connection.send_now()
-        connection.close(code, "done")
-        connection.close(4410, "too late")
-        await connection.run()
-        return websocket.sent
-
-    sent = asyncio.run(talk())
+async def test_a_connection_keeps_few_messages_but_never_loses_the_last_ones(code):
+    websocket = SentMessages()
+    connection = Connection(websocket)
+    for number in range(10_000):
+        connection.send(str(number))
+        connection.send_state(f"state {number}")
+        connection.put_picture(np.full((2, 2, 3), number % 256, np.uint8), number)
+        connection.send_now()
+    connection.close(code, "done")
+    connection.close(4410, "too late")
+    await connection.run()
+    sent = websocket.sent
     assert len(sent) < 100
     assert sent[0] == "0"
     assert sent[-2:] == ["done", code]
@@ -53,22 +50,19 @@ def test_a_connection_keeps_few_messages_but_never_loses_the_last_ones(code):
 
 
 @pytest.mark.parametrize("subprotocol", [None, "hippodrome.2"])
-def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog):
+async def test_a_picture_that_cannot_be_packed_ends_its_connection(subprotocol, caplog):
     """The page connects again. If the connection stayed, the page would wait for pictures for ever."""
 
     class Cut(SentMessages):
         def abort(self):
             self.sent.append("cut")
 
-    async def talk():
-        websocket = Cut()
-        websocket.subprotocol = subprotocol
-        connection = Connection(websocket)
-        width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
-        connection.put_picture(np.zeros((2, width, depth), np.uint8), 1)
-        connection.send_now()
-        await asyncio.wait_for(connection.run(), 5)
-        return websocket.sent
-
-    assert asyncio.run(talk()) == ["cut"]
+    websocket = Cut()
+    websocket.subprotocol = subprotocol
+    connection = Connection(websocket)
+    width, depth = (65_535, 3) if subprotocol is None else (3, 0)  # wider than a JPEG may be; without a byte
+    connection.put_picture(np.zeros((2, width, depth), np.uint8), 1)
+    connection.send_now()
+    await asyncio.wait_for(connection.run(), 5)
+    assert websocket.sent == ["cut"]
     assert "a picture cannot be sent" in caplog.text

@@ -53,75 +53,57 @@ async def until(true, seconds=10):
             await asyncio.sleep(0.01)
 
 
-def test_a_round_trip_is_the_time_there_and_back():
-    async def run():
-        async with measured_connection(3, delay=0.1) as (_, _, reports):
-            await until(lambda: len(reports) == 3)
-        assert all(seconds >= 0.2 for _, seconds in reports)
-        assert min(seconds for _, seconds in reports) < 2
-
-    asyncio.run(run())
+async def test_a_round_trip_is_the_time_there_and_back():
+    async with measured_connection(3, delay=0.1) as (_, _, reports):
+        await until(lambda: len(reports) == 3)
+    assert all(seconds >= 0.2 for _, seconds in reports)
+    assert min(seconds for _, seconds in reports) < 2
 
 
-def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeypatch):
+async def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeypatch):
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 3.0)
-
-    async def run():
-        async with measured_connection(4) as (_, end, reports):
-            await until(lambda: len(reports) == 5)
-            assert end.most == 1
-        times = [when for when, _ in reports]
-        assert times[3] - times[0] < 2.9, "four samples"
-        assert times[4] - times[3] >= 2.9
-
-    asyncio.run(run())
+    async with measured_connection(4) as (_, end, reports):
+        await until(lambda: len(reports) == 5)
+        assert end.most == 1
+    times = [when for when, _ in reports]
+    assert times[3] - times[0] < 2.9, "four samples"
+    assert times[4] - times[3] >= 2.9
 
 
-def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_further_ping_meanwhile(monkeypatch):
+async def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_further_ping_meanwhile(monkeypatch):
     monkeypatch.setattr(round_trips, "LONGEST_SECONDS", 0.3)
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
-
-    async def run():
-        async with measured_connection(1) as (client, end, reports):
-            await until(lambda: len(reports) >= 1)
-            client.transport.pause_reading()
-            await until(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
-            assert len(end.pending_pings) == 1
-            known = len(reports)
-            client.transport.resume_reading()
-            await until(lambda: len(reports) > known)
-            assert all(seconds < 0.3 for _, seconds in reports[known:]), "the ping that was late counts once"
-            assert end.most == 1
-
-    asyncio.run(run())
+    async with measured_connection(1) as (client, end, reports):
+        await until(lambda: len(reports) >= 1)
+        client.transport.pause_reading()
+        await until(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
+        assert len(end.pending_pings) == 1
+        known = len(reports)
+        client.transport.resume_reading()
+        await until(lambda: len(reports) > known)
+        assert all(seconds < 0.3 for _, seconds in reports[known:]), "the ping that was late counts once"
+        assert end.most == 1
 
 
-def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
+async def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
     """A client that sends pongs ahead does not know the four bytes of the ping that they must repeat."""
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.3)
-
-    async def run():
-        async with measured_connection(1, delay=0.1) as (client, _, reports):
-            for _ in range(200):
-                await client.pong(b"1234")
-            await until(lambda: len(reports) == 3)
-        assert all(seconds >= 0.2 for _, seconds in reports)
-
-    asyncio.run(run())
+    async with measured_connection(1, delay=0.1) as (client, _, reports):
+        for _ in range(200):
+            await client.pong(b"1234")
+        await until(lambda: len(reports) == 3)
+    assert all(seconds >= 0.2 for _, seconds in reports)
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_measuring_ends_with_the_connection(answers):
-    async def run():
-        async with measured_connection(1) as (client, _, reports):
-            await until(lambda: reports)
-            if not answers:
-                client.transport.pause_reading()
-            client.transport.abort()
-            known = len(reports)
-        assert len(reports) - known <= 1
-
-    asyncio.run(run())
+async def test_measuring_ends_with_the_connection(answers):
+    async with measured_connection(1) as (client, _, reports):
+        await until(lambda: reports)
+        if not answers:
+            client.transport.pause_reading()
+        client.transport.abort()
+        known = len(reports)
+    assert len(reports) - known <= 1
 
 
 def test_a_ping_costs_sixteen_bytes():
