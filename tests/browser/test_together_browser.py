@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from testing.browser import ARGUMENTS, chromium_path, html_page
+from testing.waiting import until
 from tests.browser.conftest import PATIENCE, hold_timers, note_texts, wait_for_noted
 from tests.browser.test_pages_browser import FLAWS, LAST_PICTURE, World, shot, tell, world
 from trial.core.session import PARTNER_MISSING, PING
@@ -63,10 +64,8 @@ def check_overlay_fits(page: Any) -> None:
 
 def wait_for_polls(world: World, polls: int) -> None:
     """Wait until the page has asked for the state so many times more."""
-    until, wanted = time.monotonic() + PATIENCE / 1000, len(world.polls) + polls
-    while len(world.polls) < wanted:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    wanted = len(world.polls) + polls
+    until(lambda: len(world.polls) >= wanted, PATIENCE / 1000)
 
 
 # The lobby
@@ -263,10 +262,7 @@ def test_a_page_that_is_closed_leaves_the_lobby_at_once(group: World, tab: Any) 
 
 
 def wait_for_posts(world: World, times: int = 1) -> None:
-    until = time.monotonic() + PATIENCE / 1000
-    while len(world.posts) < times:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: len(world.posts) >= times, PATIENCE / 1000)
 
 
 def test_closing_the_page_of_a_game_sends_no_form(group: World, tab: Any) -> None:
@@ -387,10 +383,7 @@ def start_game(world: World, page: Any) -> None:
     world.ready()
     page.goto(world.url)
     page.wait_for_selector("#play:visible")
-    until = time.monotonic() + PATIENCE / 1000
-    while not world.connections:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: world.connections, PATIENCE / 1000)
     page.wait_for_selector("#people b")
     tell(world, state="playing", **presence(red="here"))
     page.wait_for_selector("#overlay", state="hidden")

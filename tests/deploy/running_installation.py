@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -142,13 +141,6 @@ class RunningInstallation(Installed):
         servers = self.platform.settings.game_sources.split()
         tls = ssl.create_default_context(cadata=self.authority.decode())
         return OneSite(f"https://study.{self.root_domain}", servers, project_id, tls=tls, connect=connect)
-
-    def until(self, look: Callable[[], bool], seconds: float = 20) -> None:
-        """Wait for something to happen."""
-        end = time.monotonic() + seconds
-        while not look():
-            assert time.monotonic() < end
-            time.sleep(0.1)
 
     def answer_page(self, event: dict[str, Any]) -> dict[str, Any]:
         with self._working:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +17,7 @@ from lambdas import installed
 from local import publish
 from local.activity.log import ActivityLog
 from local.backend.platform import LocalPlatform
+from testing.waiting import until
 from tests.local.conftest import write_study
 
 
@@ -158,10 +158,7 @@ def test_the_lines_of_a_server_are_printed_in_order() -> None:
     activity_log.wrote("p/users/P1/answers/3.json", b'{"step": "3", "page": "b"}')
     record = {**record, "userId": "P2"}
     server("starting")  # nothing follows
-    until = time.monotonic() + 20
-    while "P2" not in text.getvalue():
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: "P2" in text.getvalue())
     assert [line[10:].strip() for line in text.getvalue().splitlines()] == [
         "P1       answered step 1 (a)",
         "P1       server starting",

@@ -22,6 +22,7 @@ import httpx
 import pytest
 from websockets.exceptions import WebSocketException
 
+from testing.waiting import until
 from tests.local.conftest import Local
 from tests.local.walk import Walker
 
@@ -48,10 +49,7 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
     assert b'"end"' in gzip.decompress(recording.read_bytes())
     assert not [path for path in here.data.rglob("*") if path.name.startswith(".") or path.suffix in (".new", ".part")]
 
-    until = time.monotonic() + 10
-    while here.servers():
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    _gone(here, 10)
 
     text = here.text()
     told = [line.split("  ")[-1] for line in text.splitlines() if "P-1234…" in line]
@@ -82,10 +80,7 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
 
     playing = threading.Thread(target=play)
     playing.start()
-    until = time.monotonic() + 20
-    while len(played) < 30:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    until(lambda: len(played) >= 30)
     here.kill()
     assert len(here.servers()) == 1
 
@@ -94,15 +89,11 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
     again = Walker(here.url, "quick", "P1")
     assert again.until("ready")["url"] == state["url"]
     seen = len(played)
-    while len(played) < seen + 30:
-        assert time.monotonic() < until + 60
-        time.sleep(0.02)
+    until(lambda: len(played) >= seen + 30, 60)
     enough.set()
     playing.join(30)
     assert not playing.is_alive()
-    while "<h1>bye</h1>" not in again.page():
-        assert time.monotonic() < until + 90
-        time.sleep(0.05)
+    until(lambda: "<h1>bye</h1>" in again.page(), 60)
     again.answer(word="two")
     here.wait_for_text(r"server gone")
     _gone(here)
@@ -248,10 +239,7 @@ def test_an_edited_page_is_shown_after_a_reload(local: Make) -> None:
     assert "<h1>hello</h1>" in walker.page()
     (here.folder / "steps" / "hello.html").write_text("<h1>Good day</h1>")
     here.wait_for_text("steps/hello.html changed")
-    until = time.monotonic() + 20
-    while "<h1>Good day</h1>" not in walker.page():  # the change is printed before it is published
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    until(lambda: "<h1>Good day</h1>" in walker.page())  # the change is printed before it is published
 
     config = here.folder / "config.yml"
     good = config.read_text()
@@ -304,10 +292,7 @@ def _group(here: Local) -> int:
 
 
 def _gone(here: Local, seconds: float = 15) -> None:
-    until = time.monotonic() + seconds
-    while here.servers():
-        assert time.monotonic() < until, here.servers()
-        time.sleep(0.05)
+    until(lambda: not here.servers(), seconds)
 
 
 def test_repeated_kills_lose_nothing_and_leave_nothing(local: Make) -> None:

@@ -7,13 +7,13 @@ import json
 import os
 import re
 import statistics
-import time
 from pathlib import Path
 
 import pytest
 
 from protocol.trial_keys import keys
 from protocol.trial_sections import Ui
+from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
@@ -390,10 +390,7 @@ def test_a_change_of_agent_py_within_a_second_is_loaded(launch, grid, tmp_path):
         file.write_text(f"import sys\nsys.stderr.write('the {word} agent\\n')\n" + grid())
         os.utime(file, (1_000_000_000, 1_000_000_000))
         server = launch(None, PYTHONDONTWRITEBYTECODE="")
-        until = time.monotonic() + 15
-        while "agent\n" not in server.log_text():
-            assert time.monotonic() < until, server.log_text()
-            time.sleep(0.02)
+        until(lambda server=server: "agent\n" in server.log_text(), 15)
         assert f"the {word} agent" in server.log_text()
         server.process.kill()
         server.process.wait()

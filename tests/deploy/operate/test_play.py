@@ -38,6 +38,7 @@ from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 from testing.simulation import conditions, tasks
 from testing.studies import study
+from testing.waiting import until
 from tests.deploy.installation import ROOT, CommandResult
 from tests.deploy.running_installation import RunningInstallation, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
@@ -117,7 +118,7 @@ def test_a_rehearsal_proves_every_line_and_leaves_nothing(
 ) -> None:
     monkeypatch.setattr(whole, "FRESH", FRESH)
     running.visited = f"projectId={STUDY}&userId=somebody"  # then a function has just read the list of projects
-    running.until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(running))
+    until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(running))
     before, file = documents(running), tmp_path / "transcript.json"
     ran = play(running, capsys, "--json", "--transcript", str(file))
     assert ran.code == Exit.DONE, ran.out

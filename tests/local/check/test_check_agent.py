@@ -13,6 +13,7 @@ from local.check import agent as agent_check
 from local.check.agent_report import slowness
 from local.check.pace import Pace
 from testing.exploration import sample
+from testing.waiting import until
 from tests.local.check.checking import agent, config, looked, page, run, tried
 
 pytestmark = pytest.mark.usefixtures("forked")
@@ -319,10 +320,8 @@ def test_processes_of_the_agent_end_with_the_check(folder: Path, tmp_path: Path)
         f"import subprocess; open({str(note)!r}, 'w').write(str(subprocess.Popen(['sleep', '99']).pid)); self.env = Env()",
     )
     assert tried(folder) == []
-    until = time.monotonic() + 20
-    while Path(f"/proc/{note.read_text()}/cmdline").exists() and Path(f"/proc/{note.read_text()}/cmdline").read_bytes():
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    line = Path(f"/proc/{note.read_text()}/cmdline")
+    until(lambda: not (line.exists() and line.read_bytes()))
 
 
 def test_a_custom_agent_needs_an_action_space(folder: Path) -> None:
