@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -19,24 +18,14 @@ from hippodrome.model.messages import StartServer
 from hippodrome.ports import Refused
 from hippodrome.servers.causes import Cause, FailureCategory
 from hippodrome.servers.sweep import RunningServers, Sweep, SweepResult
-from lambdas import installed as place
 from lambdas import start_server, sweep, task_changed
 from testing import template as cfn
 from testing.aws_events import queue_event, task_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed
 
 ROOT = Path(__file__).resolve().parents[2]
 USERS = ("R_alice", "R_bob")
-
-
-@pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    made = installed()
-    place.use(made)
-    yield made
-    place.use(None)
 
 
 def metrics_line(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:

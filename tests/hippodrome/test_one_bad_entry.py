@@ -15,12 +15,11 @@ from hippodrome.model.records import to_json
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
-from lambdas import installed as place
 from lambdas import start_server, sweep, update_project_master_list
 from testing.aws_events import queue_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import study
 from testing.visitors import Browser
 from tests.hippodrome.test_registry import registration
 
@@ -34,13 +33,6 @@ BROKEN = {
     "nothing": None,
     "a text": "broken",
 }
-
-
-@pytest.fixture
-def platform() -> FakePlatform:
-    platform = installed()
-    place.use(platform)
-    return platform
 
 
 def page(platform: FakePlatform, user: str, project: str = "maze") -> tuple[int, str]:

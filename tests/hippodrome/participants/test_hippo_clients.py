@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -18,12 +17,6 @@ from testing.visitors import hidden
 
 AXIOS = "application/json, text/plain, */*"  # the Accept header of axios (1.x, and 0.x as HIPPO has it)
 ALICE = "projectId=maze&userId=alice"
-
-
-@pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    yield installed()
-    place.use(None)
 
 
 def ask(platform: FakePlatform, query: str = ALICE, form: Any = None, **headers: str) -> tuple[int, dict[str, Any]]:

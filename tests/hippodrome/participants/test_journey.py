@@ -7,7 +7,6 @@ import gzip
 import io
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -29,12 +28,6 @@ from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
 from testing.visitors import Browser, hidden
-
-
-@pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    yield installed()
-    place.use(None)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -35,14 +34,6 @@ KINDS = {
     "vtt": "text/vtt",
     "woff2": "font/woff2",
 }
-
-
-@pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    platform = installed()
-    place.use(platform)
-    yield platform
-    place.use(None)
 
 
 def ask(path: str, method: str = "GET") -> dict[str, Any]:

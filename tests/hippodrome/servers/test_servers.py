@@ -27,11 +27,6 @@ STOP = StopServer("maze", "alice")
 
 
 @pytest.fixture
-def platform() -> FakePlatform:
-    return installed()
-
-
-@pytest.fixture
 def servers(platform: FakePlatform) -> Servers:
     return Servers(platform)
 

@@ -24,13 +24,6 @@ LABEL = ids.server_label("maze", "alice")
 NAME = ids.server_name(LABEL, 1)
 
 
-@pytest.fixture
-def platform() -> FakePlatform:
-    platform = installed()
-    place.use(platform)
-    return platform
-
-
 def ready(platform: FakePlatform, user: str = "alice") -> None:
     servers = Servers(platform)
     servers.start(StartServer("maze", user))
