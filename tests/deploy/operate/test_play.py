@@ -412,7 +412,7 @@ def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
 def claims() -> dict[str, str]:
     """Each claim of docs/unproven.md, with the line that says how to prove it."""
     page = (ROOT / "docs/unproven.md").read_text()
-    found = re.findall(r"^\*\*(.+)\*\*\n\* \*Here\*: .+\n\* \*Proof\*: (.+)\n", page, re.MULTILINE)
+    found = re.findall(r"^\* \*\*(.+)\.\*\* .+\n  \* \*Proof\*: (.+)\n", page, re.MULTILINE)
     assert len(found) == len(dict(found)) == page.count("* *Proof*:"), "a claim has another form, or stands twice"
     return dict(found)
 
