@@ -34,7 +34,8 @@ def main(
         found += errors.diagnostics
     found += check_project(folder, config)
     label = agent_file.label_of(folder)
-    playable = not _mistakes(found, label) and config is not None and bool(config.game_steps)
+    readable = not any(problem.file == label for problem in _mistakes(found))
+    playable = config is not None and bool(config.game_steps) and readable
     if playable and config and agent_imports.may_run_on_aws(config):
         lacking = [*agent_imports.missing(folder), *agent_imports.missing_for_players(folder, config)]
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
@@ -61,8 +62,8 @@ def _print(found: Iterable[Diagnostic]) -> None:
         sys.stdout.write(f"{problem}\n")
 
 
-def _mistakes(found: Iterable[Diagnostic], file: str | None = None) -> list[Diagnostic]:
-    return [problem for problem in found if not problem.remark and file in (None, problem.file)]
+def _mistakes(found: Iterable[Diagnostic]) -> list[Diagnostic]:
+    return [problem for problem in found if not problem.remark]
 
 
 def _summary(found: list[Diagnostic], config: Config | None) -> str:

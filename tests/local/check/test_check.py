@@ -53,6 +53,16 @@ def test_all_mistakes_are_reported_at_once_by_check(folder: Path) -> None:
     ]
 
 
+def test_a_game_without_agent_py_is_tried_although_a_page_has_a_mistake(folder: Path) -> None:
+    (folder / "agent.py").unlink()
+    page(folder, "{{ nobody( }}")
+    _, (mistake, trying, failure, counts) = run(folder)
+    assert mistake.startswith("steps/hello.html:1: Jinja cannot read this")
+    assert trying == "trying none …"
+    assert failure.startswith('config.yml:9: trial.game: start("none") fails')
+    assert counts == "2 mistakes."
+
+
 def test_remarks_alone_are_no_failure(folder: Path) -> None:
     page(folder, "<input>")
     status, lines = run(folder)
