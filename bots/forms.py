@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from hippodrome.participants.page_parser import PageParser
+from hippodrome.participants.page_parser import PageParser, attributes_of
 
 PRESSED = ("submit", "image")
 """Types of the buttons that send a form."""
@@ -96,9 +96,7 @@ class _Reader(PageParser):
         self._textarea: Control | None = None
 
     def handle_starttag(self, tag: str, attrs: Iterable[tuple[str, str | None]]) -> None:
-        attributes: dict[str, str] = {}
-        for name, value in attrs:
-            attributes.setdefault(name, value or "")
+        attributes = attributes_of(attrs)
         if tag == "form" and self._form is None:
             self._form = Form(attributes.get("action", ""), attributes.get("method", "get").lower())
             self.forms.append(self._form)

@@ -28,13 +28,11 @@ class Reply:
         return self.body.decode("utf-8", "replace")
 
 
-async def ask(
-    address: str, body: bytes | None = None, *, seconds: float = ASK_SECONDS, allowed: AllowedAddresses = THIS_MACHINE
-) -> Reply:
+async def ask(address: str, body: bytes | None = None, *, allowed: AllowedAddresses = THIS_MACHINE) -> Reply:
     """Send one request and return its response. With a `body`, the request is a POST of the form in it.
 
     Raises AddressRefused if `allowed` does not have the address, and OSError if there is no whole response within
-    `seconds`.
+    ASK_SECONDS.
     """
     parts = urlsplit(allowed.page(address))
     target = urlunsplit(("", "", parts.path or "/", parts.query, ""))
@@ -43,12 +41,11 @@ async def ask(
         headers += [("Content-Type", "application/x-www-form-urlencoded"), ("Content-Length", str(len(body)))]
     request = h11.Request(method="GET" if body is None else "POST", target=target, headers=headers)
     try:
-        async with asyncio.timeout(seconds):
-            host = parts.hostname or ""
+        async with asyncio.timeout(ASK_SECONDS):
+            name = parts.hostname or ""
+            host, port = allowed.dial(name, parts.port or PORTS[parts.scheme])
             tls = allowed.tls if parts.scheme == "https" else None
-            return await _exchange(
-                *allowed.dial(host, parts.port or PORTS[parts.scheme]), request, body or b"", tls=tls, name=host
-            )
+            return await _exchange(host, port, request, body or b"", tls=tls, name=name)
     except h11.ProtocolError as error:
         raise ConnectionError(f"not HTTP: {error}") from error
 

@@ -15,7 +15,7 @@ from botocore.exceptions import ClientError
 from export.source import FileGone, Source, TooLarge
 from hippodrome.config.step_files import LIMIT_BYTES
 from hippodrome.model.project import Project
-from hippodrome.participants.page_parser import PageParser
+from hippodrome.participants.page_parser import PageParser, attributes_of
 
 
 class FieldKind(StrEnum):
@@ -65,7 +65,7 @@ class _Reader(PageParser):
         self._counts: dict[str, Counter[str]] = {}
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        attributes = {name: value or "" for name, value in reversed(attrs)}  # of equal attributes the first counts
+        attributes = attributes_of(attrs)
         kind = tag
         if tag == "input":
             kind = attributes.get("type", "").strip().lower()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from html.parser import HTMLParser
 
 
@@ -14,3 +15,11 @@ class PageParser(HTMLParser):
             return super().parse_marked_section(i, report)
         except AssertionError:
             return self.parse_bogus_comment(i, report)
+
+
+def attributes_of(attrs: Iterable[tuple[str, str | None]]) -> dict[str, str]:
+    """Return a tag's attributes by name. If it has two of one name, the first counts, as in browsers."""
+    found: dict[str, str] = {}
+    for name, value in attrs:
+        found.setdefault(name, value or "")
+    return found

@@ -10,7 +10,7 @@ from jinja2 import meta
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import fragments, sandbox
-from hippodrome.participants.page_parser import PageParser
+from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, source_of
 from local.check.structure import check_structure
@@ -45,7 +45,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
 
 
 def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:
-    """Problems that show only when all pages are known."""
+    """Problems that follow from where the study shows its pages."""
     used = _pages(names, config)
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
     found = [_unused(folder, unused)] if unused else []
@@ -93,7 +93,7 @@ class _Links(PageParser):
     elsewhere = False
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        address = (dict(attrs).get("href") or "").strip().lower() if tag == "a" else ""
+        address = attributes_of(attrs).get("href", "").strip().lower() if tag == "a" else ""
         self.elsewhere = self.elsewhere or address.startswith(("https://", "http://", spans.MARK))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from hippodrome.config import Diagnostic
-from hippodrome.participants.page_parser import PageParser
+from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from protocol.values import printable
 
@@ -92,9 +92,7 @@ class _Reader(PageParser):
         self._row = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given: dict[str, str | None] = {}
-        for name, value in attrs:
-            given.setdefault(name, value or "")
+        given = attributes_of(attrs)
         self._blocks += sum((value or "").count(_STEP) + name.count(_STEP) for name, value in attrs)
         if tag not in _VOID and tag not in _OPTIONAL:
             self._open.append((tag, self.getpos()[0]))
@@ -103,8 +101,8 @@ class _Reader(PageParser):
             self._fieldsets.append(self._count)
         elif tag == "tr":
             self._row += 1
-        elif tag == "input" and str(given.get("type")).strip().lower() == "radio":
-            name = given.get("name") or ""
+        elif tag == "input" and given.get("type", "").strip().lower() == "radio":
+            name = given.get("name", "")
             if name and spans.MARK not in name and _STEP not in name:
                 fieldset = self._fieldsets[-1] if self._fieldsets else 0
                 radio = _Radio(self.getpos()[0], given.get("value"), self._blocks, fieldset, self._row)

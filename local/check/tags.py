@@ -9,7 +9,7 @@ from urllib.parse import unquote, urlsplit
 from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments
 from hippodrome.participants.files import KINDS
-from hippodrome.participants.page_parser import PageParser
+from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from local.check.wording import short
 from protocol.similar import SIMILAR_FILES, did_you_mean
@@ -42,9 +42,7 @@ class Tags(PageParser):
         return self._found
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given: dict[str, str] = {}
-        for name, value in attrs:
-            given.setdefault(name, (value or "").strip())
+        given = {name: value.strip() for name, value in attributes_of(attrs).items()}
         self._styling = tag == "style"
         self._field(tag, given)
         for name, value in given.items():
