@@ -75,12 +75,8 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 
 @dataclass
 class Verification:
-    """What was found in the data of what bots sent and played, and what is missing.
+    """What was found in the data of what bots sent and played, and what is missing."""
 
-    `recorded`: whether the project keeps recordings.
-    """
-
-    recorded: bool = True
     answers: int = 0  # of pages, found as they were sent
     answers_sent: int = 0
     games: int = 0  # answers of games found
@@ -106,7 +102,7 @@ def verify(
     `recorded`: whether the project keeps recordings. `last_error` gets a participant's id, and returns the last error
     in the log of their last server; "" if it is not known.
     """
-    found, read = Verification(recorded=recorded), dict[Path, list[StoredRecording]]()
+    found, read = Verification(), dict[Path, list[StoredRecording]]()
     for report in reports:
         folder = data / project_id / "users" / report.user_id
         membership = document(folder / "session.json")
@@ -116,7 +112,7 @@ def verify(
             found.sessions[session.name] = found.sessions.get(session.name, 0) + 1
         _look_at_answers(found, report, folder)
         trials = (session or folder) / "trials"
-        _look_at_plays(found, report, folder, _recordings(trials, read), last_error)
+        _look_at_plays(found, report, folder, _recordings(trials, read), last_error, recorded=recorded)
         for path in sorted(trials.rglob("*")):
             if path.is_file() and path.suffix != ".gz":
                 found.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
@@ -148,6 +144,8 @@ def _look_at_plays(
     folder: Path,
     recordings: list[StoredRecording],
     last_error: Callable[[str], str],
+    *,
+    recorded: bool,
 ) -> None:
     """Compare each game step with its answer and its recordings."""
     for play in report.plays:
@@ -159,7 +157,7 @@ def _look_at_plays(
         of_step = [recording for recording in recordings if recording.step == play.step]
         _look_at_game(found, who, play, answers, of_step)
         _look_for_the_cause(found, who, answers, last_error(report.user_id))
-        if found.recorded and not of_step:
+        if recorded and not of_step:
             found.missing.append(f"{who}: no recording")
 
 

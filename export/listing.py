@@ -117,7 +117,7 @@ def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
 def choose(
     state: ExportState, unit: Unit, wanted: Wanted, tally: Tally, damaged: frozenset[str], *, mark: str = ""
 ) -> tuple[list[Item], list[str]]:
-    """Return the files of a unit that have to be fetched, and the keys of those that have not. Counts them in `tally`.
+    """Return the files of a unit that have to be fetched, and the keys of its other files. Counts them in `tally`.
 
     `damaged` are paths in the folder whose files have changed or are missing. `mark` is that of a session's members.
     """
@@ -138,13 +138,18 @@ def choose(
             tally.unchanged += 1
             unchanged.append(item.listed.key)
             continue
-        tally.new, tally.changed = tally.new + (before is None), tally.changed + (before is not None)
-        tally.bytes += item.listed.size if item.kind is not KeyKind.FOREIGN else 0
+        if before is None:
+            tally.new += 1
+        else:
+            tally.changed += 1
+        if item.kind is not KeyKind.FOREIGN:
+            tally.bytes += item.listed.size
         fetch.append(item)
         # A changed participant.json may have other identities, which must be replaced in all files of the participant.
         # A changed document of a session may have other members.
         everything = everything or (item.kind in _NAMING and wanted.apart) or item.kind is KeyKind.SESSION
-    tally.participants += bool(unit.user) and not unit.is_session
+    if unit.user and not unit.is_session:
+        tally.participants += 1
     return fetch, unchanged
 
 

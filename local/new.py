@@ -141,7 +141,7 @@ def _adapt_paths(template: StudyTemplate, folder: Path) -> None:
 
 
 def _relative(target: Path, folder: Path) -> str:
-    """The path of `target` as a link in a file of `folder` has it."""
+    """The path of `target` from `folder`, for a link in a file of this folder."""
     return Path(os.path.relpath(target.resolve(), folder.resolve())).as_posix()
 
 

@@ -213,9 +213,9 @@ def from_here(path: Path) -> Path:
 
 
 def _end_servers_of_other_addresses(state: Path, named_port: int | None) -> None:
-    """End the servers of an earlier run if browsers can no longer reach them at their addresses; note the port.
+    """End the servers of an earlier run if their addresses have another port than `named_port`. Raises OSError.
 
-    The addresses hold the port that the earlier run named, which `state` remembers. Raises OSError.
+    Browsers could not reach them. A file in `state` keeps the port for the next run.
     """
     file, now = state / "named-port", str(named_port or "")
     state.mkdir(parents=True, exist_ok=True)

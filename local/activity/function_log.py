@@ -12,7 +12,7 @@ from hippodrome.log import logger
 from local.activity.log import ActivityLog
 
 _OS_ERRORS = {"OSError", *(kind.__name__ for kind in OSError.__subclasses__())} - {"ConnectionError", "TimeoutError"}
-_SHOWN_BY_RECORD = ("server closed", "the project is full")  # the terminal shows this by the server's record
+_SHOWN_BY_RECORD = ("server closed", "the project is full")  # `ActivityLog` shows these by the server's record
 
 
 class TerminalHandler(logging.Handler):
@@ -60,7 +60,7 @@ def function_log(logs: Path, activity_log: ActivityLog) -> Iterator[None]:
 
 
 class _Log:
-    """A log file that lacks lines if the disk is full: `Retry` has said so in the terminal."""
+    """A log file. On a full disk, lines are lost and nothing is raised: the terminal says that the disk is full."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

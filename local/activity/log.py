@@ -1,7 +1,8 @@
 """What the researcher's terminal shows: one line for each event of a participant.
 
 Most lines are made from documents as this process writes them. Servers write in processes of their own, so the log
-looks for new documents in the folders of those that run. Ids are shortened, and answers are never shown.
+looks for their participants' new answers, and for new errors in their logs. Ids are shortened, and answers are never
+shown.
 """
 
 from __future__ import annotations
@@ -119,13 +120,11 @@ class ActivityLog:
         self._last_step = keys[-2] if len(keys) > 1 else ""
 
     def wrote(self, key: str, body: bytes) -> None:
-        """Show what happened, as a document that was just written tells it.
+        """Show the event of a document that was just written: an arrival, an answer, a session, a server's new state.
 
-        Nothing is shown for documents that tell of no event.
+        Other documents are not shown.
         """
-        found = _PERSON.fullmatch(key)
-        together = _SESSION.fullmatch(key)
-        record = _json(body) if found or together or key.startswith("_servers/") else {}
+        found, together, record = _PERSON.fullmatch(key), _SESSION.fullmatch(key), _json(body)
         if key.startswith("_servers/"):
             folder = folder_of(str(record.get("projectId")), str(record.get("userId")))
             self._reserved(str(record.get("spare")), folder)

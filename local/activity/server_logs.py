@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 from local.backend.task_record import TaskRecord
@@ -76,11 +75,12 @@ class WatchedServer:
     def _keys(self) -> set[str]:
         """The keys of the answers that exist now."""
         with contextlib.suppress(OSError):
-            return {f"{folder}/answers/{path.name}" for folder in self._folders for path in self._answers(folder)}
+            return {
+                path.relative_to(self._data).as_posix()
+                for folder in self._folders
+                for path in (self._data / folder / "answers").glob("[!.]*.json")
+            }
         return set()
-
-    def _answers(self, folder: str) -> Iterable[Path]:
-        return (self._data / folder / "answers").glob("[!.]*.json")
 
     def _find_members(self) -> None:
         """Look whether the session has been formed. Answers of its members that exist by then are not of its game."""
@@ -130,7 +130,7 @@ def _begins_anew(raw: bytes) -> str:
 
 
 def last_error(log: Path) -> str:
-    """Return the words of the last error in a server's log; "" if there is none."""
+    """Return the text of the last error in a server's log; "" if there is none."""
     reader = ErrorReader(log)
     try:
         with log.open("rb") as lines:

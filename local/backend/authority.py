@@ -125,7 +125,7 @@ def _builder(subject: x509.Name, days: int) -> x509.CertificateBuilder:
 
 
 def general_name(name: str) -> x509.GeneralName:
-    """Return a DNS name or an IP address in the form that certificates have it in."""
+    """Return the DNS name or IP address as an entry of a certificate."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:

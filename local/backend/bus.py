@@ -164,7 +164,7 @@ class _Queue:
         if not batch:
             return
         failed = self._call(batch)
-        # If this machine refused something lately, the failure may come of that, even in another function.
+        # If this machine refused something lately, that may be the cause of the failure, even in another function.
         counts = not self._retry.reported_within(RETRY[-1])
         self._again([queued for queued in batch if queued.id in failed], counts=counts)
         done = [queued for queued in batch if queued.id not in failed]
@@ -267,9 +267,8 @@ class FolderBus:
         """Wait up to `seconds` until everything that is due has been handled; return whether it has."""
         until = time.monotonic() + seconds
         quiet = 0
-        while (
-            quiet < len(self._queues) and time.monotonic() < until
-        ):  # a queue's function may publish to the other queues
+        # A queue's function may publish to the other queues, so all must be idle in one round.
+        while quiet < len(self._queues) and time.monotonic() < until:
             quiet = sum(queue.drain(until) and queue.idle for queue in self._queues.values())
         return quiet == len(self._queues)
 

@@ -1,4 +1,7 @@
-"""Moves recordings that a killed server left in the spool to the data folder; they can be read up to their end."""
+"""Moves recordings that a killed server left in the spool to the data folder.
+
+They are cut off, but all lines before that place can be read.
+"""
 
 from __future__ import annotations
 

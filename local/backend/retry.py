@@ -21,7 +21,7 @@ SILENCE = 60.0  # seconds for which the same sentence is not said again
 _FULL = "The disk is full: please make room"
 _FILES = "This machine cannot open more files: please close programs, or raise the limit (`ulimit -n`)"
 _BUSY = "This machine cannot run more processes or threads, or its memory is full: please close programs"
-_FORBIDDEN = "A file or folder of this study may not be read or written: please see to its owner and mode"
+_FORBIDDEN = "A file or folder of this study may not be read or written: please check its owner and permissions"
 _WORDS = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -31,7 +31,7 @@ _WORDS = {
     errno.ENOMEM: _BUSY,
     errno.EACCES: _FORBIDDEN,
     errno.EPERM: _FORBIDDEN,
-    errno.EROFS: "The disk can only be read: please see to it",
+    errno.EROFS: "The disk can only be read: please make it writable",
 }
 
 Say = Callable[[str], None]

@@ -73,10 +73,10 @@ def _nearly_a_callback(name: str) -> str:
 
 
 def line_of(path: Path, method: str) -> int | None:
-    """Return the line of a method of class Agent, or else that of the class.
+    """Return the line of a method of class Agent; the line of the class if it has no such method.
 
-    Without that class, it is the line of the function of that name, since `match` stands beside the class. The result
-    is None if nothing is found.
+    A function `match` beside the class comes first. Without the class, the function of that name is looked for. None if
+    nothing is found.
     """
     try:
         body = ast.parse(path.read_bytes()).body

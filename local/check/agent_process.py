@@ -23,6 +23,7 @@ from local.check.one_player import OnePlayer
 from local.check.outside import Outside
 from protocol import environment as variables
 from protocol import handover
+from protocol.handover import Handover
 from protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
 from protocol.trial import TrialSection
 from trial.agent import match
@@ -92,10 +93,10 @@ def _try(report: Path, deadline: _Deadline) -> None:
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
     progress = AgentProgress(report, folder, Outside(config.scene), _EarlyEnviron.lines)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
-    document = os.environ.pop("GIVEN", "")
-    group = _group(document)
+    given = _handover()
+    group = given.group if given else _group()
     usual_class, _EarlyEnviron.folder = os.environ.__class__, folder
-    if document:
+    if given:
         os.environ.__class__ = _EarlyEnviron
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
@@ -104,8 +105,8 @@ def _try(report: Path, deadline: _Deadline) -> None:
 
     def reset() -> Any:
         os.environ.__class__ = usual_class
-        if document:
-            assignment.set_environment(os.environ, _assigned(document))
+        if given:
+            assignment.set_environment(os.environ, _assigned(given))
         progress.callbacks.session_begins()
         return joint.reset(1)
 
@@ -163,23 +164,26 @@ def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> Pict
     return PictureReader(config.scene, found, progress.undrawn.append)
 
 
-def _assigned(document: str) -> assignment.AssignmentDocument:
-    """Read a handover, and return the document that says who plays: the handover itself, for one participant.
-
-    If it names a session, the session's document is made up, with no members: `make check` has no stored one.
-    """
-    found = handover.parse(document.encode())
-    if not is_session_id(found.user_id):
-        return found
-    return SessionDocument(found.user_id, MAX_PLAYERS, (), found.group)
+def _handover() -> Handover | None:
+    """The handover of the server, which gets it before the first `reset`; None if the server is for one participant."""
+    document = os.environ.pop("GIVEN", "")
+    return handover.parse(document.encode()) if document else None
 
 
-def _group(document: str) -> int | None:
-    """The participant's group: from the handover, for a warm server; otherwise from the environment variable."""
-    if document:
-        return handover.parse(document.encode()).group
+def _group() -> int | None:
+    """The group of the participant for whom the server is started."""
     text = os.environ.get(variables.GROUP, "")
     return int(text) if text else None
+
+
+def _assigned(given: Handover) -> assignment.AssignmentDocument:
+    """The document that says who plays: the handover itself, for one participant.
+
+    If the handover names a session, its document is made up, with no members: `make check` has no stored one.
+    """
+    if not is_session_id(given.user_id):
+        return given
+    return SessionDocument(given.user_id, MAX_PLAYERS, (), given.group)
 
 
 def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[str, Any]:

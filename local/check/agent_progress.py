@@ -76,9 +76,9 @@ class AgentProgress:
         self._callback_errors.append({"name": name, **_described(error, self._folder)})
 
     def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
-        """Note the first value that is too large for the recording.
+        """Note the first value of a step that is too large for the recording.
 
-        It is one of the `infos` of a step, or of what the agent records itself (`extra`).
+        `infos` are those of the step; `extra` are the further values that `step` returned.
         """
         if "tooLarge" in self.known:
             return

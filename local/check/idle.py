@@ -33,14 +33,15 @@ def actions_without_effect(
     until = time.monotonic() + SECONDS
     random = Random(1)  # noqa: S311 - the same each time
     walk = [random.randrange(count) for _ in range(max(_STATES))]
-    still = set(range(min(count, _MOST_ACTIONS))) - {idle}
+    others = [action for action in range(min(count, _MOST_ACTIONS)) if action != idle]
+    still = set(others)
     found = False
     for state in _STATES:
         seen: dict[int, bool] = {}
         first: Any = None  # the pictures before and after the idle action
-        for action in [idle, idle, *sorted(set(range(min(count, _MOST_ACTIONS))) - {idle})]:
+        for action in [idle, idle, *others]:
             if time.monotonic() > until:
-                return None if not found else sorted(still)
+                return sorted(still) if found else None
             begin(1)
             if any([step(each) for each in walk[:state]]):  # noqa: C419 - all steps are taken
                 return sorted(still) if found else None

@@ -34,7 +34,7 @@ class Outside:
     def found(self) -> dict[str, tuple[float, float]]:
         """Return the objects that were never in the picture, but would be if their coordinates were pixels.
 
-        Each name of an object has one of its places.
+        The result has one place of each object, by its name.
         """
         return {name: place for (_, name), place in self._outside.items()}
 

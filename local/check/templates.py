@@ -17,13 +17,8 @@ from local.check.wording import short
 from protocol.answer import UNMATCHED
 from protocol.similar import did_you_mean
 
-VALUES = (
-    "answers",
-    "completion_code",
-    "group",
-    "participant",
-    "project",
-)  # the values that a page may use: docs/pages.md
+VALUES = ("answers", "completion_code", "group", "participant", "project")
+"""The values that a page may use (docs/pages.md)."""
 
 
 def check_template(

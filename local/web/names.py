@@ -43,7 +43,7 @@ class Names:
         self._ended = asyncio.Event()
         self._context = authority.context("localhost")
         self._all: set[asyncio.Task[None]] = set()
-        self._handshakes: dict[asyncio.Task[None], None] = {}  # those of `_all` in their handshake, the oldest first
+        self._handshakes: dict[asyncio.Task[None], None] = {}  # tasks in the TLS handshake, the oldest first
 
     def start(self) -> None:
         """Serve until `close`."""
