@@ -25,7 +25,7 @@ class Conflict(Exception):
 
 
 class NoCapacity(Exception):
-    """There is no capacity for this kind of task now: Spot is sold out, or a quota is used up."""
+    """There is no capacity for this kind of task now: Spot has none left, or a quota is used up."""
 
 
 class ServiceBusy(Exception):
@@ -37,7 +37,7 @@ class Refused(Exception):
 
 
 class RefusedDnsRecords(Exception):
-    """The zone will never take these `records`. The call's other records are changed; `change` is that change's id."""
+    """The zone will never accept these `records`. The change with the id `change` has made the other changes."""
 
     def __init__(self, records: Sequence[DnsRecord], change: str) -> None:
         super().__init__(f"{len(records)} names are refused")  # names may hold ids
@@ -52,7 +52,7 @@ class Document(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """One line of a listing."""
+    """A document in a listing: its key, the time of its last change (UTC), and its size in bytes."""
 
     key: str
     modified: datetime
@@ -180,7 +180,7 @@ class Dns(Protocol):
         """
 
     def list(self) -> Iterator[DnsRecord]:
-        """Yield the servers' A records in our zone: those whose first label has the form of a server's name."""
+        """Yield the A records in our zone whose first label has the form of a server's name."""
 
     def browser_host(self, record: DnsRecord) -> str:
         """Return the host that browsers connect to: the DNS name; the IPv4 address if the platform has no DNS."""

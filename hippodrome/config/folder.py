@@ -76,13 +76,13 @@ def read_project(folder: Path) -> Config:
     """
     source = read_source(folder)
     checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
-    steps, missing_files = _step_files(folder, checked)
-    game_pages, more_missing = _game_pages(folder, checked, steps)
-    missing_files += [*more_missing, *_missing_policies(source.layout, checked)]
-    if checked.valid(STEPS) and not missing_files:
+    steps, file_mistakes = _step_files(folder, checked)
+    game_pages, page_mistakes = _game_pages(folder, checked, steps)
+    file_mistakes += [*page_mistakes, *_missing_policies(source.layout, checked)]
+    if checked.valid(STEPS) and not file_mistakes:
         groups = number_of_groups(page.variants for page in (*steps, *game_pages))
-        missing_files += sessions.mistakes_of_groups(checked, groups)
-    found = (*checked.mistakes, *missing_files, *source.parsed.mistakes)
+        file_mistakes += sessions.mistakes_of_groups(checked, groups)
+    found = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
     mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
     agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
     mistakes += [problem for problem in agent if not problem.remark]

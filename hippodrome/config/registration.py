@@ -42,7 +42,7 @@ def parse_registration(data: object) -> dict[str, Any]:
     """
     if not isinstance(data, dict):
         raise ConfigErrors([Diagnostic(MESSAGE, None, "", "a registration must be a JSON object")])
-    steps, mistakes = _message_steps(data.get("steps"))
+    steps, mistakes = _steps_in(data.get("steps"))
     project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS)}
     if not mistakes:
         project["steps"] = {step.key: step.page for step in steps}
@@ -50,19 +50,19 @@ def parse_registration(data: object) -> dict[str, Any]:
     if mistakes:
         checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
     task = {key: data[key] for key in _OURS if key in data}
-    checked.mistakes += [*_task_findings(task), *_page_findings(task.get("gamePages", {}), checked.trial.pages)]
+    checked.mistakes += [*_task_mistakes(task), *_page_mistakes(task.get("gamePages", {}), checked.trial.pages)]
     if not checked.mistakes:
         variants = [*(step.variants for step in steps), *task.get("gamePages", {}).values()]
         checked.mistakes += sessions.mistakes_of_groups(checked, number_of_groups(variants))
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
-        raise ConfigErrors(in_order(_message_problem(mistake, order) for mistake in checked.mistakes))
+        raise ConfigErrors(in_order(_diagnostic(mistake, order) for mistake in checked.mistakes))
     shown = visited(checked.step_keys, checked.project.steps)
     config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in shown])
     return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
 
 
-def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
+def _task_mistakes(task: Mapping[str, Any]) -> Iterator[Mistake]:
     name, port = task.get("taskDefinition", "none"), task.get("serverPort", PORTS[0])
     if not (isinstance(name, str) and _TASK_DEFINITION.fullmatch(name)):
         message = "must be the name or ARN of a task definition: 1 to 255 letters, digits and :/_.-"
@@ -73,7 +73,7 @@ def _task_findings(task: Mapping[str, Any]) -> Iterator[Mistake]:
         yield Mistake(("pageFolder",), f'must be {STEPS_FOLDER}, or "" for pages right below the project\'s id')
 
 
-def _page_findings(variants: object, pages: Mapping[str, str]) -> Iterator[Mistake]:
+def _page_mistakes(variants: object, pages: Mapping[str, str]) -> Iterator[Mistake]:
     if not isinstance(variants, dict) or not variants.keys() <= pages.keys():
         yield Mistake(("gamePages",), "must be a map of the keys of trial that name a page")
         return
@@ -82,14 +82,14 @@ def _page_findings(variants: object, pages: Mapping[str, str]) -> Iterator[Mista
             yield Mistake(("gamePages", key), f"must be a number of groups, 0 to {LIMIT_VARIANTS}")
 
 
-def _message_problem(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
+def _diagnostic(mistake: Mistake, order: Mapping[str, int]) -> Diagnostic:
     path = mistake.path[1:] if mistake.path[:1] == ("project",) else mistake.path
     if path[:1] == ("steps",) and len(path) > 1 and path[1] in order:
         path = ("steps", order[str(path[1])], *path[2:])
     return Diagnostic(MESSAGE, None, path_text(path), mistake.message)
 
 
-def _message_steps(data: object) -> tuple[list[_Step], list[Mistake]]:
+def _steps_in(data: object) -> tuple[list[_Step], list[Mistake]]:
     """The steps of a registration, and the mistakes in them: each step is checked by itself, then their order."""
     if not isinstance(data, list) or not data or len(data) > project_keys.MAX_STEPS + 1:
         return [], [Mistake(STEPS, f"must be a list of 1 to {project_keys.MAX_STEPS} steps")]

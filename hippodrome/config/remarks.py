@@ -1,4 +1,4 @@
-"""Remarks on a configuration without mistakes that may cost or do something that is not intended."""
+"""Makes remarks on a configuration without mistakes that may cost or do something that its researcher does not want."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _pages(steps: Mapping[str, Any]) -> dict[str, str]:
-    """The pages in order, by their keys. Steps without a page are left out, and the keys of later steps count less."""
+    """The pages in order, by their keys. Steps without a page are left out, and later steps get lower numbers."""
     numbers = _numbers(steps)
     if numbers != list(range(1, len(numbers) + 1)):
         missing = next(number for number, given in enumerate(numbers, 1) if number != given)
@@ -87,7 +87,10 @@ def _events(entry: Mapping[str, Any], keys: list[str], pages: Mapping[str, str])
 
 
 def _place(event: object, steps: Mapping[str, Any], keys: list[str]) -> int | None:
-    """The index in `keys` of the step that an event of HIPPO's names; the last if it is beyond; None if it is none."""
+    """The index in `keys` of the step that this event of HIPPO's names; None if it names no step.
+
+    If the step comes after the last one, the result is the last index.
+    """
     text = str(event)
     if text == FINAL:
         return len(keys) - 1
@@ -107,7 +110,7 @@ def _page(given: object) -> str:
 
 
 def _minutes(given: object) -> int:
-    """The maxRuntime in minutes, of a number or a numeral as HIPPO takes both; `USUAL_RUNTIME` if it is missing."""
+    """The maxRuntime in minutes, from a number or its digits as text; `USUAL_RUNTIME` if it is missing."""
     if _is_blank(given):
         return USUAL_RUNTIME
     if isinstance(given, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(given)):

@@ -144,7 +144,7 @@ class Server(Record, frozen=True):
         return self.state is ServerState.CLOSED
 
     def lacks(self, step_key: str) -> bool:
-        """Return whether the steps were registered anew since this server was started, so that it cannot play this one.
+        """Return whether this server may not store the answer to this game step, which was registered after it started.
 
         The result is False for records of earlier versions, which do not name their steps, and for a session's server,
         on which others play.
