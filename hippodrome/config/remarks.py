@@ -17,32 +17,16 @@ from protocol.values import Keys, printable
 
 START: Keys = ("project", "events", "startServerStep")
 
-ACTIONS: Keys = ("trial", "actionSpace")
 IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
 """Names of an action that does nothing."""
 
 UI: Keys = ("trial", "ui")
+KEYS: Keys = ("trial", "keys")
 ARROWS = ("left", "right", "up", "down")
 PARTS = frozenset({*ARROWS, "fire"})
 """Keys that are combined with others: "up" and "right" are the action "upright" (`trial/core/controls.py`)."""
 
-KEYS: Keys = ("trial", "keys")
-
-CERTIFICATE: Keys = ("project", "ssl")
-
-PLAIN_CLIENTS: Keys = ("project", "plainClients")
-WHO_KNOWS_AN_ID = "whoever knows a participant's id can play in that participant's place"
-
-OBSERVATIONS: Keys = ("trial", "recordObservations")
-NO_OBSERVATIONS = (
-    "recordObservations is not given: recordings hold no observations, which HIPPO Gym saved; write "
-    "recordObservations: true to have them, or false"
-)
-
 EACH_LINK = "every opened link starts a server, also for people who look and leave"
-NO_GAME = (
-    "a server starts, and no step uses it: none is game; call the step of the game that, or leave startServerStep out"
-)
 
 
 def starts_at_link(config: Config) -> bool:
@@ -68,7 +52,10 @@ def without_a_key(config: Config) -> Remark | None:
         if idle is not None
         else "if one of the actions does nothing, name it as idleAction; if none does, see docs/agent.md#no-key"
     )
-    return Remark(ACTIONS, f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}')
+    return Remark(
+        ("trial", "actionSpace"),
+        f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}',
+    )
 
 
 def arrows_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[Remark]:
@@ -146,8 +133,10 @@ def _names_a_certificate(config: Config) -> bool:
 
 def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:
     """Yield a remark if a project of HIPPO's layout has no `recordObservations`: HIPPO saved observations."""
-    if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not source.names(OBSERVATIONS):
-        yield Remark(("trial",), NO_OBSERVATIONS)
+    given = source.names(("trial", "recordObservations"))
+    if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not given:
+        message = "recordObservations is not given: recordings hold no observations, which HIPPO Gym saved"
+        yield Remark(("trial",), f"{message}; write recordObservations: true to have them, or false")
 
 
 def keys_of_sessions(source: ConfigSource, config: Config) -> Iterator[Remark]:
@@ -160,10 +149,11 @@ def keys_of_sessions(source: ConfigSource, config: Config) -> Iterator[Remark]:
 def remarks(config: Config) -> Iterator[Remark]:
     """Yield the remarks that need only the values of the configuration."""
     if _names_a_certificate(config):
-        yield Remark(CERTIFICATE, SSL_NO_EFFECT)
+        yield Remark(("project", "ssl"), SSL_NO_EFFECT)
     if config.project.plain_clients:
         links = "; signedLinks does not protect the game then" if config.project.signed_links else ""
-        yield Remark(PLAIN_CLIENTS, f"{WHO_KNOWS_AN_ID}{links}; see docs/security.md#identity")
+        message = "whoever knows a participant's id can play in that participant's place"
+        yield Remark(("project", "plainClients"), f"{message}{links}; see docs/security.md#identity")
     yield from combined_after_single(config)
     yield from several_humans(config)
     yield from sessions.remarks(config)
@@ -173,7 +163,8 @@ def remarks(config: Config) -> Iterator[Remark]:
     first, *_ = config.steps
     second = config.steps[1] if len(config.steps) > 1 else first
     if config.events.start_server_step is not None and not config.game_steps:
-        yield Remark(START, NO_GAME)
+        message = "a server starts, and no step uses it: none is game"
+        yield Remark(START, f"{message}; call the step of the game that, or leave startServerStep out")
     elif starts_at_link(config):
         if first.type.on_server:
             advice = "a page before it, such as a consent, keeps those out who only look"

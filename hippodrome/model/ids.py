@@ -82,8 +82,8 @@ def timer_server(timer: str) -> str:
     return timer.removesuffix(_DELAYED)
 
 
-def host_server(domain_name: str) -> str:
-    """Return the first label of a server's DNS name, which by default is the server's name."""
+def first_label(domain_name: str) -> str:
+    """Return the first label of a DNS name. In a server's DNS name this is the server's name by default."""
     return domain_name.partition(".")[0]
 
 

@@ -170,7 +170,7 @@ class Server(Record, frozen=True):
     @property
     def has_default_name(self) -> bool:
         """Whether its DNS name begins with its own name, not with a participant's id."""
-        return ids.host_server(self.dns) == self.name
+        return ids.first_label(self.dns) == self.name
 
     @property
     def domain(self) -> str:

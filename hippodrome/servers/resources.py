@@ -45,7 +45,7 @@ class Resources:
     def names(self) -> Iterator[str]:
         """Yield the name of each resource. Not every name is the name of a server."""
         yield from (task.name for task in self.tasks)
-        yield from (ids.host_server(record.name) for record in self.dns_records)
+        yield from (ids.first_label(record.name) for record in self.dns_records)
         yield from map(ids.timer_server, self.timers)
         yield from self.clusters
 
@@ -59,7 +59,7 @@ class Resources:
         return replace(
             self,
             tasks=[task for task in self.tasks if (ours if task.cluster == self.cluster else keep)(task.name)],
-            dns_records=[record for record in self.dns_records if keep(ids.host_server(record.name))],
+            dns_records=[record for record in self.dns_records if keep(ids.first_label(record.name))],
             timers=[timer for timer in self.timers if ours(ids.timer_server(timer))],
             clusters=[cluster for cluster in self.clusters if keep(cluster)],
         )
