@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 LIMIT = 2_000_000  # characters of a rendered page
 VALUES_READ = frozenset({"participant", "answers"})  # the values that cost reads of the participant's documents
+_WIDE = re.compile(r"%(?:\([^)]*\))?[^a-z%]*([0-9]{4}|\*)")  # a place in a text for `%` with a width beyond 999
 
 
 class FragmentError(Exception):
@@ -118,8 +119,8 @@ def environment() -> ImmutableSandboxedEnvironment:
             sizes = [len(side) for side in (left, right) if isinstance(side, str | list | tuple)]
             counts = [abs(side) for side in (left, right) if isinstance(side, int)]
             too_long = operator == "*" and any(size * count > LIMIT for size in sizes for count in counts)
-            too_large = operator == "**" and any(count > 64 for count in counts[-1:])
-            wide = operator == "%" and isinstance(left, str) and re.search(r"%[^a-z%]*([0-9]{4}|\*)", left)
+            too_large = operator == "**" and isinstance(right, int) and abs(right) > 64
+            wide = operator == "%" and isinstance(left, str) and _WIDE.search(left)
             if too_long or too_large or wide:
                 raise SecurityError(f"the result of {operator} would be too large")
             return call(left, right)

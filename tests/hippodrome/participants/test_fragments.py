@@ -399,9 +399,12 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("2 ** 64", False),
         ("2 ** 65", True),
         ("65 ** 2", False),
+        ("100 ** 0.5", False),
         ("'%999d' % 1", False),
         ("'%1000d' % 1", True),
         ("'%*d' % (9, 1)", True),
+        ("'%(x)999d' % {'x': 1}", False),
+        ("'%(x)1000d' % {'x': 1}", True),
         ("1000 % 7", False),
     ],
 )
