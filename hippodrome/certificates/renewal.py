@@ -111,13 +111,13 @@ class Renewal:
         found = stored.directory if stored else state.directory
         if found or stored or self._location == FORMER:
             return found
-        return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).last_directory()
+        return self._at_former().last_directory()
 
     def last_roots(self, directory: str) -> str:
         """Return the root certificates (PEM) last trusted at this directory's HTTPS address; "" for the public ones."""
         state = self.read()[0]
         if not state.directory and self._location != FORMER:
-            state = Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note).read()[0]
+            state = self._at_former().read()[0]
         return state.trusted if state.directory == directory else ""
 
     def decide(self, wanted: RenewalRequest) -> Decision:
@@ -150,6 +150,9 @@ class Renewal:
         return RenewalOutcome(decision, issued.stored)
 
     # ---- the state
+
+    def _at_former(self) -> Renewal:
+        return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note)
 
     def _state(self) -> tuple[CertificateRecord, Document | None]:
         found = self._documents.get(self._location.state)
@@ -302,10 +305,11 @@ class Renewal:
         for _ in range(MAX_TRIES):
             known = self._documents.get(self._location.fullchain)  # before the key, so that a newer chain conflicts
             source = self._documents.get(self._location.privkey)
-            if source is None or (known and known.body == chain_of(source.body)):
+            chain = chain_of(source.body) if source else None
+            if chain is None or (known and known.body == chain):
                 return
             try:
-                self._write(self._location.fullchain, chain_of(source.body), known)
+                self._write(self._location.fullchain, chain, known)
             except Conflict:
                 continue
             return

@@ -33,7 +33,7 @@ class Slots:
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
         self._shared = SharedDocuments(platform.documents)
-        self._full: dict[str, tuple[int, datetime]] = {}
+        self._full: dict[str, tuple[int, datetime]] = {}  # by project: the limit, and until when it is reached
 
     # Participants
 

@@ -1,8 +1,9 @@
 """`next_step`: shows the step that is due, and stores the answers that participants send.
 
-A GET moves no participant on; a POST answers one step. If project and pages are in the cache, a GET makes one listing
-(and at a game step a read of the server's record), and a POST one conditional write (and publishes a message if the
-next step is one of the project's `events`).
+A POST answers one step. A GET moves no participant on, except a participant who was not matched with others: that GET
+stores the answer of each game step. If project and pages are in the cache, a GET makes one listing (and at a game step
+a read of the server's record), and a POST one conditional write (and publishes a message if the next step is one of the
+project's `events`). With sessions there are more calls (`lobby/lobby.py`).
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class ServerServices:
         self.written: dict[tuple[str, int], Versioned] = {}  # records in state `naming`, by label and attempt
         self._failures: list[Cause] = []
 
-    def failed(self, cause: Cause) -> None:
+    def note_failure(self, cause: Cause) -> None:
         """Note that a server was closed because it failed."""
         self._failures.append(cause)
 

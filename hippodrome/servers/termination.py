@@ -250,7 +250,7 @@ class Termination:
                 "the warm server may have been assigned: then its participant's record is the one to close"
             )
         if closed and closing.cause:
-            self._services.failed(closing.cause)
+            self._services.note_failure(closing.cause)
         log = logger.warning if cause else logger.info
         log("server closed", extra={"server": record.name, "reason": closing.reason, "cause": cause})
         self.after_close(closed.server if closed else record)
