@@ -10,7 +10,7 @@ from picture import draw
 
 WORDS = {"good": 1.0, "bad": -1.0}
 SHOWN_STEPS = 2
-"""For so many steps the picture shows the last word that the robot has heard."""
+"""The number of steps for which the picture shows the last word that the robot has heard."""
 
 
 class Agent:
@@ -31,7 +31,7 @@ class Agent:
         return self.place, {}
 
     def step(self, _action):
-        """The participant takes no action; the robot draws one from its policy."""
+        """Take a move that the robot draws from its policy. The participant takes no action."""
         known = features(self.place)
         probabilities = self.coach.probabilities(known)
         self.move = self.coach.choose(known, self.chance)

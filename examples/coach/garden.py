@@ -7,11 +7,11 @@ import numpy as np
 WIDTH, HEIGHT = 8, 5
 START, STATION = (0, 0), (7, 0)
 FLOWERS = frozenset((column, 0) for column in range(1, 7))
-"""They lie on the straight way from START to STATION."""
+"""The flowers lie on the straight way from START to STATION."""
 MOVES = {"up": (0, 1), "right": (1, 0), "down": (0, -1), "left": (-1, 0)}
 AT_STATION, ON_FLOWERS = 5.0, -1.0
 LONGEST = 40
-"""Steps after which an episode ends."""
+"""The number of steps after which an episode ends."""
 
 Place = tuple[int, int]
 
@@ -22,7 +22,7 @@ class Garden:
         return self.place
 
     def step(self, move: int) -> tuple[Place, float, bool, bool]:
-        """Drive to the next field; the fence stops the robot. Returns place, reward, terminated, truncated."""
+        """Drive to the next field; the fence stops the robot. Return place, reward, terminated and truncated."""
         self.steps += 1
         self.place = beside(self.place, move)
         reward = AT_STATION if self.place == STATION else ON_FLOWERS if self.place in FLOWERS else 0.0
@@ -30,15 +30,15 @@ class Garden:
 
 
 def beside(place: Place, move: int) -> Place:
-    """The place to which a move leads."""
+    """Return the place to which a move leads."""
     right, up = list(MOVES.values())[move]
     return min(max(place[0] + right, 0), WIDTH - 1), min(max(place[1] + up, 0), HEIGHT - 1)
 
 
 def features(place: Place) -> np.ndarray:
-    """The features by which the learner knows a place: its field, its column and its row.
+    """Return the features of a place: its field, its column and its row.
 
-    So what it learns on one field also counts a little in the same column and row.
+    So what the robot learns on one field also counts a little in the same column and row.
     """
     found = np.zeros(WIDTH * HEIGHT + WIDTH + HEIGHT)
     column, row = place

@@ -1,4 +1,4 @@
-"""The picture, as objects: the garden, the robot, an arrow for its last move, and the last word that it heard."""
+"""Draws the garden, the robot, an arrow for its last move, and the last word that it heard, by objects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Object = dict[str, object]
 
 
 def draw(before: Place, place: Place, move: int | None, heard: str | None) -> list[Object]:
-    """The robot at `place`, where `move` (None: not yet) has taken it from `before`."""
+    """Draw the robot at `place`, to which `move` has taken it from `before`. `move` is None before the first move."""
     return [*_garden(), *_words(before, place, move, heard), *_arrow(before, place, move), *_robot(place, move)]
 
 
@@ -79,7 +79,7 @@ def _words(before: Place, place: Place, move: int | None, heard: str | None) -> 
 
 
 def _arrow(before: Place, place: Place, move: int | None) -> list[Object]:
-    """An arrow from the field before towards the present one, or towards the fence that was in the way."""
+    """Draw an arrow from the previous field towards the present one, or towards the fence that was in the way."""
     if move is None:
         return []
     right, up = list(MOVES.values())[move]

@@ -36,11 +36,11 @@ class Agent:
 
     def _observations(self):
         forest = self.forest
-        me, other = PLAYERS
+        you, partner = PLAYERS
         return {
             player: {
                 "me": forest.places[player],
-                "other": forest.places[other if player == me else me],
+                "other": forest.places[partner if player == you else you],
                 "acorns": sorted(forest.acorns),
                 "trees": forest.trees,
                 "left": forest.left,

@@ -8,7 +8,7 @@ from random import Random
 WIDTH, HEIGHT = 8, 6
 TREES, ACORNS = 9, 8
 TURNS = 36
-"""Moves of both players together."""
+"""The moves of both players together."""
 PLAYERS = ("you", "partner")
 MOVES = ((0, 0), (0, -1), (1, 0), (0, 1), (-1, 0))
 """wait, up, right, down, left: the order of actionSpace in config.yml. Rows count from the top."""
@@ -18,7 +18,7 @@ START: dict[str, Place] = {"you": (0, HEIGHT - 1), "partner": (WIDTH - 1, 0)}
 
 
 class Forest:
-    """One game. `turn` is the player who is to move; each acorn counts one point for both."""
+    """One game. `turn` is the player who is to move, `left` the number of turns left. An acorn is a point for both."""
 
     def __init__(self, seed: int | None = None) -> None:
         chance = Random(seed)
@@ -38,13 +38,13 @@ class Forest:
         return not self.acorns or not self.left
 
     def legal(self, player: str) -> list[bool]:
-        """For each move, whether the player can make it now."""
+        """Return, for each move, whether the player can make it now."""
         other = next(place for name, place in self.places.items() if name != player)
         beside = (_beside(self.places[player], move) for move in range(len(MOVES)))
         return [inside(place) and place not in self.trees and place != other for place in beside]
 
     def move(self, move: int) -> float:
-        """The player whose turn it is moves. Returns the points for it."""
+        """Move the player whose turn it is, if the move is legal. Return the points for it."""
         player = self.turn
         if self.legal(player)[move]:
             self.places[player] = _beside(self.places[player], move)
@@ -60,7 +60,7 @@ def inside(place: Place) -> bool:
 
 
 def distances(start: Place, trees: frozenset[Place]) -> dict[Place, int]:
-    """The number of moves from `start` to each place that can be reached."""
+    """Return the number of moves from `start` to each place that can be reached."""
     found, edge = {start: 0}, deque([start])
     while edge:
         place = edge.popleft()

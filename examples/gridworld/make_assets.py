@@ -32,7 +32,7 @@ class Pen:
 
 
 def you(pen: Pen) -> None:
-    """A squirrel."""
+    """Draw a squirrel."""
     pen.ellipse(56, 18, 94, 84, "#a9592b", 2)  # tail
     pen.ellipse(66, 30, 86, 74, "#c97a45")
     pen.shape([(24, 28), (30, 6), (42, 24)], "#a9592b")  # ears
@@ -46,7 +46,7 @@ def you(pen: Pen) -> None:
 
 
 def partner(pen: Pen) -> None:
-    """A robot."""
+    """Draw a robot."""
     pen.line([(50, 22), (50, 8)], 3)
     pen.ellipse(45, 2, 55, 12, "#e0a800", 1.5)
     pen.ellipse(18, 18, 82, 66, "#7ea7c4", 2.5)  # head

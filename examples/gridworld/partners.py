@@ -9,7 +9,7 @@ from typing import Any
 from forest import MOVES, Place, distances
 
 THINKING_SECONDS = 0.4
-"""A partner waits so long before each move, so that people see one move after the other."""
+"""The time for which a partner waits before each move, so that people see one move after the other."""
 
 
 class Planner:
@@ -30,10 +30,10 @@ class Nearest:
 
 
 def first_of_plan(observation: dict[str, Any]) -> Place | None:
-    """The acorn to fetch first; None if the plan leaves all acorns to the other player.
+    """Return the acorn to fetch first; None if the plan leaves all acorns to the other player.
 
-    The best division of the acorns is the one with which all are collected soonest; of equal ones, the one with which
-    the players walk least.
+    The plan is the division of the acorns with which all are collected soonest. Of equal divisions it is the one with
+    which the players walk least.
     """
     acorns, trees = sorted(observation["acorns"]), observation["trees"]
     between = [distances(acorn, trees) for acorn in acorns]
@@ -41,14 +41,14 @@ def first_of_plan(observation: dict[str, Any]) -> Place | None:
 
     @cache
     def onward(at: int, left: int) -> int:
-        """The fewest moves from acorn `at` through all those of the set `left`."""
+        """Return the fewest moves from acorn `at` through all acorns of the set `left`."""
         return min(
             (between[at][acorns[to]] + onward(to, left & ~(1 << to)) for to in _members(left)),
             default=0,
         )
 
     def tour(start: Place, left: int) -> tuple[int, int | None]:
-        """The fewest moves from a place through all acorns of the set `left`, and the acorn to begin with."""
+        """Return the fewest moves from a place through all acorns of the set `left`, and the first of them."""
         ways = ((between[to][start] + onward(to, left & ~(1 << to)), to) for to in _members(left))
         return min(ways, default=(0, None))
 
@@ -62,12 +62,12 @@ def first_of_plan(observation: dict[str, Any]) -> Place | None:
 
 
 def _members(numbers: int) -> list[int]:
-    """The members of a set, which is a number whose bit n stands for member n."""
+    """Return the members of a set. The set is a number: its bit n says whether n is a member."""
     return [bit for bit in range(numbers.bit_length()) if numbers >> bit & 1]
 
 
 def step_towards(observation: dict[str, Any], info: dict[str, Any], acorn: Place | None) -> int:
-    """The legal move after which the acorn is nearest; without an acorn to fetch, the player waits."""
+    """Return the legal move after which the acorn is nearest; without an acorn to fetch, the move `wait`."""
     if acorn is None:
         return 0
     away = distances(acorn, observation["trees"])

@@ -41,7 +41,7 @@ def _sprite(name: str, image: str, place: Place) -> Object:
 
 
 def _whose_turn(forest: Forest) -> Object:
-    """A ring around the player who is to move. The page also says in words whose turn it is."""
+    """Draw a ring around the player who is to move. The page also says in words whose turn it is."""
     x, y = _corner(forest.places[forest.turn])
     ring: Object = {"x": x + FIELD / 2, "y": y + FIELD / 2, "radius": FIELD / 2 - 3, "color": "#ffffff88"}
     return {**ring, "id": "turn", "type": "circle", "outline": RING, "outline_width": 4, "depth": 1, "tween": GLIDE}

@@ -13,16 +13,18 @@ LARGER = {"width": TILE + 1, "height": TILE + 1}
 """The size of a picture that fills its tile: neighbours overlap, so that no line is seen between them."""
 
 STEPS_PER_SECOND = 10
-"""As `startingFrameRate` of config.yml: the clock beside the score counts by it."""
+"""The same as `startingFrameRate` in config.yml: the clock beside the score counts steps."""
 
 WALK = 110
-"""Milliseconds in which a chef is seen to walk from one tile to the next."""
+"""The milliseconds in which a chef is seen to walk from one tile to the next."""
 
 COOK_STEPS = 30
+"""The steps for which a full pot cooks, as the package has it."""
+
 COLOURS = ("blue", "green")
 FACING = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
 HANDS = {UP: (0.0, -0.16), DOWN: (0.0, 0.22), LEFT: (-0.3, 0.12), RIGHT: (0.3, 0.12)}
-"""Where a chef holds a thing, by the direction in which they face: in tiles from the middle."""
+"""The place of the thing that a chef holds, by the direction in which they face: in tiles from the chef's middle."""
 
 
 class Agent:
@@ -36,7 +38,7 @@ class Agent:
         return self.env
 
     def render(self, player):
-        """The scene (docs/objects.md). Objects that never change are `permanent`: sent once, when an episode begins.
+        """Return the scene (docs/objects.md). Objects that never change are `permanent`: they are sent once an episode.
 
         If two people play, each reads which chef they are. With the policy, the instructions say it.
         """
@@ -53,14 +55,14 @@ class Agent:
 
 
 def _sprite(name, frame, cell, **more):
-    """A picture of the atlas, as large as its tile."""
+    """Return a picture of the atlas, as large as its tile."""
     row, column = cell
     at = {"x": column * TILE, "y": row * TILE, "width": TILE, "height": TILE}
     return {"id": name, "type": "sprite", "image": "kitchen", "frame": frame, **at, **more}
 
 
 def _room(kitchen):
-    """Floor and tables: they never change."""
+    """Return floor and tables, which never change."""
     rows, columns = kitchen.size
     cells = [(row, column) for row in range(rows) for column in range(columns)]
     still = {**LARGER, "permanent": True}
@@ -73,7 +75,7 @@ def _room(kitchen):
 
 
 def _pot(cell, onions, timer):
-    """The pot with its onions, and a bar that grows while it cooks."""
+    """Return the pot with its onions, and a bar that grows while it cooks."""
     ready = onions == POT_HOLDS and timer == 0
     found = [_sprite(f"pot {cell}", "pot-ready" if ready else f"pot-{onions}", cell, **LARGER)]
     if onions == POT_HOLDS and not ready:
@@ -88,7 +90,7 @@ def _pot(cell, onions, timer):
 
 
 def _chef(number, chef):
-    """The chef, and the thing that they hold: it is behind them while they face away."""
+    """Return the chef, and the thing that they hold. It is behind them while they face away."""
     found = [_sprite(f"chef {number}", f"chef-{COLOURS[number]}-{FACING[chef.facing]}", chef.cell, depth=4, tween=WALK)]
     if chef.holds:
         right, down = HANDS[chef.facing]

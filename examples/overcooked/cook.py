@@ -13,7 +13,7 @@ from kitchen import NOOP, PICKUP, POT_HOLDS, STEPS, Cell, Kitchen
 
 
 def act(kitchen: Kitchen, chef: int) -> int:
-    """The best action of this chef."""
+    """Return the best action of this chef."""
     for wanted in _targets(kitchen, chef):
         action = _towards(kitchen, chef, wanted)
         if action is not None:
@@ -22,7 +22,10 @@ def act(kitchen: Kitchen, chef: int) -> int:
 
 
 def _targets(kitchen: Kitchen, number: int) -> Iterator[frozenset[Cell]]:
-    """Sets of cells to walk to and use, the best first. A later set counts if no cell before it can be reached."""
+    """Yield sets of cells to walk to and use, the best set first.
+
+    A set counts only if no cell of an earlier set can be reached.
+    """
     me, other = kitchen.chefs[number], kitchen.chefs[1 - number]
     filling = [cell for cell, (onions, _) in kitchen.pots.items() if onions < POT_HOLDS]
     full = {cell: timer for cell, (onions, timer) in kitchen.pots.items() if onions == POT_HOLDS}
@@ -56,9 +59,10 @@ def _places(things: dict[Cell, str]) -> Callable[[str], frozenset[Cell]]:
 
 
 def _towards(kitchen: Kitchen, number: int, wanted: frozenset[Cell]) -> int | None:
-    """The action that uses a wanted cell if it is ahead, else the first step of the shortest way to one of them.
+    """Return the action that uses a wanted cell ahead, or else the first step of the shortest way to a wanted cell.
 
-    The way leads around the other chef. If there is none, it leads through them: they may go. None: no way at all.
+    The way leads around the other chef; if there is no such way, through them, since they may go. Return None if there
+    is no way at all.
     """
     me, other = kitchen.chefs[number], kitchen.chefs[1 - number]
     if not wanted:

@@ -1,4 +1,4 @@
-"""Overcooked of the package `cogrid` as PettingZoo's ParallelEnv, and the state of its kitchen."""
+"""The environment Overcooked of the package `cogrid` as a ParallelEnv of PettingZoo, and the state of its kitchen."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ for _name in HIDDEN:
     del sys.modules[_name]
 
 Cell = tuple[int, int]
-"""Row and column, from the upper left corner."""
+"""The row and the column, from the upper left corner."""
 
 ACTIONS = ("up", "down", "left", "right", "pickup", "noop")
 UP, DOWN, LEFT, RIGHT, PICKUP, NOOP = range(len(ACTIONS))
@@ -47,7 +47,7 @@ FEATURES = [
     "ordered_pot_features",
     "overcooked_inventory",
 ]
-"""The parts of the package's observations that a chef gets: 202 numbers. By default they are 892, mostly 0."""
+"""The parts of the package's observations that a chef gets: 202 numbers. By default it gets 892, most of them 0."""
 
 
 @dataclass
@@ -75,11 +75,11 @@ class Kitchen:
     lying: dict[Cell, str] = field(default_factory=dict)
     """Things on counters, and on the floor."""
     pots: dict[Cell, tuple[int, int]] = field(default_factory=dict)
-    """By the pot's cell: the number of onions in it, and the steps that a full one still cooks."""
+    """By the pot's cell: the number of onions in it, and the number of steps for which a full pot still cooks."""
 
 
 class Overcooked(ParallelEnv):
-    """Two chefs, 0 and 1, cook onion soup: three onions in the pot, wait, the soup on a plate, and out with it.
+    """Two chefs, 0 and 1, cook onion soup: they put three onions into the pot, wait, and deliver the soup on a plate.
 
     Both get the same rewards: 20 for a soup that is delivered, 3 for an onion in the pot, 5 for soup on a plate.
     """
@@ -124,7 +124,7 @@ class Overcooked(ParallelEnv):
         return self.max_steps - self._game.t
 
     def kitchen(self) -> Kitchen:
-        """The present state of the kitchen."""
+        """Return the present state of the kitchen."""
         state = self._game._env_state
         chefs = [
             Chef(_cell(cell), FACING[int(facing)], self._names.get(int(held[0])))

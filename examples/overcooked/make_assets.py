@@ -14,14 +14,14 @@ from PIL import Image, ImageDraw
 
 ASSETS = Path(__file__).parent / "assets"
 TILE = 144
-"""Pixels; half as many again as in the scene, for large screens."""
+"""The side of a picture in pixels: 1.5 times the tile of the scene, for large screens."""
 
 FINER = 4
-"""Pictures are drawn so many times larger and then reduced, so that edges are smooth."""
+"""Pictures are drawn FINER times larger and then reduced, so that edges are smooth."""
 
 COLUMNS = 6
 EDGE = 2
-"""Each picture has a border of so many copies of its outermost pixels: a scaled picture then shows none of the next."""
+"""The width of each picture's border, which repeats its outermost pixels: scaled, it shows nothing of the next one."""
 
 Colour = tuple[int, ...]
 
@@ -39,7 +39,7 @@ AHEAD = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 
 
 class Tile:
-    """A picture in the making. Lengths are parts of a tile, from 0 to 1."""
+    """A picture that is being drawn. Lengths are parts of a tile, from 0 to 1."""
 
     def __init__(self, fill: Colour | None = None) -> None:
         self._size = TILE * FINER
@@ -51,7 +51,7 @@ class Tile:
         self._draw.rounded_rectangle(corners, round_by * self._size, fill=fill)
 
     def oval(self, x: float, y: float, wide: float, high: float, fill: Colour, edge: Colour | None = None) -> None:
-        """Around a point; `wide` and `high` are radii."""
+        """Draw an ellipse around a point; `wide` and `high` are its radii."""
         corners = tuple(part * self._size for part in (x - wide, y - high, x + wide, y + high))
         self._draw.ellipse(corners, fill=fill, outline=edge, width=round(0.025 * self._size) if edge else 0)
 
@@ -107,7 +107,7 @@ def plates() -> Tile:
 
 
 def hatch() -> Tile:
-    """Where soups are delivered: an open hatch with an arrow."""
+    """Draw an open hatch with an arrow, where soups are delivered."""
     tile = Tile(STEEL_EDGE)
     tile.box(0.04, 0.04, 0.96, 0.9, GREEN, 0.08)
     tile.line([(0.5, 0.2), (0.5, 0.7)], (240, 250, 240), 0.09)
@@ -116,7 +116,7 @@ def hatch() -> Tile:
 
 
 def pot(onions_inside: int, ready: bool = False) -> Tile:
-    """On its stove, from above and the front."""
+    """Draw the pot on its stove, from above and the front."""
     tile = counter()
     tile.box(0.08, 0.08, 0.92, 0.82, DARK, 0.1)
     tile.box(0.04, 0.36, 0.96, 0.48, STEEL_EDGE, 0.06)
@@ -133,7 +133,7 @@ def pot(onions_inside: int, ready: bool = False) -> Tile:
 
 
 def chef(colour: str, facing: str) -> Tile:
-    """From above and the front: clothes, head, tall hat. Hands point ahead."""
+    """Draw a chef from above and the front: clothes, head, tall hat. Hands point ahead."""
     tile, clothes = Tile(), CLOTHES[colour]
     darker = tuple(round(part * 0.7) for part in clothes)
     across, down = AHEAD[facing]
@@ -154,7 +154,7 @@ def chef(colour: str, facing: str) -> Tile:
 
 
 def thing(name: str) -> Tile:
-    """Something that lies on a counter or is carried: in the middle of its tile."""
+    """Draw a thing that lies on a counter or is carried, in the middle of its tile."""
     tile = Tile()
     if name == "onion":
         onion(tile, 0.5, 0.52, 0.2)

@@ -28,12 +28,12 @@ Player = Callable[[Kitchen, int, Array], int]
 
 HIDDEN = 64
 EPISODE = 250
-"""Steps of an episode in training: short, so that many kitchens begin anew."""
+"""The steps of an episode in training. It is short, so that training has many beginnings."""
 
 
 @dataclass
 class Network:
-    """Two layers. Inputs are scaled by the mean and deviation of what was observed in training."""
+    """A network with two layers. Inputs are scaled by the mean and deviation of the observations in training."""
 
     mean: Array
     deviation: Array
@@ -59,7 +59,7 @@ class Network:
         return int(self.values(observation[None])[0].argmax())
 
     def learn(self, observations: Array, labels: Array, chance: np.random.Generator, epochs: int) -> float:
-        """Learn to give these actions, by Adam. Returns the share that it gets right."""
+        """Learn to choose these actions, by Adam. Return the share of them that the network now chooses."""
         means = [np.zeros_like(part) for part in self.weights]
         squares = [np.zeros_like(part) for part in self.weights]
         inputs = ((observations - self.mean) / self.deviation).astype(np.float32)
@@ -96,14 +96,14 @@ def at_random(chance: random.Random) -> Player:
 
 
 def by_rules(chance: random.Random, astray: float) -> Player:
-    """The cook by rules, who sometimes takes a random action, so that the network learns to go on after mistakes."""
+    """Return the cook by rules, who sometimes takes a random action: so the network learns to go on after mistakes."""
     return lambda kitchen, chef, observation: (
         chance.randrange(len(ACTIONS)) if chance.random() < astray else cook.act(kitchen, chef)
     )
 
 
 def play(players: tuple[Player, Player], steps: int, seed: int, layout: str = CRAMPED) -> tuple[Array, Array, float]:
-    """Play. Returns the observations, the actions of the cook by rules for them, and the soups in 100 steps."""
+    """Play. Return the observations, the actions of the cook by rules for them, and the soups in 100 steps."""
     env, observed, labels, soups = Overcooked(layout, max_steps=EPISODE), [], [], 0
     for number in range(steps):
         if number % EPISODE == 0:

@@ -8,13 +8,13 @@ from slime_volleyball.core import constants, physics
 from volleyball import LEFT, PLAYERS, RIGHT, Volleyball
 
 WIDTH, HEIGHT = 960, 500
-"""The size of the scene in config.yml, in pixels. `assets/court.png` has the same."""
+"""The size of the scene in config.yml, in pixels. `assets/court.png` has the same size."""
 
 SCALE = WIDTH / constants.REF_W
-"""Pixels of one unit of the package."""
+"""The pixels of one unit of the package."""
 
 SAND = 30
-"""Pixels from the bottom of the picture to the ground."""
+"""The pixels from the bottom of the picture to the ground."""
 
 SLIMES = {LEFT: "slime-left", RIGHT: "slime-right"}
 COLOURS = {LEFT: "red", RIGHT: "blue"}
@@ -31,7 +31,7 @@ class Agent:
         return self.env
 
     def render(self, player):
-        """The scene (docs/objects.md). Objects that never change are `permanent`: sent once, when an episode begins.
+        """Return the scene (docs/objects.md). Objects that never change are `permanent`: they are sent once an episode.
 
         If two people play, each reads which slime they are. Against the policy, the instructions say it.
         """
@@ -52,7 +52,7 @@ class Agent:
 
 
 def _at(x, y):
-    """A place in pixels of the scene. The package measures it from the net, and from the lower edge of the ground."""
+    """Convert a place to pixels. The package measures it from the net, and from the lower edge of the ground."""
     return WIDTH / 2 + x * SCALE, HEIGHT - SAND - (y - constants.REF_U) * SCALE
 
 
@@ -66,7 +66,7 @@ def _circle(name, place, radius, color, **more):
 
 
 def _slime(player, place, ball):
-    """The body is a sprite; its eye looks at the ball."""
+    """Return a slime: its body is a sprite, and its eye looks at the ball."""
     x, y = _at(*place)
     radius = physics.AGENT_RADIUS * SCALE
     eye = x + (0.4 if player == LEFT else -0.4) * radius, y - 0.55 * radius
@@ -81,7 +81,7 @@ def _slime(player, place, ball):
 
 
 def _ball(place):
-    """The ball, which turns as it flies. If it is above the picture, an arrow points to it."""
+    """Return the ball, which turns as it flies; an arrow that points to it if it is above the picture."""
     x, y = _at(*place)
     size = 2 * physics.BALL_RADIUS * SCALE
     if y > -size / 2:

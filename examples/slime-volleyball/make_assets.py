@@ -9,19 +9,19 @@ from PIL import Image, ImageDraw
 
 ASSETS = Path(__file__).parent / "assets"
 FINER = 4
-"""Pictures are drawn so many times larger and then reduced, so that edges are smooth."""
+"""Pictures are drawn FINER times larger and then reduced, so that edges are smooth."""
 
 WIDTH, HEIGHT, GROUND = 960, 500, 30
 """The size of the court, and the height of its ground, in pixels."""
 
 SLIME, BALL = (120, 60), 40
-"""Pixels: twice the size at which they are shown."""
+"""The sizes of their pictures in pixels: twice the sizes at which they are shown."""
 
 Colour = tuple[int, ...]
 
 
 def court() -> Image.Image:
-    """Sky, sea, and sand."""
+    """Draw sky, sea and sand."""
     picture = Image.new("RGB", (WIDTH * 2, HEIGHT * 2), (198, 232, 244))
     draw = ImageDraw.Draw(picture)
     draw.ellipse(_around(1560, 190, 90), fill=(255, 236, 168))
@@ -38,7 +38,7 @@ def court() -> Image.Image:
 
 
 def slime(body: Colour, edge: Colour) -> Image.Image:
-    """Half a disc with a lighter belly. The eye is drawn by the game: it follows the ball."""
+    """Draw half a disc with a lighter spot. The game itself draws the eye, which follows the ball."""
     width, height = SLIME[0] * FINER, SLIME[1] * FINER
     picture = Image.new("RGBA", (width, height * 2))
     draw = ImageDraw.Draw(picture)

@@ -27,11 +27,11 @@ Chooser = Callable[[Array], Array]
 """Chooses the actions of one player from the observations of many games, a row for each game."""
 
 BUTTONS = np.array(SlimeVolleyEnv.action_table, np.float32)
-"""For each action the pressed buttons: forwards, backwards, jump."""
+"""The pressed buttons (forwards, backwards, jump) of each action."""
 
 INPUTS, HIDDEN, OUTPUTS = 12, 48, len(ACTIONS)
 SIDES = (-1, 1)
-"""The sign of x on the half of the left player, and on that of the right one."""
+"""The sign of x on the half of the left player, and on the half of the right one."""
 
 
 class Games:
@@ -52,14 +52,14 @@ class Games:
         self._wait[where] = constants.INIT_DELAY_FRAMES
 
     def observations(self, player: int) -> Array:
-        """A row for each game, as the package's `compute_observations` makes them."""
+        """Return a row for each game, as the package's `compute_observations` makes them."""
         own, opponent = np.array([[SIDES[player]], [1]]), np.array([[-SIDES[player]], [1]])
         mine, theirs = (self._place[player], self._speed[player]), (self._place[1 - player], self._speed[1 - player])
         parts = [part * own for part in (*mine, self._ball, self._ball_speed)] + [part * opponent for part in theirs]
         return (np.concatenate(parts) / 10).T.astype(np.float32)
 
     def step(self, left: Array, right: Array) -> Array:
-        """Take an action of each player in each game: forwards or backwards. Returns the right player's rewards."""
+        """Take an action of each player in each game: forwards or backwards. Return the right player's rewards."""
         for player, actions in enumerate((left, right)):
             wanted = physics.actions_to_desired_vel(BUTTONS[actions]).T
             self._place[player], self._speed[player], _ = physics.update_agent(
@@ -88,7 +88,7 @@ def _bounce(ball: Array, speed: Array, place: Array, radius: float) -> tuple[Arr
 
 
 class Teacher:
-    """The opponent that the package brings, in many games at once. It remembers the last step."""
+    """The opponent of the package, in many games at once. It remembers its last output."""
 
     def __init__(self, count: int) -> None:
         given = BaselinePolicy()
@@ -96,7 +96,7 @@ class Teacher:
         self._output = np.zeros((count, given.nOutput))
 
     def __call__(self, observations: Array) -> Array:
-        """The opponent's actions. Forwards and backwards at once count as neither, since there is no such action."""
+        """Return the opponent's actions. Forwards and backwards at once count as neither: there is no such action."""
         inputs = np.concatenate([observations[:, :8], self._output], axis=1)
         self._output = np.tanh(inputs @ self._weight + self._bias)
         forwards, backwards, jumps = (self._output[:, :3] > 0.75).T
@@ -105,7 +105,7 @@ class Teacher:
 
 
 class Network:
-    """Two layers; the largest of six values is the action."""
+    """A network with two layers. Its action is the one with the largest of six values."""
 
     def __init__(self, chance: np.random.Generator) -> None:
         first, second = chance.normal(0, 1, (INPUTS, HIDDEN)), chance.normal(0, HIDDEN**-0.5, (HIDDEN, OUTPUTS))
@@ -125,7 +125,7 @@ class Network:
         return hidden, hidden @ second + last
 
     def learn(self, observations: Array, actions: Array, rate: float) -> float:
-        """Take one step of Adam towards these actions. Returns the share that the network had right before."""
+        """Take one step of Adam towards these actions. Return the share of them that the network chose before."""
         hidden, values = self._values(observations)
         right = float((values.argmax(1) == actions).mean())
         shares = np.exp(values - values.max(1, keepdims=True))
@@ -144,7 +144,10 @@ class Network:
 
 
 def play(left: Chooser, right: Chooser, games: int, steps: int, seed: int) -> tuple[float, Array, Array]:
-    """Play. Returns the right player's points less the left one's, a game; its observations; the teacher's actions."""
+    """Play. Return the right player's mean score, their observations, and the teacher's actions for these.
+
+    The score of a game is the points that the player has won, less those that they have lost.
+    """
     world, teacher = Games(games, np.random.default_rng(seed)), Teacher(games)
     points, observed, wanted = 0.0, [], []
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""The environment of the package `slimevb` as PettingZoo's ParallelEnv."""
+"""The environment of the package `slimevb` as a ParallelEnv of PettingZoo."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ACTIONS = ("noop", "left", "leftup", "up", "rightup", "right")
 """In the package's order. `left` is to the left on the screen, for both players."""
 
 MIRRORED = (0, 5, 4, 3, 2, 1)
-"""Each action mirrored: the number of the same action for the player of the other half."""
+"""For each action, the number of the same action for the player of the other half."""
 
 STEPS_PER_SECOND = round(1 / constants.TIMESTEP)
 
@@ -34,7 +34,6 @@ class Volleyball(ParallelEnv):
         """An episode ends when a player has `points`, or after `seconds`, which are steps at 30 a second."""
         self.possible_agents = list(PLAYERS)
         self.agents: list[str] = []
-        self.points = points
         self._observation_space = spaces.Box(-np.inf, np.inf, (12,), np.float32)
         self._action_spaces = {player: spaces.Discrete(len(ACTIONS)) for player in PLAYERS}
         self.max_steps = round(seconds * STEPS_PER_SECOND)
@@ -72,7 +71,7 @@ class Volleyball(ParallelEnv):
         )
 
     def places(self) -> dict[str, tuple[float, float]]:
-        """Where the players and the `ball` are: x from the net, y from the bottom, in the package's units (48 wide)."""
+        """Return where the players and the `ball` are: x from the net, y from the bottom, in the package's units."""
         state = self._game._env_state
         return {
             LEFT: _place(state.agent_pos[0]),

@@ -13,7 +13,7 @@ from tamer import Bumps, Tamer
 
 WORDS = {"good": 1.0, "bad": -1.0}
 SHOWN_SECONDS = 0.8
-"""For so long the picture shows the last word that the car has heard."""
+"""The time for which the picture shows the last word that the car has heard."""
 
 ACTIONS = 3  # push left, no push, push right
 

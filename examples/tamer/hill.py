@@ -16,7 +16,7 @@ DOES = ("pushes left", "does not push", "pushes right")
 
 
 def height(place: float) -> float:
-    """The height of MountainCar's hill at a place."""
+    """Return the height of MountainCar's hill at a place."""
     return math.sin(3 * place) * 0.45 + 0.55
 
 
@@ -60,7 +60,7 @@ class Hill:
         angle = math.atan2(ahead[1] - behind[1], ahead[0] - behind[0])
 
         def on_car(along: float, up: float) -> tuple[float, float]:
-            """A point `along` the ground and `up` from it, in pixels of the picture."""
+            """Return a point `along` the ground and `up` from it, in pixels before the picture is reduced."""
             return (
                 x + (along * math.cos(angle) + up * math.sin(angle)) * FINE,
                 y + (along * math.sin(angle) - up * math.cos(angle)) * FINE,
@@ -91,5 +91,5 @@ def at(x: float, y: float) -> tuple[float, float]:
 
 
 def ground(place: float) -> tuple[float, float]:
-    """The point of the hill's surface at `place`, in pixels before the picture is reduced."""
+    """Return the point of the hill's surface at `place`, in pixels before the picture is reduced."""
     return at((place - LEFT) / (RIGHT - LEFT) * WIDTH, HEIGHT - 24 - height(place) * 240)

@@ -7,8 +7,8 @@ TAMER framework" (K-CAP 2009). Three of its ideas are here:
   reward plays no part.
 * It is greedy: it takes the action with the highest H. What a person says judges an action with all its consequences,
   so the agent need not look ahead.
-* People are slow. A word is shared among the steps that it may be about: each step gets as much of it as the
-  probability that the person answered that step (credit assignment).
+* People are slow. A word is shared among the steps that it may be about: the share of a step is the probability that
+  the word was about that step (credit assignment).
 
 H is linear in features of the state, with weights of its own for each action.
 """
@@ -20,7 +20,7 @@ from collections import deque
 import numpy as np
 
 FASTEST, SLOWEST = 0.2, 0.8
-"""Seconds in which a person reacts, at least and at most. All delays between are taken as equally likely."""
+"""The least and the most seconds in which a person reacts. All delays between them are taken as equally likely."""
 
 
 class Bumps:
@@ -43,7 +43,7 @@ class Bumps:
 
 
 class Tamer:
-    """The learner. `step_seconds` is how long the participant sees a step; `rate` how much one word changes."""
+    """The learner. `step_seconds` is the time for which a step is seen; `rate` is how much one word changes."""
 
     def __init__(self, features: Bumps, actions: int, step_seconds: float, rate: float) -> None:
         self._features, self._step_seconds, self._rate = features, step_seconds, rate
@@ -51,11 +51,11 @@ class Tamer:
         self._recent: deque[tuple[int, np.ndarray]] = deque(maxlen=int(SLOWEST / step_seconds) + 1)  # newest first
 
     def predict(self, state: np.ndarray) -> np.ndarray:
-        """H of each action: what the teacher would say, from -1 (bad) to 1 (good)."""
+        """Return H of each action: what the teacher would say, from -1 (bad) to 1 (good)."""
         return self._weights @ self._features(state)
 
     def choose(self, state: np.ndarray, last: int) -> int:
-        """The action with the highest H. Among equal ones it is the `last` action, so that a teacher can follow."""
+        """Return the action with the highest H; of equal ones the `last` action, so that a teacher can follow."""
         predicted = self.predict(state)
         best = np.flatnonzero(predicted >= predicted.max() - 1e-9)
         return last if last in best else int(best[0])
@@ -65,7 +65,7 @@ class Tamer:
         self._recent.appendleft((action, self._features(state)))
 
     def begin(self) -> None:
-        """Begin an episode: words are no longer about the one before."""
+        """Begin an episode: words are no longer about the previous episode."""
         self._recent.clear()
 
     def hear(self, word: float) -> None:
@@ -77,7 +77,7 @@ class Tamer:
         self._weights += self._rate * error * credited
 
     def _credit(self, age: int) -> float:
-        """The share of a word that belongs to a step after which `age` other steps were taken.
+        """Return the share of a word that belongs to a step after which `age` other steps were taken.
 
         The person saw that step from `age` to `age + 1` steps ago. The share is the probability of such a delay.
         """

@@ -43,6 +43,6 @@ class Agent:
         }
 
     def _infos(self):
-        """The `info` that the recording holds of each step."""
+        """Return the infos. The recording holds them for each step."""
         garden = self.garden
         return {player: {"place": garden.places[player], "plates": garden.plates} for player in PLAYERS}

@@ -27,7 +27,7 @@ class Helper:
 
 
 def plate_of(observation: dict[str, Any], player: str) -> Place:
-    """The plate that this player should take, so that both plates are reached as soon as possible.
+    """Return the plate that this player should take, so that both plates are reached as soon as possible.
 
     If it makes no difference, red takes the first plate: otherwise two helpers might both go to the same one.
     """
@@ -43,7 +43,7 @@ def plate_of(observation: dict[str, Any], player: str) -> Place:
 
 
 def step_towards(observation: dict[str, Any], plate: Place) -> int:
-    """The move after which the plate is nearest. On the plate the helper waits."""
+    """Return the move after which the plate is nearest. On the plate the helper waits."""
     away = distances(plate, observation["hedges"])
     column, row = observation["me"]
     reached = {move: (column + x, row + y) for move, (x, y) in enumerate(MOVES)}

@@ -8,7 +8,7 @@ from random import Random
 WIDTH, HEIGHT = 9, 6
 HEDGES, LANTERNS = 9, 12
 APART = 4
-"""The fewest moves from one plate to the other."""
+"""The least number of moves from one plate to the other."""
 PLAYERS = ("red", "blue")
 MOVES = ((0, 0), (0, -1), (1, 0), (0, 1), (-1, 0))
 """wait, up, right, down, left: the order of actionSpace in config.yml. Rows count from the top."""
@@ -43,7 +43,7 @@ class Garden:
         return set(self.plates) & set(self.places.values())
 
     def move(self, moves: dict[str, int]) -> float:
-        """Both players move at once. Returns 1 if they have lit a lantern, else 0."""
+        """Move both players at once. Return 1 if they have lit a lantern, else 0."""
         for player, move in moves.items():
             column, row = self.places[player]
             there = column + MOVES[move][0], row + MOVES[move][1]
@@ -56,7 +56,7 @@ class Garden:
         return 1.0
 
     def _next_plates(self) -> tuple[Place, Place]:
-        """Two fields on which no player stands, some way from each other."""
+        """Return two fields on which no player stands, at least APART moves from each other."""
         free = [place for place in self._open if place not in self.places.values()]
         while True:
             first, second = self._chance.sample(free, 2)
@@ -69,7 +69,7 @@ def inside(place: Place) -> bool:
 
 
 def distances(start: Place, hedges: frozenset[Place]) -> dict[Place, int]:
-    """The number of moves from `start` to each field that can be reached."""
+    """Return the number of moves from `start` to each field that can be reached."""
     found, edge = {start: 0}, deque([start])
     while edge:
         place = edge.popleft()

@@ -37,7 +37,7 @@ class Pen:
 
 
 def keeper(pen: Pen, coat: str, shade: str, *, pointed: bool) -> None:
-    """A keeper of lanterns in a hooded coat. `pointed`: the form of the hood, for people who see no colours."""
+    """Draw a keeper of lanterns in a hooded coat. Only one hood is `pointed`, for people who see no colours."""
     if pointed:
         pen.shape([(26, 40), (50, 2), (74, 40)], coat)
     else:

@@ -28,7 +28,7 @@ def _corner(place: Place) -> tuple[int, int]:
 
 
 def _ground(lit: int) -> list[Object]:
-    """The grass, which gets lighter with each lantern."""
+    """Draw the grass. It gets lighter with each lantern."""
     found: list[Object] = []
     for column in range(WIDTH):
         for row in range(HEIGHT):
@@ -70,7 +70,7 @@ def _plate(place: Place, *, lit: bool) -> list[Object]:
 
 
 def _figure(player: str, place: Place, *, me: bool) -> list[Object]:
-    """A player. The figure of the participant who sees the picture has a ring around it."""
+    """Draw a player. The figure of the participant who sees the picture has a ring around it."""
     x, y = _corner(place)
     found: list[Object] = []
     if me:
