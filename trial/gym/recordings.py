@@ -97,8 +97,9 @@ class Recorded:
             return results  # `Instance` refuses it
         observation, reward, *ends, info = results
         terminated, truncated = (ends[0], ends[1]) if len(ends) == 2 else (ends[0], False)
+        number = float(reward.item() if isinstance(reward, np.ndarray) else reward)
         self._steps += 1
-        self._score += float(reward)
+        self._score += number
         plain_action = recording.plain(action)
         self.write(
             "step",
@@ -108,7 +109,7 @@ class Recorded:
             actionName=str(plain_action),
             by="agent",
             human=None,
-            reward=float(reward),
+            reward=number,
             terminated=bool(terminated),
             truncated=bool(truncated),
             info=info,

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import minari
 import numpy as np
 import psutil
@@ -19,6 +20,7 @@ from console.problem import Exit
 from deploy.__main__ import main
 from testing.gym_server import ROOT, TextClient, gym_server
 from testing.waiting import until
+from trial.gym.recordings import ConnectionRecorder
 from trial.recordings import recording
 
 HERE = Path(__file__).parent
@@ -84,6 +86,24 @@ def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
         client.ask("close", instance_id=made)
     ((*_, last, end),) = recordings_in(tmp_path)
     assert (last["terminated"], end["why"], end["steps"], end["score"]) == (True, "terminated", 5, 15.0)
+
+
+def test_a_reward_may_be_an_array_of_one_number(tmp_path: Path) -> None:
+    class Env(gymnasium.Env[Any, Any]):
+        action_space = observation_space = gymnasium.spaces.Discrete(2)
+
+        def reset(self, **_: Any) -> Any:
+            return 0, {}
+
+        def step(self, action: Any) -> Any:
+            return 0, np.array([2.5]), True, False, {}
+
+    env = ConnectionRecorder(tmp_path).record(Env(), "Env-v0", None)
+    env.reset()
+    assert env.step(1)[1] == np.array([2.5])
+    env.close()
+    ((*_, step, end),) = recordings_in(tmp_path)
+    assert (step["reward"], end["score"]) == (2.5, 2.5)
 
 
 def test_a_recording_is_whole_after_the_client_leaves_and_lacks_a_second_after_a_kill(
