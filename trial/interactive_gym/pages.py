@@ -11,6 +11,7 @@ from typing import Any
 
 from trial.interactive_gym.playing import humans_of
 from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.sources import put
 
 _LINKED = re.compile(r'(?P<before>\b(?:src|href)=")(?P<path>[^":#?{}]+\.[A-Za-z0-9]+)(?=")')
 _TAG = re.compile(r"<[A-Za-z/!]")
@@ -127,8 +128,7 @@ def with_files(page: str, locate: Locate, files: dict[str, bytes]) -> str:
         path = locate(link["path"])
         if path is None:
             return link[0]
-        files[f"steps/{path.name}"] = path.read_bytes()
-        return f"{link['before']}{path.name}"
+        return f"{link['before']}{put(path, 'steps', files)}"
 
     return _LINKED.sub(beside, page)
 

@@ -213,12 +213,13 @@ def _players(
             players[player] = (plays, "")
             continue
         file = find(plays) if isinstance(plays, str) and ("/" in plays or "." in plays) else None
+        name = Path(str(plays)).name
         if file is not None and file.is_file():
-            files[f"policies/{file.name}"] = file.read_bytes()
+            name = sources.put(file, "policies", files)
         elif isinstance(plays, str) and plays.endswith(".onnx"):
             remark(f"the policy of {player} is not found: {plays}")
         if looking.is_file(config, plays) and look.joined_as_sorted:
-            players[player] = (f"sample:policies/{Path(plays).name}", "")
+            players[player] = (f"sample:policies/{name}", "")
         else:
             players[player] = (f"agent:Policy{number}", f"Policy{number}")
     return players

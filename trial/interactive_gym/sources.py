@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 import site
 import sys
 import sysconfig
@@ -26,6 +27,7 @@ HASHES = ".made-by-interactive-gym.json"
 _HIPPODROME = Path(__file__).resolve().parents[2]
 _SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's assets are in its server's folder
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
+_PACKAGE = re.compile(r"(?P<name>[A-Za-z0-9._-]+) *(?:$|[\[<>=!~;@#])")  # what may follow a name: PEP 508
 _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _TAKEN = {"agent", "trial", "protocol"}  # modules on a server that no module of an experiment may hide
 _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
@@ -136,6 +138,19 @@ def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list
     return files, sentences
 
 
+def put(file: Path, folder: str, files: dict[str, bytes]) -> str:
+    """Add a file to this folder of the project's `files`, and return its name there.
+
+    The name gets a number if the folder has another file of this name.
+    """
+    data, name, number = file.read_bytes(), file.name, 1
+    while files.get(f"{folder}/{name}", data) != data:
+        number += 1
+        name = f"{file.stem}-{number}{file.suffix}"
+    files[f"{folder}/{name}"] = data
+    return name
+
+
 def requirements(files: Iterable[Path], given: Iterable[str], modules: Collection[str] = ()) -> list[str]:
     """Write the lines of requirements.txt: the packages that these files import, in the versions here, and `given`.
 
@@ -145,10 +160,16 @@ def requirements(files: Iterable[Path], given: Iterable[str], modules: Collectio
     lines = {"onnxruntime": ONNXRUNTIME} if "onnxruntime" in modules else {}
     for name in sorted({*modules, *(name for file in files if file.suffix == ".py" for name in _imports(file))}):
         for package in packages.get(name, [])[:1]:
-            lines[package.lower()] = f"{package}=={metadata.version(package)}"
+            lines[_package(package)] = f"{package}=={metadata.version(package)}"
     for line in given:
-        lines[line.partition("=")[0].partition("<")[0].partition(">")[0].strip().lower()] = line
+        lines[_package(line)] = line
     return [lines[name] for name in sorted(lines)]
+
+
+def _package(line: str) -> str:
+    """Return the name of the package in a line of requirements.txt, normalized (PEP 503); an address as it is."""
+    named = _PACKAGE.match(line.strip())
+    return re.sub("[-_.]+", "-", named["name"]).lower() if named else line
 
 
 def _imports(file: Path) -> Iterator[str]:

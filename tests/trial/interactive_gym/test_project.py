@@ -104,6 +104,23 @@ def test_texts_become_pages(tmp_path: Path) -> None:
     assert "5000" in final
 
 
+def test_pictures_with_the_same_name_are_two_files_of_the_pages(tmp_path: Path) -> None:
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "arrow.png").write_bytes(folder.encode())
+    shown = "<img src='left/arrow.png'><img src='right/arrow.png'><img src='left/arrow.png'>".replace("'", '"')
+    project, _ = project_of(tmp_path, ALONE.replace('"Hello {{ you }} & <friends>"', repr(shown)))
+    pictures = re.findall('src="([^"]+)"', (project / "steps/welcome.html").read_text())
+    assert [(project / "steps" / name).read_text() for name in pictures] == ["left", "right", "left"]
+
+
+def test_a_package_that_the_experiment_names_is_not_required_twice(tmp_path: Path) -> None:
+    named = 'config.pyodide(packages_to_install=["Gymnasium[classic_control]~=1.2", "typing.extensions !=4.0"])\n'
+    project, _ = project_of(tmp_path, f"import typing_extensions\n{ALONE}{named}")
+    lines = (project / "requirements.txt").read_text().splitlines()
+    assert lines == ["Gymnasium[classic_control]~=1.2", "typing.extensions !=4.0"]
+
+
 def test_options_without_effect_get_a_remark(tmp_path: Path) -> None:
     _, said = project_of(tmp_path)
     assert "Remark: host has no effect: on one machine only its own browsers reach a study" in said
@@ -386,6 +403,22 @@ def test_a_file_that_fits_is_a_policy(tmp_path: Path) -> None:
     project, said = project_of(tmp_path, WITH_A_FILE)
     assert config_of(project)["trial"]["players"]["1"] == "sample:policies/partner.onnx"
     assert "Remark" not in said
+
+
+def test_policies_whose_files_have_the_same_name_are_two_files(tmp_path: Path) -> None:
+    for folder, weights in (("left", [[1, 0, 0], [0, 1, 0]]), ("right", [[0, 0, 1], [0, 1, 0]])):
+        onnx_files.linear(tmp_path / folder / "partner.onnx", weights)
+    source = WITH_A_FILE.replace('1: "brains/partner.onnx"', '1: "left/partner.onnx", 2: "right/partner.onnx"')
+    source = source.replace("(0, 1)", "(0, 1, 2)").replace("1: spaces.", "2: spaces.Discrete(3), 1: spaces.", 1)
+    source = source.replace("1: spaces.Box", "2: spaces.Box(0, 99, (2,)), 1: spaces.Box", 1)
+    source = (
+        source.replace("1: {}", "1: {}, 2: {}").replace("{0, 1}", "{0, 1, 2}").replace("1: False", "1: False, 2: False")
+    )
+    project, _ = project_of(tmp_path, source)
+    files = [config_of(project)["trial"]["players"][player].removeprefix("sample:") for player in ("1", "2")]
+    assert files == ["policies/partner.onnx", "policies/partner-2.onnx"]
+    for folder, file in zip(("left", "right"), files, strict=True):
+        assert (project / file).read_bytes() == (tmp_path / folder / "partner.onnx").read_bytes()
 
 
 def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path) -> None:
