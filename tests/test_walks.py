@@ -48,11 +48,11 @@ def test_a_walk_leads_to_what_exists(what: str, file: Path | None, names: list[s
     assert missing == []
 
 
-def in_rooms() -> Iterator[tuple[Path, str]]:
-    """Each folder and file that the lists of rooms name, with the folder of its item."""
-    rooms = (ROOT / "docs/architecture.md").read_text().partition("\n## Rooms\n")[2].partition("\n## ")[0]
+def in_folders() -> Iterator[tuple[Path, str]]:
+    """Each folder and file that the lists of folders name, with the folder of its item."""
+    listed = (ROOT / "docs/architecture.md").read_text().partition("\n## Folders\n")[2].partition("\n## ")[0]
     folder = ROOT
-    for item in rooms.splitlines():
+    for item in listed.splitlines():
         if found := re.match(r"\* `([\w/]+/)`", item):
             folder = ROOT / found[1]
             yield folder, "."
@@ -61,13 +61,13 @@ def in_rooms() -> Iterator[tuple[Path, str]]:
                 yield folder, named
 
 
-@pytest.mark.parametrize(("folder", "named"), list(in_rooms()))
+@pytest.mark.parametrize(("folder", "named"), list(in_folders()))
 def test_every_file_in_the_lists_of_folders_exists(folder: Path, named: str) -> None:
     assert (folder / named).exists() or (ROOT / named).exists()
 
 
 def test_each_folder_of_the_large_packages_has_its_row() -> None:
-    rows = {folder for folder, named in in_rooms() if named == "."}
+    rows = {folder for folder, named in in_folders() if named == "."}
     folders = {
         file.parent for package in ("hippodrome", "trial", "deploy") for file in ROOT.glob(f"{package}/*/__init__.py")
     }
