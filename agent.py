@@ -50,8 +50,9 @@ class Agent:
     def render(self):
         """The picture: height x width x 3 bytes.
 
-        The console draws each ghost in one frame of four, which a television blurs. Every second frame alone would
-        never show some of them. So each pixel is the brightest of the last four frames.
+        The console draws each ghost in only one frame of four; on a television the frames blur. A step has two frames,
+        so the last frames of the steps would never show some ghosts. So each pixel is the brightest of the last four
+        frames.
         """
         picture = self.screens[-1].copy()
         pixels = picture.reshape(-1, 3)

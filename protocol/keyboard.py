@@ -1,4 +1,4 @@
-"""Reads the names of keys in config.yml: those of `KeyboardEvent.key`, with `+` between keys that are held together.
+"""Reads the names of keys in config.yml, as in `KeyboardEvent.key`, with `+` between keys that are held together.
 
 Source of the names: https://www.w3.org/TR/uievents-key/. A letter is the same key with Shift and without.
 """

@@ -1,6 +1,6 @@
 """Checks a `trial` section: first each value by itself, then the values against each other (`trial_rules.py`).
 
-`hippodrome/config` checks the section of a registration with `check`, and `trial/settings.py` that of a server.
+`hippodrome/config` calls `check` with the section of a registration, and `trial/settings.py` with a server's section.
 """
 
 from __future__ import annotations

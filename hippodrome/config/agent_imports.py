@@ -26,7 +26,7 @@ from protocol import players
 from protocol.values import Keys, printable
 
 _ROOT = Path(__file__).resolve().parents[2]
-_IN_IMAGE = ("trial", "protocol", "pip")  # Hippodrome's packages in the image, and that of Python's base image
+_IN_IMAGE = ("trial", "protocol", "pip")  # two packages of Hippodrome, and the package of Python's base image
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 
 
@@ -208,9 +208,10 @@ def _requirement(line: str) -> Requirement | None:
 
 
 def _closure(requirements: Sequence[Requirement | None]) -> _Image:
-    """These packages and their dependencies, with those of extras. None stands for a line that cannot be read.
+    """These packages, their dependencies, and the dependencies of their extras.
 
-    If a dependency is not installed here, its own dependencies are left out.
+    In `requirements` None stands for a line that cannot be read. If a dependency is not installed here, its own
+    dependencies are left out.
     """
     readable = [requirement for requirement in requirements if requirement is not None]
     image = _Image(set(), set(), unread=len(readable) < len(requirements))
@@ -319,7 +320,7 @@ def _modules(node: ast.Import | ast.ImportFrom, package: tuple[str, ...]) -> lis
 
 
 def _beside(folder: Path, module: str) -> list[Path]:
-    """The project's own files that run when the module is imported: those of its packages, and its own."""
+    """The project's own files that Python runs when it imports the module: its packages' files, and its own."""
     found, parts = [], module.split(".")
     if not all(part.isidentifier() for part in parts):
         return []

@@ -50,7 +50,7 @@ def differing_folder(event: Mapping[str, Any]) -> list[str]:
 
 
 def differing_places(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
-    """Yield a sentence for each bucket, region and domain in the payload that differs from the one in `here`.
+    """Yield a sentence for each bucket, region and domain in the payload that differs from the value in `here`.
 
     The script has uploaded the pages to its bucket, and makes the repository and the task definition in its region. A
     value "" in `here` is not compared.

@@ -54,7 +54,7 @@ def shown_as_they_are(config: Config) -> Iterator[Remark]:
 def left_in_english(config: Config) -> Iterator[Remark]:
     """Yield a remark if a study in another language leaves texts of Hippodrome in English.
 
-    The study's language is that of its `texts` or of its pages. If neither names one, their words tell whether the
+    The study's `texts` or its pages may name its language. If neither names one, their words tell whether the
     study is in English.
     """
     own = config.project.own_texts

@@ -13,9 +13,9 @@ class Membership(Record, frozen=True, omit_defaults=False):
     """The document of a membership. `session` is the session's id; None for an unmatched participant.
 
     `seat` counts the human players of the environment from 0. `members` is how many participants the session has;
-    `players`, how many it is for, empty places included (0 in documents of earlier versions). `completion_code` is the
-    one that an unmatched participant is shown instead of the one in `participant.json`. `waited`: the seconds that the
-    participant spent in the lobby.
+    `players`, how many it is for, empty places included (0 in documents of earlier versions). An unmatched participant
+    sees `completion_code` instead of the code in `participant.json`. `waited`: the seconds that the participant spent
+    in the lobby.
     """
 
     session: str | None = None

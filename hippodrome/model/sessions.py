@@ -36,7 +36,7 @@ def lifetime(project: Project, settings: Settings) -> timedelta:
 def lifetime_asked_for(project: Project, settings: Settings) -> timedelta:
     """Return how long the study needs its servers to live: the project's maxRuntime.
 
-    In a study with sessions, the time in which a server waits for its members comes in addition.
+    In a study with sessions, the time for which a server may wait for its members is added.
     """
     waits = open_for(project, settings) if project.has_sessions else timedelta()
     return timedelta(minutes=project.max_runtime) + waits

@@ -42,5 +42,5 @@ def default_start(games: Sequence[int]) -> int:
 
 
 def default_stop(games: Sequence[int]) -> int:
-    """Return the index of the step at which a server stops by default: the one after the last game."""
+    """Return the index of the step at which a server stops by default: the step after the last game step."""
     return games[-1] + 1

@@ -22,7 +22,7 @@ PAGE = StepType("page", has_files=True, on_server=False)
 GAME = StepType("game", has_files=False, on_server=True)
 
 RESERVED = {"game": GAME}
-"""The types with a reserved page name, by that name in config.yml. Every other page name is that of a step file."""
+"""The types with a reserved page name, by that name in config.yml. Every other page name names a step file."""
 NAMES = " or ".join(RESERVED)
 """The reserved page names, as messages to people list them."""
 
