@@ -7,19 +7,19 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hippodrome.config.hippo import adapt
-from hippodrome.config.project_keys import STEPS
+from hippodrome.config.project_keys import NAMES, STEPS, ProjectKeys
 from hippodrome.config.step_order import is_step_key
 from hippodrome.model import ids
 from hippodrome.model.step_order import ordered
-from protocol.values import is_blank, number_in, path_text, show
+from protocol.values import is_blank, number_in, path_text, printable, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
-_KEPT = (  # HIPPO's script does not know these keys, so a registration by it keeps their earlier values
-    "signedLinks", "maxParticipants", "maxServers", "maxServerHours", "warmServers", "allowedHosts", "cluster",
-    "subdomain", "plainClients", "frontEnd", "taskDefinition", "serverPort",
-    "players", "matching", "seats", "patience", "afterPatience",
-)  # fmt: skip
-_SHOWN = frozenset(_KEPT) - {"taskDefinition", "serverPort"}  # keys that a config.yml may have
+_OF_HIPPO = frozenset(
+    {"id", "name", "researcher", "teamMembers", "live", "maxRuntime", "useAWS", "awsSetup", "events", "ssl", "steps"}
+)
+_ONLY_HERE = sorted(NAMES["project",] - _OF_HIPPO)
+"""The keys of `project` that HIPPO's script does not know, so a registration by it keeps their earlier values."""
+_LONGEST_SHOWN = 300  # characters of such a value in a remark
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"
 _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, start() of the agent is given "none"'
 
@@ -84,8 +84,13 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
     remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
-    added = {key: earlier[key] for key in _KEPT if key in earlier and key not in project}
-    remarks += [f"project.{key}: {json.dumps(value)} {_STAYS}" for key, value in added.items() if key in _SHOWN]
+    defaults = ProjectKeys().model_dump(mode="json", by_alias=True)
+    kept = {key: earlier[key] for key in _ONLY_HERE if key not in project and key in earlier}
+    kept = {key: value for key, value in kept.items() if value != defaults[key]}
+    remarks += [
+        f"project.{key}: {printable(json.dumps(value), _LONGEST_SHOWN)} {_STAYS}" for key, value in kept.items()
+    ]
+    task = {key: earlier[key] for key in ("taskDefinition", "serverPort") if key not in project and key in earlier}
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):
         trial["game"] = "none"
@@ -93,4 +98,4 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     if steps and all(map(is_step_key, steps)):
         with_page = [key for key in ordered(steps) if not is_blank(steps[key])]
         project["steps"] = [{"key": key, "page": steps[key]} for key in with_page]
-    return {**added, **project, "trial": trial}, remarks
+    return {**kept, **task, **project, "trial": trial}, remarks

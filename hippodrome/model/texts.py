@@ -275,11 +275,11 @@ _TOGETHER = {
         "The other participant is not there any more, so the game has ended. This is not your fault. Please go on."
     ),
     "someLeft": "A participant is not there any more, so the game has ended. This is not your fault. Please go on.",
-    "tooSlow": ("Your connection to the game is too slow to play with others. This is not your fault. Please go on."),
+    "tooSlow": "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
 }
 SAID_ALONE = {
     "saidRoundFailed": "Something went wrong in the game, so this round has ended. The next round begins.",
-    "saidRoundAgain": ("This round could not go on where it was, so it begins again. The rounds before it are kept."),
+    "saidRoundAgain": "This round could not go on where it was, so it begins again. The rounds before it are kept.",
     "saidGameFailed": (
         "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
     ),
@@ -326,7 +326,7 @@ _LINKS = {
     "brokenLinkText": "Please copy the whole link again from your invitation.",
     "brokenId": "Its {field} should be 1 to 64 letters, digits, dashes or underscores.",
     "byInvitation": "This study is by invitation",
-    "byInvitationText": ("It needs the link of your own invitation. Please copy the whole link again from there."),
+    "byInvitationText": "It needs the link of your own invitation. Please copy the whole link again from there.",
     "pageMissing": "This page is missing",
     "pageMissingText": "It was not uploaded. Please tell whoever invited you.",
     "pageBroken": "This page is broken",

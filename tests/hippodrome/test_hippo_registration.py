@@ -101,6 +101,21 @@ def test_the_script_neither_opens_a_study_by_invitation_nor_lifts_its_limits(
         assert (project.id, project.task_definition, project.trial["game"]) == (project_id, "t:1", "CartPole-v1")
 
 
+def test_the_studys_own_texts_stay(platform: FakePlatform) -> None:
+    texts = {"language": "de", "start": "Los", "moved": "Das Spiel zieht um. " * 20}
+    steps = [{"key": "1", "page": "consent"}, {"key": "2", "page": "game"}, {"key": "3", "page": "thank"}]
+    ours = {"id": "flight", "live": True, "steps": steps, "trial": {"game": "CartPole-v1"}, "texts": texts}
+    assert "registered" in update_project_master_list.handler({"project": ours}, None)
+    answer = update_project_master_list.handler(PAYLOAD, None)
+    assert answer["statusCode"] == 200, answer
+    (project,) = read_list(platform.documents.kept[MASTER_LIST][0]).projects
+    assert project.texts == {name: text.strip() for name, text in texts.items()}
+    (remark,) = [line for line in answer["body"].splitlines() if line.startswith("project.texts: ")]
+    assert remark.startswith('project.texts: {"language": "de", ')
+    assert len(remark) < 400
+    assert "project.patience" not in answer["body"]  # it was never set
+
+
 def test_keys_that_the_script_sends_itself_are_registered(platform: FakePlatform) -> None:
     assert registered(platform, signedLinks=True, maxServers=3).signed_links
     changed = registered(platform, signedLinks=False)
