@@ -21,7 +21,7 @@ Record = tuple[str, str]  # tag and value
 class Caa:
     """The CAA records that apply to a name.
 
-    They stand at `where`: the name or the nearest domain above; "": none do.
+    `where` is the domain that has them: the name itself or the nearest domain above it; "" if no record applies.
     """
 
     where: str = ""
@@ -29,7 +29,7 @@ class Caa:
     certain: bool = True  # False: DNS could not be asked
 
     def forbidding(self, authorities: Sequence[str], *, wildcard: bool, acme: bool = False) -> list[Record]:
-        """Return the records that keep all these authorities from issuing; empty if one of them may issue.
+        """Return the records by which none of these authorities may issue; empty if one of them may issue.
 
         For a wildcard, `issuewild` counts instead of `issue` if there is any (section 4.3). With `acme`, an authority
         may issue only if it may validate by DNS-01 (RFC 8657).

@@ -1,8 +1,8 @@
 """How many invocations the functions behind queues may have at once, so that participants' pages always find room.
 
-All functions of an account share its concurrent executions in a Region: 1,000, and 10 in many a new account (Lambda
-Developer Guide, "Lambda quotas"; AWS raises them on request, quota L-B99A9384). A page that finds none free is answered
-by API Gateway with an error. Concurrency cannot be reserved for pages in a small account: Lambda refuses
+All functions of an account share its concurrent executions in a Region: 1,000, and in many new accounts 10 (Lambda
+Developer Guide, "Lambda quotas"; AWS raises them on request, quota L-B99A9384). If none is free, API Gateway answers a
+participant's request with an error. Concurrency cannot be reserved for pages in a small account: Lambda refuses
 PutFunctionConcurrency unless 100 executions stay unreserved, in a smaller account all of them (API Reference,
 PutFunctionConcurrency; "below its minimum value of [10]", awslabs/fhir-works-on-aws-deployment issue 691). So the
 queues are kept small instead, by `MaximumConcurrency` of their event source mappings, which takes 2 to 1,000 (API

@@ -106,7 +106,7 @@ def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
 
 
 def exists(account: Account, zone: Zone, name: str) -> bool:
-    """Whether a name in the zone exists: it has records, a name below it has some, or a wildcard stands for it.
+    """Whether a name in the zone exists: it or a name below it has records, or a wildcard record matches it.
 
     This asks Route 53, not DNS: a resolver that is asked for a name before the name is made answers for 15 minutes
     that there is none (RFC 2308, section 5; Route 53 Developer Guide, "The start of authority (SOA) record": the TTL

@@ -56,5 +56,5 @@ def request(account: Account, quota: Quota, wanted: float) -> str:
 
 
 def ask_for(account: Account, quota: Quota, wanted: float) -> str:
-    """`request`, as the advice for a quota that is too small."""
+    """Return the advice for a quota that is too small: to ask AWS for more, by the command that `request` returns."""
     return f"Ask for more: {request(account, quota, wanted)}"

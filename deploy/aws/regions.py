@@ -28,7 +28,7 @@ SUPPORTED: Mapping[str, str] = {
     "us-west-1": "N. California",
     "us-west-2": "Oregon",
 }
-"""By region, its place. Each region has every resource type of the template and every service of the commands."""
+"""By region, its name. Each region has every resource type of the template and every service of the commands."""
 
 FARGATE_ZONES: Mapping[str, frozenset[str]] = {
     "ap-northeast-1": frozenset({"apne1-az1", "apne1-az2", "apne1-az4"}),

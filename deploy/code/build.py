@@ -1,4 +1,4 @@
-"""The functions' zips: the same input gives the same bytes, and each carries only what it imports.
+"""The functions' zips: the same input gives the same bytes, and each zip holds only what its function imports.
 
 Imports are followed from the function's module in `lambdas/` through this project's modules to the distributions that
 it needs, which `deploy.code.packages` provides. All imports count, also those inside functions; only those for type

@@ -46,7 +46,7 @@ def stack_name(given: str) -> str:
 
 
 def same_place(region: str, profile: str | None) -> str:
-    """Return the options with which another command uses the same account and region, to be added to its line."""
+    """Return the options, as a text, with which another command uses the same account and region."""
     return f"--region {region}" + (f" --profile {shlex.quote(profile)}" if profile else "")
 
 

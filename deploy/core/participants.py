@@ -26,8 +26,8 @@ class ParticipantCounts:
     """The numbers of a project's participants, in all and by step. It holds no ids."""
 
     participants: int = 0
-    by_step: dict[str, int] = field(default_factory=dict)  # step → how many are there; in the order of the study
-    finished: int = 0  # how many of them are at the last step
+    by_step: dict[str, int] = field(default_factory=dict)  # step → participants at it, in the order of the steps
+    finished: int = 0  # participants at the last step
     arrived_today: int = 0
     last_arrival: datetime | None = None
 
@@ -76,9 +76,10 @@ def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
 def count_participants(
     documents: Documents, project: Project, today: datetime, advance: Callable[[int], None] | None = None
 ) -> ParticipantCounts:
-    """Count a project's participants, by a listing of its folder, 1,000 keys a request. `today`: when the day began.
+    """Count a project's participants, by a listing of its folder, 1,000 keys a request.
 
-    Folders without a participant's record, and ids that are not well formed, are not counted.
+    `today` is the beginning of the day. `advance` gets the number of participants counted up to now. Folders without a
+    participant's record, and ids that are not well formed, are not counted.
     """
     found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in folders(documents, project.id):

@@ -156,7 +156,7 @@ def _contradictions(config: Config, installation: Installation) -> Iterator[tupl
 
 
 def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
-    """Yield the project's values without effect here: the bucket's name, and a time longer than servers may run."""
+    """Yield the values that have no effect here: another bucket's name, and a maxRuntime that is too long."""
     most = int(installation["MaxRuntime"])
     if config.project.max_runtime > most:
         yield (

@@ -1,4 +1,4 @@
-"""Reads servers' records (`_servers/{label}.json`): a listing tells which have changed, and only those are read."""
+"""Reads servers' records (`_servers/{label}.json`). A listing tells which records have changed; only these are read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLACK = timedelta(hours=1)  # how long a record may stay open after its server's
 
 
 class Records:
-    """Reads the records of servers, and keeps them, so that the next call of `since` reads only those that changed."""
+    """Reads the records of servers, and keeps them: the next call of `since` reads only records that have changed."""
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
@@ -36,7 +36,10 @@ class Records:
         return [key.removeprefix(RECORDS).removesuffix(".json") for key in keys]
 
     def since(self, moment: datetime | None = None, advance: Callable[[int, int], None] | None = None) -> list[Server]:
-        """Read the records written at `moment` (aware) or later, or all. `advance` gets the numbers read and in all."""
+        """Return the records that were written at `moment` (an aware time) or later; without `moment`, all records.
+
+        `advance` gets two numbers: how many records have been read, and how many have to be read.
+        """
         wanted = [
             entry
             for entry in self._documents.list(RECORDS)

@@ -53,9 +53,10 @@ class ApplyOutcome:
 
 @dataclass(frozen=True)
 class ApplyRequest:
-    """The input of an apply: the `study` that follows, findings that are `wrong` already, the administrator's answers.
+    """What `apply` has to know beside the settings: the study, earlier findings, and the administrator's answers.
 
-    `yes` agrees to the loss of something. With `anyway`, bad findings do not stop the apply.
+    `study` will be registered after the apply; `wrong` are bad findings about it. `yes` agrees to every loss. With
+    `anyway`, bad findings do not stop the apply.
     """
 
     study: ProjectFolder | None = None

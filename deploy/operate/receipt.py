@@ -29,7 +29,7 @@ NOT_COVERED = (
 
 @dataclass
 class ProjectReceipt:
-    """One project's part of a receipt: the numbers of what was deleted and removed, and of what the last look found."""
+    """One project's part of a receipt: how many documents and resources were removed, and what the last look found."""
 
     project: str
     user: str

@@ -48,12 +48,13 @@ _LONGEST_BUNDLE = 1_000_000  # bytes
 class Choice:
     """The order that the administrator wants.
 
-    Without `directory`, the present certificate's authority gets it, or Let's Encrypt's staging environment.
+    `directory` is the ACME directory that gets the order. If it is empty, the authority of the present certificate gets
+    the order; without a certificate, Let's Encrypt's staging environment.
     """
 
     directory: str = ""
     email: str = ""
-    trusted: str = ""  # PEM of the roots with which the address of a CA of one's own is checked
+    trusted: str = ""  # PEM of the root certificates by which the directory's TLS is checked; "": the public ones
     force: bool = False
     seconds: float = 300.0
 
@@ -71,7 +72,7 @@ class Report:
 
     @property
     def ordered(self) -> bool:
-        """Whether a certificate is due, so that one was or would be ordered."""
+        """Whether a certificate was ordered; in a report of `inspect`, whether one would be ordered."""
         return self.decision.verdict is Verdict.ORDER
 
     @property
@@ -214,11 +215,10 @@ def renewal_of(
 
 
 def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
-    """Check that the domain is in the zone, the zone is delegated, and no CAA record forbids the order.
+    """Raise `Problem` if the domain is not in the zone, the zone is not delegated, or a CAA record forbids the order.
 
-    Raises `Problem`.
-
-    With `own`, the directory is a CA of one's own, which may use another DNS: then only the domain's zone is checked.
+    `own` says that the directory belongs to an authority of one's own, which may use another DNS. Then only the zone is
+    checked. If DNS cannot be asked about the delegation, this only warns.
     """
     domain = installation.servers_domain
     zone = read_zone(account, installation["HostedZoneId"])

@@ -294,7 +294,7 @@ def cluster_exists(account: Account, name: str) -> bool:
     return any(cluster.get("status") != "INACTIVE" for cluster in found)
 
 
-_TAGGED = {  # services, as in ARNs, whose resources no listing above finds; the tagging API does
+_TAGGED = {  # services, by their names in ARNs, whose resources only the tagging API lists here
     "elasticfilesystem",
     "secretsmanager",
     "ssm",

@@ -14,8 +14,8 @@ from deploy.core.finding import Finding, bad, good, look
 from deploy.operate.doctor.check_context import CheckContext
 
 USUAL = 1.0  # vCPU of a server, if there is no project
-REQUESTS = 0.1  # executions of next_step for each waiting participant: a request every two seconds, 0.12 s each
-IN_LOBBY = 0.15  # the same in a lobby, where a request makes four more calls of S3, one after the other
+REQUESTS = 0.1  # executions of next_step for each waiting participant: one of 0.12 s every two seconds, rounded up
+IN_LOBBY = 0.15  # the same in a lobby, where an execution makes four more calls of S3, one after the other
 HEADROOM = 4  # standard deviations above the mean: requests come at random, and all should find room
 
 

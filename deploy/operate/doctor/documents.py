@@ -1,6 +1,7 @@
-"""Finds documents that cannot be read and pages that cannot be rendered: their project, the consequence, the advice.
+"""Finds documents that cannot be read, and pages that cannot be rendered.
 
-Such a document harms nothing else, since every reader skips it. Participants are counted, never named.
+Each finding names the project, and says what the consequence is and what to do. An unreadable document harms no other
+document, since every reader skips it. Participants are counted, never named.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
     yield bad(
         "servers",
         f"{count(records.unreadable, 'record')} cannot be read ({', '.join([*shown, *more])}): these participants get "
-        "no server, and what theirs has is not removed.",
+        "no server, and the resources of their servers are not removed.",
         f"{OLDER}; or delete it, then run `python -m deploy stop`, which ends servers without a record.",
     )
 

@@ -87,7 +87,7 @@ class Builder:
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             file = Path(folder, "bundle.zip")
             order.bundle.write_zip(file)
-            screen.info(f"Uploading what the image is made of ({formatting.size(file.stat().st_size)}) …")
+            screen.info(f"Uploading the files for the image ({formatting.size(file.stat().st_size)}) …")
             with file.open("rb") as body:  # not upload_file, which raises errors of its own
                 s3.upload_fileobj(body, self.bucket, key, ExtraArgs={"ContentType": "application/zip"})
 

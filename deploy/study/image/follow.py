@@ -64,9 +64,9 @@ class BuildLog:
                 self._show(line)
 
     def failure(self, summary: str, more: Iterable[str] = ()) -> Problem:
-        """Make the problem to raise for a failed build, with advice.
+        """Return the problem to raise for a failed build, with advice.
 
-        Details: the log's lines on errors (else its last lines), and `more`.
+        Its details are the log's lines on errors (if there are none, its last lines), and `more`.
         """
         more, lines = list(more), list(self._last)
         missing = _missing("\n".join(lines))
@@ -77,7 +77,7 @@ class BuildLog:
 
 
 def advice(log: str) -> str:
-    """Advise on a failed build by its log."""
+    """Return advice on a failed build, by the first known message in its log."""
     for pattern, text in _ADVICE:
         found = re.search(pattern, log)
         if found:

@@ -37,9 +37,7 @@ REASON = "Rehearsal: set by hand to see whether this alarm is delivered. Nothing
 
 
 class Timer:
-    """Tests a server's timer by a server without a participant.
-
-    `begin` starts the server, `end` checks that it has ended.
+    """Tests a server's timer: `begin` starts a server without a participant, `end` checks that its timer has ended it.
 
     The rehearsal does not wait for the project's `maxRuntime`. It checks that the ready server has a timer at its
     deadline, and moves the timer to the next minute, with the same name, role, topic and message.
