@@ -73,7 +73,8 @@ class VersionedBucket:
         try:
             return bytes(self._get(version)["Body"].read())
         except ClientError as error:
-            if errors.code(error) in {"NoSuchKey", "NoSuchVersion", "404", "405"}:
+            # S3 answers 405 for a delete marker, with the code MethodNotAllowed (API Reference, GetObject).
+            if errors.status(error) == 405 or errors.code(error) in {"NoSuchKey", "NoSuchVersion", "404"}:
                 return b""
             raise
 

@@ -98,3 +98,13 @@ def test_refused_deletions_are_reported_and_not_counted_as_deleted(
         VersionedBucket(account, NAME).delete(versions, note)
     assert [one.key for one in noted] == ["a"]
     assert [one.key for one in left(account)] == ["b", "c"]
+
+
+def test_a_delete_marker_and_a_version_that_is_gone_have_no_content(account: Account) -> None:
+    put(account, "a")
+    account.client("s3").delete_object(Bucket=NAME, Key="a")
+    bucket = VersionedBucket(account, NAME)
+    assert {one.marker: bucket.read(one) for one in bucket.versions()} == {False: b"x", True: b""}
+    gone = [*bucket.versions()]
+    bucket.empty()
+    assert [bucket.read(one) for one in gone] == [b"", b""]
