@@ -53,7 +53,12 @@ def command(
     spot: Annotated[bool, typer.Option("--spot/--no-spot", help="Whether servers run on Fargate Spot.")] = True,
     project: Annotated[
         str | None,
-        typer.Option("--project", help="What this project has cost, from its servers' records.", show_default=False),
+        typer.Option(
+            "--project",
+            callback=options.project_id,
+            help="What this project, named by its id or its folder, has cost, from its servers' records.",
+            show_default=False,
+        ),
     ] = None,
     ask_aws: Annotated[
         bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")

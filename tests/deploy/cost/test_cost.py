@@ -417,6 +417,14 @@ def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: An
     assert "No project named labyrinth" in installed.run(capsys, "cost", "--project", "labyrinth").err
 
 
+def test_cost_takes_the_folder_of_a_project(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
+    installed.register(study())
+    installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
+    (tmp_path / "config.yml").write_text("project:\n  id: maze\n")
+    ran = installed.run(capsys, "cost", "--project", f"{tmp_path}/", "--json")
+    assert (ran.code, list(ran.json["projects"])) == (Exit.DONE, ["maze"])
+
+
 def answer_bill(world: Installed, *answers: dict[str, float]) -> None:
     """Let Cost Explorer answer the next requests with these costs by service."""
     for services in answers:
