@@ -23,7 +23,7 @@ from deploy.stack import cooldown, domain_change, states
 from deploy.stack.changes import PREFIX, Prepared, change_set, prepare
 from deploy.stack.deletion import StackDeletion
 from deploy.stack.settings import StackSettings, taking_settings
-from deploy.stack.stack import GOOD, Stack, role_is_new
+from deploy.stack.stack import Stack, role_is_new
 from hippodrome.aws import errors
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def _execute(prepared: Prepared, arn: str, stack_id: str, total: int) -> None:
     )
     title = "Updating the stack" if prepared.existing else "Making the stack (five minutes or so)"
     status = stack.follow(title, stack_id, total, after)
-    if status in GOOD - {"DELETE_COMPLETE"}:
+    if status in states.COMPLETE:
         return
     summary = f"The stack {stack.name} could not be {'updated' if prepared.existing else 'made'}"
     raise stack.problem(summary, stack_id, status)

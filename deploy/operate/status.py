@@ -22,6 +22,7 @@ from deploy.aws.account import STACK, Account, Installation, find_installation, 
 from deploy.core import options, participants
 from deploy.cost.billed import Billed, billed_or_why
 from deploy.operate.snapshot import InstallationMonitor, Snapshot
+from deploy.stack import states
 from hippodrome.model.project import Project
 from hippodrome.model.server import Server
 
@@ -196,7 +197,7 @@ def picture(look: Snapshot, installation: Installation) -> RenderableType:
     parts: list[RenderableType] = [
         Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
     ]
-    if installation.status not in ("CREATE_COMPLETE", "UPDATE_COMPLETE"):
+    if installation.status not in states.COMPLETE:
         parts.append(Text(f"! The stack is in {installation.status}.", style="yellow"))
     parts += [Text(""), *_projects(look), Text(""), *_servers(look), *_failures(look), Text(""), *_parts(look)]
     parts += [Text(f"! No {part}: {why}", style="yellow") for part, why in look.problems.items()]

@@ -23,7 +23,6 @@ FIRST_PAUSE = 0.3  # seconds between the first two looks
 PAUSE = 3.0  # seconds between two looks, later
 LONG_FOR_A_CERTIFICATE = 300.0  # seconds; ACM validates a delegated domain in a few minutes
 
-GOOD = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "DELETE_COMPLETE", "IMPORT_COMPLETE"}
 _BEGINS = {"CREATE_IN_PROGRESS", "UPDATE_IN_PROGRESS", "DELETE_IN_PROGRESS"}
 _STACK_TYPE = "AWS::CloudFormation::Stack"
 _BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS state", re.IGNORECASE)
@@ -156,7 +155,7 @@ class Stack:
                     "The certificate is waiting for DNS: it comes only if the domain is delegated to the zone."
                 )
             if started and not status.endswith("_IN_PROGRESS"):
-                if status in GOOD:
+                if status in {*states.COMPLETE, "DELETE_COMPLETE"}:
                     bar.update(task, total=operation.done, now="")
                 return status
             self._sleep(pause)

@@ -51,6 +51,9 @@ ACTIONS: Mapping[str, StackAction] = {
     "IMPORT_ROLLBACK_COMPLETE": StackAction.UPDATE,
 }
 
+COMPLETE = {"CREATE_COMPLETE", "UPDATE_COMPLETE", "IMPORT_COMPLETE"}
+"""The states of a stack whose last operation has succeeded."""
+
 _BECAUSE = {
     "DELETE_FAILED": "is half deleted",
     "IMPORT_ROLLBACK_FAILED": "has taken in resources by hand, which failed and could not be taken back",

@@ -21,6 +21,7 @@ from deploy.operate.doctor.check_context import Check, CheckContext
 from deploy.operate.doctor.play import MAX_BOTS, WITHIN
 from deploy.operate.doctor.rehearsal import CHECK as REHEARSAL
 from deploy.operate.doctor.rehearsal import Rehearsal, project_for
+from deploy.stack import states
 from deploy.stack.stack import Stack
 from hippodrome.model.project import Project
 
@@ -146,7 +147,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
     except Problem as problem:
         return None, [bad("stack", str(problem), problem.advice)]
     found = []
-    if installation.status in ("CREATE_COMPLETE", "UPDATE_COMPLETE", "IMPORT_COMPLETE"):
+    if installation.status in states.COMPLETE:
         found.append(good("stack", f"{stack} is in {installation.status}."))
     elif installation.status == "UPDATE_ROLLBACK_COMPLETE":
         found.append(

@@ -8,12 +8,14 @@ from typing import Any
 import msgspec
 import pytest
 from botocore.exceptions import ClientError
+from rich.console import Console
 
 from console.problem import Exit
-from deploy.aws.account import Account
+from deploy.aws.account import Account, Installation
 from deploy.core import server_records
 from deploy.core.server_records import Records
 from deploy.operate import status
+from deploy.operate.snapshot import Snapshot
 from hippodrome.model import server
 from hippodrome.model.server import Reason, ServerState
 from hippodrome.servers.causes import Cause
@@ -133,6 +135,17 @@ def test_status_says_why_servers_failed_and_what_to_do(world: Installed, capsys:
     assert Cause.IMAGE.sentence in text
     assert "by no fault of yours, and replaced where AWS could: 1 spot (maze)." in text
     assert not any(user in text for user in ("carol", "dave"))
+
+
+@pytest.mark.parametrize(
+    ("state", "warned"), [("UPDATE_COMPLETE", False), ("IMPORT_COMPLETE", False), ("UPDATE_ROLLBACK_COMPLETE", True)]
+)
+def test_status_warns_only_of_a_stack_whose_last_operation_failed_or_goes_on(state: str, warned: bool) -> None:
+    installation = Installation("hippodrome", "us-east-1", state, {"Site": "https://study.example.org"})
+    lines = Console(width=200)
+    with lines.capture() as shown:
+        lines.print(status.picture(Snapshot(at=datetime.now(UTC)), installation))
+    assert (f"! The stack is in {state}." in shown.get()) == warned
 
 
 def test_without_failures_status_says_nothing_of_them(world: Installed, capsys: Any) -> None:
