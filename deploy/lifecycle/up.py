@@ -13,7 +13,7 @@ from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, describe_stack, find_installation, open_account
 from deploy.core import explain, options, project_folder
 from deploy.core.explain import DENIED
-from deploy.core.finding import show
+from deploy.core.finding import Finding, show
 from deploy.lifecycle import apply as applying
 from deploy.lifecycle import plan as plans
 from deploy.lifecycle import preflight
@@ -100,10 +100,11 @@ def command(
     The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
     installation, get their study registered with the one that is there.
     """
-    found, wrong = _study(folder)
-    account = _account(profile, region, wrong)
-    if wrong and (dry_run or describe_stack(account, stack)):
-        raise wrong[0]  # with an installation, the account needs no further check
+    found, problem = _study(folder)
+    known = [preflight.of_problem("study", problem)] if problem else []
+    account = _account(profile, region, known)
+    if problem and (dry_run or describe_stack(account, stack)):
+        raise problem  # with an installation, the account needs no further check
     if dry_run:
         code = plans.run(account, stack, settings, False, found)
         if found:
@@ -112,7 +113,6 @@ def command(
             )
         return code
     if may_apply(account, stack):
-        known = [preflight.of_problem("study", problem) for problem in wrong]
         request = applying.ApplyRequest(found, known, yes=yes, anyway=anyway)
         outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
@@ -126,25 +126,25 @@ def command(
     return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
 
 
-def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, list[Problem]]:
+def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, Problem | None]:
     """Return the study in the folder (None if there is none for AWS), and no problem.
 
     After a mistake return None and the problem, which a first installation shows together with its other problems.
     """
     try:
-        return study_in(folder), []
+        return study_in(folder), None
     except Problem as problem:
-        return None, [problem]
+        return None, problem
 
 
-def _account(profile: str | None, region: str | None, wrong: list[Problem]) -> Account:
-    """Open the account and try its credentials. If they fail, show the problems in `wrong` first, then raise."""
+def _account(profile: str | None, region: str | None, known: list[Finding]) -> Account:
+    """Open the account and try its credentials. If they fail, show the findings in `known` first, then raise."""
     try:
         account = open_account(profile, region)
         user = account.identity["Arn"].rpartition(":")[2]
     except Exception as error:
         if problem := explain.problem_from(error):
-            show([preflight.of_problem("study", one) for one in wrong], screen.err)
+            show(known, screen.err)
             raise problem from None
         raise
     screen.info(f"In account {account.id}, region {account.region}, as {user}.")

@@ -288,5 +288,12 @@ def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str
         yield from page.get("MetricAlarms", ())
 
 
+def subscriptions(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
+    """Yield the subscriptions of the alarms' topic. A confirmed subscription has an ARN."""
+    pages = account.client("sns").get_paginator("list_subscriptions_by_topic")
+    for page in pages.paginate(TopicArn=installation["Alarms"]):
+        yield from page["Subscriptions"]
+
+
 def _fires(alarm: Mapping[str, Any]) -> bool:
     return alarm.get("StateValue") == "ALARM"

@@ -112,9 +112,7 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
     """Check whether the alarms' topic has a confirmed subscription."""
-    pages = context.account.client("sns").get_paginator("list_subscriptions_by_topic")
-    topic = context.installation["Alarms"]
-    found = [one for page in pages.paginate(TopicArn=topic) for one in page["Subscriptions"]]
+    found = [*snapshot.subscriptions(context.account, context.installation)]
     pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
     confirmed = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
     if pending:

@@ -54,11 +54,6 @@ class Copy:
         assert self._made is not None, "not made yet"
         return self._made
 
-    @property
-    def players(self) -> int:
-        """The number of participants who play together; 1 before the copy is made."""
-        return self._made.players if self._made else 1
-
     def make(self, of: Project) -> int:
         """Copy the pages of the project `of`, register the copy, and return the number of pages. Raises `Problem`."""
         documents = self._platform.documents

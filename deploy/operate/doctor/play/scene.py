@@ -57,7 +57,7 @@ class RehearsalContext:
 
     def server(self, user: str) -> Server | None:
         """Read the record of a bot's server, or of its session's server. The transcript hides its token and names."""
-        membership = self.repository.membership(self.copy.id, user) if self.copy.players > 1 else None
+        membership = self.repository.membership(self.copy.id, user) if self.copy.project.players > 1 else None
         found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
         if found is not None:
             self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)

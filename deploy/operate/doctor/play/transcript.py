@@ -124,12 +124,12 @@ class Transcript:
 
 
 def _plain(line: TranscriptLine) -> dict[str, Any]:
-    data = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
-    return {
-        **data,
-        **({"advice": line.advice} if line.advice else {}),
-        **({"seconds": line.seconds} if line.seconds else {}),
-    }
+    data: dict[str, Any] = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
+    if line.advice:
+        data["advice"] = line.advice
+    if line.seconds:
+        data["seconds"] = line.seconds
+    return data
 
 
 def shown(values: Iterable[float]) -> str:

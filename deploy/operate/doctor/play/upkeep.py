@@ -46,7 +46,7 @@ class Timer:
     def __init__(self, scene: RehearsalContext) -> None:
         self._scene = scene
         bot = scene.copy.user("timer")
-        self.user = ids.new_session_id() if scene.copy.players > 1 else bot
+        self.user = ids.new_session_id() if scene.copy.project.players > 1 else bot
         scene.transcript.hide(bot, self.user)
         self._bot = bot
         self.record: Server | None = None
@@ -56,7 +56,7 @@ class Timer:
         if self.user != self._bot:
             copy = self._scene.copy
             copy.users.append(self.user)
-            session = SessionDocument(self.user, copy.players, (Member(self._bot, None, 0),))
+            session = SessionDocument(self.user, copy.project.players, (Member(self._bot, None, 0),))
             write_session(self._scene.platform.documents, copy.id, session)
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
@@ -188,12 +188,13 @@ def alarm(scene: RehearsalContext) -> None:
         now = cloudwatch.describe_alarms(AlarmNames=[name])["MetricAlarms"]
         if now and now[0].get("StateValue") == "ALARM":
             cloudwatch.set_alarm_state(AlarmName=name, StateValue=before, StateReason=REASON)
-    subscribers = _subscribers(context.account.client("sns"), topic)
+    listed = snapshot.subscriptions(context.account, context.installation)
+    subscribers = sum(one["SubscriptionArn"].startswith("arn:") for one in listed)  # confirmed subscriptions
     if subscribers:
         scene.transcript.good(
             "alarm",
             "An alarm was set off and reached its topic: a mail is on its way to "
-            + ("1 address." if subscribers == 1 else f"{subscribers} addresses."),
+            f"{subscribers} {'address' if subscribers == 1 else 'addresses'}.",
         )
     else:
         scene.transcript.say(
@@ -207,12 +208,6 @@ def alarm(scene: RehearsalContext) -> None:
 def _sent_to_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
     found = cloudwatch.describe_alarm_history(AlarmName=name, HistoryItemType="Action", StartDate=since)
     return any("success" in one.get("HistorySummary", "").lower() for one in found["AlarmHistoryItems"])
-
-
-def _subscribers(sns: Any, topic: str) -> int:
-    """Return the number of confirmed subscriptions of a topic."""
-    pages = sns.get_paginator("list_subscriptions_by_topic").paginate(TopicArn=topic)
-    return sum(one["SubscriptionArn"].startswith("arn:") for page in pages for one in page["Subscriptions"])
 
 
 def times(scene: RehearsalContext, records: Iterable[Server]) -> None:

@@ -41,7 +41,7 @@ class Walk:
 
     def __init__(self, scene: RehearsalContext, bots: int) -> None:
         self._scene = scene
-        bots += -(bots + 1) % scene.copy.players  # bots and victim together fill whole sessions
+        bots += -(bots + 1) % scene.copy.project.players  # bots and victim together fill whole sessions
         self.bots = [scene.bot(f"{number}", PLAY) for number in range(1, bots + 1)]
         self.victim = scene.bot("victim", VICTIM_PLAYS)
         self._struck: Server | None = None  # the record of the server whose task was killed
