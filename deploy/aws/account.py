@@ -171,7 +171,7 @@ class Installation:
 
     @property
     def env(self) -> dict[str, str]:
-        """The functions' environment variables, from which `Account.platform` makes the same ports as functions use."""
+        """The functions' environment variables, from which `Account.platform` makes the ports that functions use."""
         return {
             "AWS_REGION": self.region,
             "BUCKET": self["Bucket"],

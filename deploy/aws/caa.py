@@ -41,7 +41,7 @@ class Caa:
 
 
 def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
-    """Ask DNS for the records that apply to a name: its own, or those of the nearest domain above (section 3).
+    """Ask DNS for the records that apply to a name: its own, or the records of the nearest domain above (section 3).
 
     `known` says whether a name exists. DNS is not asked for a name that does not (`deploy.aws.hosted_zone.exists` says
     why). Raises only what `known` raises.

@@ -61,7 +61,7 @@ def find_zone(account: Account, domain: str) -> Zone:
         if len(public.get(name, ())) > 1:
             raise Problem(
                 f"This account has {len(public[name])} public hosted zones for {name}.",
-                "Delete those that the domain is not delegated to, or name the right one with --zone.",
+                "Delete the zones that the domain is not delegated to, or name the right zone with --zone.",
                 public[name],
             )
         if name in public:
@@ -83,7 +83,7 @@ def read_zone(account: Account, zone_id: str) -> Zone:
         found = client.get_hosted_zone(Id=zone_id)
     except (client.exceptions.NoSuchHostedZone, client.exceptions.InvalidInput):
         raise Problem(
-            f"This account has no hosted zone {zone_id}.", "`aws route53 list-hosted-zones` lists those that it has."
+            f"This account has no hosted zone {zone_id}.", "`aws route53 list-hosted-zones` lists its zones."
         ) from None
     if found["HostedZone"].get("Config", {}).get("PrivateZone"):
         raise Problem(

@@ -69,7 +69,7 @@ class Template:
 
     @property
     def defaults(self) -> dict[str, str | None]:
-        """The parameters with their defaults; None for one that has no default."""
+        """The parameters with their defaults; None if a parameter has no default."""
         return {
             name: str(spec["Default"]) if "Default" in spec else None
             for name, spec in self.body.get("Parameters", {}).items()

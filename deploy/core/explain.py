@@ -70,7 +70,7 @@ def _refusal(error: boto.ClientError) -> Problem:
     if code in _WRONG_KEYS:
         return Problem(
             "AWS does not accept these credentials.",
-            "Check the access key and its secret, and the region: one that is not enabled accepts none.",
+            "Check the access key and its secret, and the region: a region that is not enabled accepts none.",
         )
     if code in _NOT_ACTIVE:
         return Problem(*NOT_ACTIVE, [message] if message else [])

@@ -68,7 +68,7 @@ class Records:
         return [record for record in recent if not record.is_closed]
 
     def read(self, labels: Iterable[str]) -> dict[str, Server]:
-        """Read the records of these labels as they are now. Return them by label, without those that cannot be read."""
+        """Read the present records of these labels. Return them by label, without the records that cannot be read."""
         keys = sorted({server.key(label) for label in labels})
         with ThreadPoolExecutor(READERS) as pool:
             found = pool.map(self._load, keys)

@@ -1,8 +1,8 @@
 """Estimates what a study will cost: a line for each thing that AWS bills. Pure.
 
-The numbers of calls are those that `make bench` counts for the example study of five steps (docs/architecture.md, "What
-a participant costs": 30 from the link to the clean-up in a running study, 39 for a participant alone), scaled by the
-number of steps. A figure that is not measured is assumed, low, likely and high; `assumptions` says which.
+The numbers of calls come from `make bench`, which counts them for the example study of five steps: 30 from the link to
+the clean-up in a running study, 39 for a participant alone (docs/architecture.md, "What a participant costs"). They are
+scaled by the number of steps. A figure that is not measured is assumed, low, likely and high; `assumptions` says which.
 """
 
 from __future__ import annotations

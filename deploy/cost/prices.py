@@ -1,6 +1,6 @@
 """What AWS charges: list prices in US dollars, in one table with its date and the source of each price.
 
-The prices are those of us-east-1 (N. Virginia), without taxes, savings plans, credits and, unless it says so, free
+The prices hold for us-east-1 (N. Virginia), without taxes, savings plans, credits and, unless it says so, free
 tiers. Other regions cost up to about a third more; `current` asks AWS's Price List API for Fargate's prices there.
 
 AWS's pricing pages fill in their figures by scripts. Prices with `twice` (the default) were found in at least one more
@@ -62,7 +62,7 @@ class Price(NamedTuple):
 
 
 class Prices(NamedTuple):
-    """The table of prices. `region` is the region of Fargate's prices; all others are those of `REGION`."""
+    """The table of prices. `region` is the region of Fargate's prices; all other prices hold for `REGION`."""
 
     # Fargate, Linux on x86: billed by the second, a minute at least, from the image's download to the task's end.
     vcpu_hour: Price = Price(0.04048, "vCPU-hour", "aws.amazon.com/fargate/pricing; AmazonECS USE1-Fargate-vCPU-Hours")

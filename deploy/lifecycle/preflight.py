@@ -190,7 +190,7 @@ def _delegation(prepared: Prepared) -> Iterator[Finding]:
             "domain",
             f"{found.problem} No certificate can be issued for it, and its names cannot be resolved.",
             f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
-            "Minutes to hours later that is known, and the same command goes on.",
+            "DNS knows them after minutes or hours; then run the same command again.",
         )
     elif found.problem:
         yield look("domain", found.problem, f"Its name servers have to be {servers}.")

@@ -97,8 +97,8 @@ def command(
 ) -> int:
     """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
 
-    The first time it needs --domain, a domain with a hosted zone in Route 53. Researchers, who may not change the
-    installation, get their study registered with the one that is there.
+    The first time it needs --domain, a domain with a hosted zone in Route 53. For researchers, who may not change the
+    installation, it only registers the study.
     """
     found, problem = _study(folder)
     known = [preflight.of_problem("study", problem)] if problem else []

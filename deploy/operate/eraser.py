@@ -179,7 +179,7 @@ class Eraser:
         return Slots(self._platform)
 
     def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
-        """Return the tasks of the participant and their sessions: those that run, and those that are stopping."""
+        """Return two lists of tasks of the participant and their sessions: running tasks, and stopping tasks."""
         tasks = [task for task in self._platform.tasks.list() if self._scope.erases(task.name)]
         return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
 
@@ -195,7 +195,7 @@ class Eraser:
             return None
 
     def _is_in_zone(self, record: DnsRecord) -> bool:
-        """Whether the zone has this record. Listings of servers' names lack those that `subdomain: userId` makes."""
+        """Whether the zone has this record. Listings of servers lack the names that `subdomain: userId` makes."""
         answer = self._account.client("route53").list_resource_record_sets(
             HostedZoneId=self._installation["HostedZoneId"],
             StartRecordName=record.name,

@@ -282,7 +282,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
 
 
 def alarms(account: Account, installation: Installation) -> Iterable[Mapping[str, Any]]:
-    """Yield the installation's alarms, which are those that send to its topic."""
+    """Yield the installation's alarms: the alarms that send to its topic."""
     pages = account.client("cloudwatch").get_paginator("describe_alarms")
     for page in pages.paginate(ActionPrefix=installation["Alarms"]):
         yield from page.get("MetricAlarms", ())

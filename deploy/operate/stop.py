@@ -55,10 +55,10 @@ class FoundServers:
 
 
 class Stopper:
-    """Stops all servers, or those of one project, and looks until nothing of them is left.
+    """Stops all servers, or the servers of one project, and looks until nothing of them is left.
 
     It does the work of the function `stop_server` on this machine, so that it works even if queues or functions do not.
-    Several may run at the same time, and together with the functions.
+    Several commands may do this at the same time, and while the functions stop servers, too.
     """
 
     def __init__(self, platform: AwsPlatform, project_id: str | None = None, executor: Executor | None = None) -> None:
@@ -129,7 +129,7 @@ class Stopper:
             self.errors.update(failures.lines)
 
     def _stop_chunk(self, servers: Sequence[Server]) -> list[str]:
-        """Stop servers with one call, and return the names of those that are stopped."""
+        """Stop servers with one call, and return the names of the servers that are stopped."""
         stops = {StopServer(one.project_id, one.user_id, one.attempt, Reason.STOPPED): one.name for one in servers}
         again = self._termination.stop([*stops])
         return [name for stop, name in stops.items() if stop not in again]

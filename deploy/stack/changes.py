@@ -182,7 +182,7 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
 def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
     """Read the first five findings of CloudFormation's validation of a change set; empty if they cannot be read.
 
-    `mode`: FAIL for those that made the change set fail, WARN for those that did not, such as a quota that is used up
+    `mode` is FAIL for findings that made the change set fail, WARN for other ones, such as a quota that is used up
     (CloudFormation User Guide, "Validate stack deployments"; API Reference, OperationEvent).
     """
     found: list[str] = []

@@ -76,7 +76,7 @@ def check_network(prepared: Prepared) -> None:
         return
     _refuse(
         _running(prepared.account, before),
-        "Servers run in the present network, which could not be removed, and they would lose their way out of it.",
+        "Servers run in the present network. It could not be removed, and they would lose their way out of it.",
         _WAIT_FOR_WARM_TOO,
     )
 

@@ -85,7 +85,7 @@ def detach(account: Account, arn: str) -> PolicyAttachments:
 
 
 def free_role(account: Account, name: str) -> None:
-    """Detach all managed policies of a role, and delete its inline policies, such as those that others have added."""
+    """Detach all managed policies of a role, and delete its inline policies; people may have added such policies."""
     iam = account.client("iam")
     try:
         given = [

@@ -19,7 +19,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # no ARN: that would hide the owner
-_WHICH = "`python -m deploy destroy --dry-run` names those that it has kept (with --stack and --region)."
+_WHICH = "`python -m deploy destroy --dry-run` names the buckets that it has kept (with --stack and --region)."
 
 
 def open_bucket(account: Account, name: str, project: str) -> Bucket:

@@ -1,6 +1,6 @@
 """The states of a CloudFormation stack, and what `apply` does about each of them.
 
-The names are those of CloudFormation's API (Stack, StackStatus). Sources for the ways out of a state: its user guide,
+The names come from CloudFormation's API (Stack, StackStatus). Sources for the ways out of a state: its user guide,
 "Stack status codes", "Continue rolling back an update", "Choose how to handle failures when provisioning resources";
 its API Reference, RollbackStack (the way out of CREATE_FAILED and UPDATE_FAILED).
 """

@@ -88,7 +88,7 @@ def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
     if project.limits_servers and not _is_readable(documents, limits.server_slots_key(project.id), ServerSlots):
         yield bad(
             check,
-            f"{limits.server_slots_key(project.id)} cannot be read, so no server of it starts.",
+            f"{limits.server_slots_key(project.id)} cannot be read, so no server of this project starts.",
             f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
             "the count begins anew, and with it the hours of maxServerHours.",
         )

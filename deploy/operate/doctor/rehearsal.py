@@ -121,7 +121,7 @@ class Rehearsal:
         if record is not None and record.state is ServerState.STARTING:
             if self._platform.tasks.find(record.name, record.cluster):
                 return CheckFailed(
-                    f"Its task was started {WAIT:.0f} seconds ago, and no word of it has come.",
+                    f"Its task was started {WAIT:.0f} seconds ago, and no event of it has arrived.",
                     "See the task in the ECS console; if it runs, its event is missing: "
                     "`python -m deploy logs task_changed`.",
                 )

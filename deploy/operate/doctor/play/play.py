@@ -29,7 +29,7 @@ DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 
 
 def site(context: CheckContext, project_id: str) -> OneSite:
-    """Return the addresses that bots may open: those of the installation's site and of its servers."""
+    """Return the addresses that bots may open: the addresses of the installation's site and of its servers."""
     servers = context.platform.settings.game_sources.split()
     return OneSite(context.installation["Site"], servers, project_id, tls=addresses.authorities())
 
