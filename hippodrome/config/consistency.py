@@ -151,7 +151,7 @@ def _environment_size(checked: Checked) -> Iterator[Mistake]:
     pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
     length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), ",".join(checked.game_steps), pages))
     if length > _ECS_LIMIT:
-        key = max(("actionSpace", "options", "keys", "labels", "game"), key=lambda name: len(_json(trial[name])))
+        key = max(trial, key=lambda name: len(_json(trial[name])))
         message = (
             f"too long: a server would be told {length} characters in all, and ECS allows {_ECS_LIMIT}; shorten it"
         )

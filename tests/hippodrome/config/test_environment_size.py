@@ -74,6 +74,10 @@ MAKES: dict[str, tuple[Make, str]] = {
     "actions beyond ASCII": (lambda n: {"actionSpace": [f"{k}{'é' * 40}" for k in range(n)]}, "actionSpace"),
     "options of backslashes": (lambda n: {"options": {"a": "\\" * n}}, "options"),
     "options of quotes": (lambda n: {"options": {"a": [""] * n}}, ""),
+    "many policies": (
+        lambda n: {"players": {"p": "human", **{f"p{k}": f"{'a' * 190}.onnx" for k in range(n)}}},
+        "players",
+    ),
     "a game beyond ASCII": (lambda n: {"game": "é" * 500, "options": {"a": "é" * n}}, "game"),
 }
 
