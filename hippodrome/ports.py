@@ -216,7 +216,10 @@ class Bus(Protocol):
         """Send the message to the topic's subscribers."""
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        """Send the message to the queue of `task_changed`, delayed by 0 to 900 `seconds`; else raise ValueError."""
+        """Send the message to the queue of `task_changed`, delayed by 0 to 900 `seconds`.
+
+        Raises ValueError for another delay.
+        """
 
 
 PORTS = (443, 5000)
