@@ -18,6 +18,8 @@ NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 TLS_NAMES = frozenset({"study.localhost", "api.localhost"})
 """Further names with TLS: the site's name, as on AWS, and the name to which HIPPO's front end sends its requests."""
 
+_PORTS = {"http": 80, "https": 443}
+
 
 def refusal(
     method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = (), *, scheme: str = "http"
@@ -68,15 +70,19 @@ def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: 
 
 
 def origin_of(address: str) -> str | None:
-    """Return the origin that an address names, as browsers write it; None if the text names no origin."""
+    """Return the origin that an address names, as browsers write it: without the port that its scheme has by default.
+
+    None if the text names no origin.
+    """
     try:
         parts = urlsplit(address)
-        port = f":{parts.port}" if parts.port else ""
+        port = parts.port
     except ValueError:
         return None
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.path not in ("", "/") or parts.query:
+    if parts.scheme not in _PORTS or not parts.hostname or parts.path not in ("", "/") or parts.query:
         return None
-    return f"{parts.scheme}://{parts.hostname}{port}"
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    return f"{parts.scheme}://{host}" + (f":{port}" if port and port != _PORTS[parts.scheme] else "")
 
 
 def _name(host: str) -> str:

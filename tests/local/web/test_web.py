@@ -14,8 +14,8 @@ import httpx
 import pytest
 
 from hippodrome.http import Request
+from local.web import access, connections, server
 from local.web import app as web_app
-from local.web import connections, server
 
 Event = dict[str, Any]
 
@@ -306,6 +306,23 @@ def test_our_own_pages_links_and_programs_are_answered(site: Site) -> None:
         ("GET", "/steps/p/a.png", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}),
     ]:
         assert site.http.request(method, path, headers=headers).status_code == 200, (method, path, headers)
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [
+        ("http://localhost:3000/", "http://localhost:3000"),
+        ("http://localhost:80", "http://localhost"),
+        ("https://Front.example:443", "https://front.example"),
+        ("http://localhost:443", "http://localhost:443"),
+        ("http://[::1]:3000", "http://[::1]:3000"),
+        ("localhost:3000", None),
+        ("http://localhost:3000/page", None),
+        ("http://localhost:x", None),
+    ],
+)
+def test_an_origin_is_named_as_browsers_send_it(given: str, sent: str | None) -> None:
+    assert access.origin_of(given) == sent
 
 
 def test_answers_can_be_read_by_no_other_origin_than_those_that_were_named() -> None:
