@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from export import scrub
-from export.recording_columns import as_number, when
+from export.recording_columns import as_number, as_whole, when
 from export.scrub import clean, texts
 from export.state import ExportedParticipant, ExportState
 from export.table_files import BATCH, Column, fit
@@ -146,7 +146,7 @@ def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> It
         other = _other_fields(row)
         player = other.get("player") if isinstance(other.get("player"), str) else None
         number = participant.number if participant else first.get("people", {}).get(player)
-        value, skipped = other.get("value"), other.get("skipped")
+        value = other.get("value")
         yield [
             number,
             first["step"],
@@ -159,7 +159,7 @@ def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> It
             _text(other.get("name")),
             None if value is None else fit(value, "text"),
             _text(row["error"]),
-            skipped if isinstance(skipped, int) else None,
+            as_whole(other.get("skipped")),
             path,
             *([first.get("session"), None if player is None else clean(player)] if in_sessions else ()),
         ]

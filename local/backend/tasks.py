@@ -50,14 +50,13 @@ class ProcessTasks:
         None: each server has its own port. Raises OSError if the files of servers cannot be read or written in `state`.
         """
         self.retry = retry or Retry(say)
-        self.logs = state / "logs"
         self._state = state.resolve()
         self._named_port = named_port
         self._files = TaskFolder(self._state / "tasks")
         self._clusters = self._state / "clusters"
         self._shared = Shared(
             state=self._state,
-            logs=self.logs,
+            logs=state / "logs",
             spool=self._state / "spool",
             files=self._files,
             data=data.resolve(),
@@ -68,7 +67,7 @@ class ProcessTasks:
             say=say,
             retry=self.retry,
         )
-        for folder in (self._files.path, self.logs, self._shared.spool, self._clusters):
+        for folder in (self._files.path, self._shared.logs, self._shared.spool, self._clusters):
             disk.make_folder(folder)
         self._lock = self._shared.lock
         self._servers: dict[str, TaskProcess] = {}  # by name; also servers that have stopped
