@@ -56,7 +56,7 @@ class Fetcher:
         folder: Path,
         wanted: Wanted,
         progress: Callable[[int, int], None],
-        damaged: frozenset[str] = frozenset(),
+        damaged: frozenset[str],
     ) -> None:
         self._project = project
         self._source = source

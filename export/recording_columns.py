@@ -157,8 +157,8 @@ class Rows:
         self,
         constants: Mapping[str, Any],
         scrub: Scrub,
-        players: tuple[str, ...] = (),
-        humans: tuple[str, ...] | None = None,
+        players: tuple[str, ...],
+        humans: tuple[str, ...] | None,
     ) -> None:
         self._constants = constants
         self._scrub = scrub

@@ -55,14 +55,14 @@ def players(state: ExportState) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))[:MAX_PLAYERS]
 
 
-def episode_columns(players: Sequence[str], in_sessions: bool = False) -> list[Column]:
+def episode_columns(players: Sequence[str], in_sessions: bool) -> list[Column]:
     """Return the columns of `episodes`."""
     kinds = (Column(f"player.{clean(name)}") for name in players)
     scores = (Column(f"score.{clean(name)}", "number") for name in players)
     return [*EPISODES, *((*_SESSION_COLUMNS, _BY_POLICY) if in_sessions else ()), *kinds, *scores]
 
 
-def episodes(state: ExportState, players: Sequence[str], in_sessions: bool = False) -> Iterator[list[Any]]:
+def episodes(state: ExportState, players: Sequence[str], in_sessions: bool) -> Iterator[list[Any]]:
     """Yield a row per episode: its outcome, the file with its frames, and who played each player with which score.
 
     An episode of a session has a row for each human player, with their own score.
@@ -137,7 +137,7 @@ def callback_columns(in_sessions: bool) -> list[Column]:
     return [*CALLBACKS, *(_SESSION_COLUMNS if in_sessions else ())]
 
 
-def callbacks(state: ExportState, folder: Path, in_sessions: bool = False) -> Iterator[list[Any]]:
+def callbacks(state: ExportState, folder: Path, in_sessions: bool) -> Iterator[list[Any]]:
     """Yield a row per line that a callback of the agent has recorded. `folder` holds the converted recordings.
 
     In a session, the row's participant is the one whose player the line names, if it names one.

@@ -41,7 +41,7 @@ def last_line(report: str) -> dict[str, Any]:
 class AgentReport:
     """The report of an agent that was tried in one group. `place` is the folder that has the report."""
 
-    def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None = None) -> None:
+    def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
         self._group = group
         self._code = layout.agent_folder(folder).resolve()

@@ -38,7 +38,7 @@ class ServerLogs:
         self._folder = logs_of(data)
         self._sizes = {log: log.stat().st_size for log in self._logs()}
 
-    def crashes(self, names: Mapping[str, str] | None = None) -> list[AgentCrash]:
+    def crashes(self, names: Mapping[str, str]) -> list[AgentCrash]:
         """Return the errors of agent.py, each once, the most frequent first.
 
         `names` maps texts to those that replace them in the errors.
@@ -49,7 +49,7 @@ class ServerLogs:
                 new = log.read_bytes()[self._sizes.get(log, 0) :].decode("utf-8", "replace")
             except OSError:
                 continue
-            for before, after in (names or {}).items():
+            for before, after in names.items():
                 new = new.replace(before, after)
             for crash in read(new.splitlines()):
                 found.setdefault(crash.text, crash).count += 1

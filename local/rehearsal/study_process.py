@@ -235,7 +235,7 @@ def sessions_not_open(data: Path, project_id: str) -> set[str]:
     return {owner for owner in owners - ahead if is_session_id(owner)}
 
 
-def open_records(data: Path, users: Collection[str] | None = None) -> list[str]:
+def open_records(data: Path, users: Collection[str] | None) -> list[str]:
     """Return the labels of the servers whose records are not closed.
 
     With `users`, return only those whose owner is one of these: a participant's id, or a session's.

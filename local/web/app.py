@@ -24,7 +24,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 class App:
     """The ASGI application. `functions` are the handlers by name. Pages of `origins` are answered, too."""
 
-    def __init__(self, functions: Mapping[str, Handler], say: Say = print, origins: Collection[str] = ()) -> None:
+    def __init__(self, functions: Mapping[str, Handler], say: Say, origins: Collection[str] = ()) -> None:
         self._functions = functions
         self._say = say
         self._origins = frozenset(origins)
