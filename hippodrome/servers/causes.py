@@ -108,7 +108,7 @@ _EXPLANATIONS = {
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
-        "The program ended with an error while a participant might play.",
+        "The program ended with an error, perhaps while a participant was playing.",
         f"{_LOGS} `make run` may show the same on your machine.",
     ),
     Cause.OUT_OF_MEMORY: _Explanation(
@@ -150,7 +150,7 @@ _EXPLANATIONS = {
     Cause.CAPACITY: _Explanation(
         FailureCategory.AWS,
         "Fargate had no room, neither on Spot nor on demand.",
-        "It mostly passes; with subnets in more zones there is room more often.",
+        "This usually passes; with subnets in more zones there is room more often.",
     ),
     Cause.SPOT: _Explanation(
         FailureCategory.AWS,
@@ -160,7 +160,7 @@ _EXPLANATIONS = {
     Cause.MACHINE: _Explanation(
         FailureCategory.AWS,
         "AWS could not start the server, or its machine failed.",
-        "It mostly passes; if not, the AWS Health Dashboard may know more.",
+        "This usually passes; if not, the AWS Health Dashboard may know more.",
     ),
     Cause.VANISHED: _Explanation(
         FailureCategory.AWS,
