@@ -217,7 +217,7 @@ class Lobby:
         servers = self._lookups.servers(project, known, me.label, proposals)
         run = self._lookups.run(project, known, entries, proposals, servers=servers, chosen=chosen)
         own = entries.waiting.get(me.label)
-        before = known  # the document that this run has changed
+        before = known  # the version of the document that this run changes
 
         def settle(document: Decisions) -> Decisions:
             nonlocal before

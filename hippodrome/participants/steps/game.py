@@ -114,29 +114,23 @@ class GameStep:
 
     def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
         """Send a lost start message again. `owner`: the id of the participant, or of a session of `players` members."""
-        project, step = visit.project, visit.step
-        attempt = self._first_attempt_if_lost(visit) if record is None else self._overdue_attempt(project, step, record)
+        attempt = self._overdue_attempt(visit, record)
         if attempt is not None:
-            self._request_server(project, owner, attempt, players)
+            self._request_server(visit.project, owner, attempt, players)
 
-    def _first_attempt_if_lost(self, visit: Visit) -> int | None:
-        """Return 1, the number of the first attempt, if its start message was lost; otherwise None.
-
-        There is no record. The message was lost if the participant may have a server, and should have one by now.
-        """
-        project, step, progress = visit.project, visit.step, visit.progress
-        since = progress.reached_at(project, step)
-        overdue = progress.has_arrived if since is None else self._services.platform.now() - since > ASK_AGAIN
-        return 1 if participant.may_have_server(project, step) and overdue else None
-
-    def _overdue_attempt(self, project: Project, step: Step, record: Server) -> int | None:
+    def _overdue_attempt(self, visit: Visit, record: Server | None) -> int | None:
         """The attempt to request again, because it is overdue; None if none is.
 
         Its message was lost, or came while the study was closed, or the project was full and may have a slot now.
         """
+        project, step, now = visit.project, visit.step, self._services.platform.now()
         if not participant.may_have_server(project, step):
             return None
-        now, full = self._services.platform.now(), server.found_no_slot(record, record.attempt)
+        if record is None:
+            since = visit.progress.reached_at(project, step)
+            overdue = visit.progress.has_arrived if since is None else now - since > ASK_AGAIN
+            return 1 if overdue else None
+        full = server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else next_attempt(record)
         stuck = record.state is ServerState.STARTING and now - record.requested > STUCK
