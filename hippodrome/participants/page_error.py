@@ -30,8 +30,7 @@ class PageError(Exception):
     """Ends a request with a page of this title and text, or with JSON for a program.
 
     `status` is the HTTP status, `lang` the language of title and text. With `hippo`, programs get HIPPO's status and
-    text. A front end gets status 200 instead of a status on which HIPPO's front end does not
-    act (`ACTED_ON`).
+    text. A front end gets status 200 instead of a status on which HIPPO's front end does not act (`ACTED_ON`).
     """
 
     def __init__(

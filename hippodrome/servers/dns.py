@@ -126,7 +126,7 @@ class DnsRecords:
             "a server is not renamed yet",
             lambda record: record.name,
         )
-        unregistered = self._create([record for _, record in renamed], looked) if renamed else []
+        unregistered = self._create([record for _, record in renamed], looked)
         return [record for record in servers if record.has_default_name] + failed + unregistered
 
     def _use_default_name(self, record: Server) -> Server | None:

@@ -126,10 +126,8 @@ class SharedGame:
     def _standing(self, project: Project, found: LobbyState | NoServerYet | Membership) -> Standing:
         if isinstance(found, NoServerYet):
             return Standing(found, _not_yet_ready(found.record))
-        standing = Standing(found)
-        if standing.session is None:
-            return standing
-        return Standing(found, self._services.repository.server_of(project.id, standing.session))
+        session = found.session if isinstance(found, Membership) else None
+        return Standing(found, self._services.repository.server_of(project.id, session) if session else None)
 
     def _earlier_answers(self, project: Project, user_id: str, step: Step) -> Mapping[str, Any]:
         """The participant's answers on the pages before this step. Of a field on two pages, the later answer counts."""
