@@ -55,7 +55,9 @@ class Choices:
             repeats_last=config.input != "single",
         )
         self._advice: dict[str, int] = {}
-        self._usual = {  # made once, since most steps take one of these: by action, chosen by no one or by the human
+        # Most steps take one of these actions, so they are made once: by player and by the action's number, the action
+        # that no one has chosen, and the same action chosen by the human.
+        self._usual = {
             name: tuple(
                 (Action(index, action), Action(index, action, "human"))
                 for index, action in enumerate(players[name].action_space)

@@ -25,7 +25,7 @@ class Client:
     window: Window
     player: str
     sent: tuple[object, ...] = ()
-    """The values (`state_of`) from which the last state for this client was made."""
+    """The values (`state_of`) that the client was sent last."""
 
 
 class Clients:
@@ -138,7 +138,7 @@ class Clients:
 
 
 def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
-    """Return the values (state, episode, score and others) after whose change a client is sent the state again."""
+    """Return the state, the episode, the score and others: if one of them changes, a client is sent the state again."""
     score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
     members, frozen = progress.session_version, progress.shows_first_picture
     return progress.state, progress.episode, score, progress.frame_rate, frozen, members, to_act
@@ -146,17 +146,14 @@ def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
 
 def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:
     """Return the arguments of `messages.state` that say the times, the player's turn and the session."""
-    turn = _turn_arguments(progress, player, times.turn_ends_in)
-    arguments = {"next_in": times.next_in, "starts_in": times.starts_in, "time_left": times.time_left, **turn}
-    return arguments if times.session is None else {**arguments, "session": {**times.session, "you": player}}
-
-
-def _turn_arguments(progress: TrialProgress, player: str, ends_in: float | None) -> dict[str, Any]:
-    """Return the arguments of `messages.state` that say the player's turn; none in real time."""
-    if progress.turns is None:
-        return {}
-    to_act = progress.to_act(player)
-    return {"to_act": to_act, "turn_ends_in": ends_in if to_act else None}
+    arguments = times._asdict()
+    if progress.turns is not None:
+        arguments["to_act"] = progress.to_act(player)
+        if not arguments["to_act"]:
+            arguments["turn_ends_in"] = None
+    if times.session is not None:
+        arguments["session"] = {**times.session, "you": player}
+    return arguments
 
 
 def _controls_text(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:

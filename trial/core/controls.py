@@ -27,8 +27,9 @@ class Controls:
 
     `action_space` are the names of the player's actions in their order. `lifespan` is the number of steps for which a
     press acts. `default` is the number of the idle action; None: NOOP, or the first action.
-    `keys` are the project's own, an action for each combination of keys (`protocol.keyboard`); those of actions that
-    do not exist do nothing. With `single`, each press is one action, for one step.
+    `keys` are the project's own: the name of an action for each combination of keys (`protocol.keyboard`). If the
+    player has no action of this name, the combination does nothing. With `single`, each press is one action, for one
+    step.
     """
 
     def __init__(

@@ -171,7 +171,7 @@ class StepTaken(NamedTuple):
 class Replayed:
     """The result of a `ReplayCall`: the present picture, and what the players see (`view` as in `Begun`).
 
-    `observed`: by player, the observations for which its policy had chosen the actions of these steps, in their order.
+    `observed`: by player, the observations with which its policy was asked for the actions of these steps, in order.
     """
 
     pictures: Pictures

@@ -6,7 +6,7 @@ import math
 from collections import deque
 
 STALLED_SECONDS = 3.0
-"""A client is lost or hidden if it has acknowledged frames, but has not acknowledged one for so many seconds."""
+"""A client that acknowledges frames counts as lost or hidden if it leaves one without acknowledgement for so long."""
 
 _WIDEST = 15  # the most frames under way, however long the round trip is
 

@@ -60,14 +60,14 @@ class MessageLog:
         if self._full(player):
             self._dropped += 1
             return
-        self._messages.append({"ns": ns, **_of(player), **record})
+        self._messages.append({"ns": ns, **_player_field(player), **record})
         if message.command is not None and is_feedback(message.command):
             self._feedback.append(Word(message.command, player))
 
     def note(self, event: str, ns: int, player: str | None = None) -> None:
         """Add an event that is not a client's message, such as a new connection. If too many messages wait, drop it."""
         if not self._full(player):
-            self._messages.append({"ns": ns, **_of(player), "event": event})
+            self._messages.append({"ns": ns, **_player_field(player), "event": event})
 
     def _full(self, player: str | None) -> bool:
         """Whether too many messages of this participant wait. In a session each participant has their own limit."""
@@ -77,7 +77,7 @@ class MessageLog:
 
     def repeat(self, feedback: Sequence[Word], ns: int) -> None:
         """Insert feedback, which an earlier server's agent did not hear, before all other messages."""
-        again = [{"ns": ns, **_of(word.player), "command": word.text, "again": True} for word in feedback]
+        again = [{"ns": ns, **_player_field(word.player), "command": word.text, "again": True} for word in feedback]
         self._messages[:0] = again
         self._feedback[:0] = feedback
 
@@ -97,5 +97,5 @@ class MessageLog:
         del self._feedback[:feedback]
 
 
-def _of(player: str | None) -> dict[str, str]:
+def _player_field(player: str | None) -> dict[str, str]:
     return {} if player is None else {"player": player}

@@ -115,7 +115,7 @@ class Presence:
 
     rules: Rules
     players: Sequence[str]
-    """The players of the members, in the environment's order."""
+    """The players of the members."""
     reads: bool
     """Whether there is a page before the game: the game begins when all members have gone on from it."""
     begun: bool
@@ -379,6 +379,7 @@ class Presence:
 
     @property
     def _least(self) -> float:
+        """The least time that one absence uses up now: see `LEAST_ABSENCE`."""
         return min(LEAST_ABSENCE, (self.rules.absent if self.begun else self.rules.gather) / 3)
 
     def _give_time_back(self, now: float) -> None:

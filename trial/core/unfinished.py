@@ -78,9 +78,9 @@ class UnfinishedEpisode:
     def failures(self) -> dict[str, int]:
         """By player, how often its policy has failed in a row, up to the last step.
 
-        A step for which a policy failed has `observed`, and `by` is none or late. So has a step whose action had become
-        illegal when the policy answered. But after that the policy is asked again, and a policy with `FAILURES`
-        failures is not: so only a step without a question shows that a policy has reached that number.
+        If a policy failed in a step, the step has `observed`, and its `by` is none or late. A step looks the same if
+        the policy's action had become illegal when it answered. The steps after it tell the two apart: a policy with
+        `FAILURES` failures in a row is not asked any more, so the next steps have no `observed`.
         """
         failures: dict[str, int] = {}
         idle: set[str] = set()

@@ -52,7 +52,7 @@ class Scene:
     problems: tuple[str, ...] = field(default=(), compare=False)
     """The mistakes in single objects, in sentences for the researcher. Objects that cannot be drawn are left out."""
     given: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, compare=False, repr=False)
-    """The objects as `render()` returned them, by id. One that it returns unchanged needs no second check."""
+    """The objects as `render()` returned them, by id. An object that it returns unchanged is not checked again."""
     images: frozenset[str] | None = field(default=None, compare=False, repr=False)
     """The names of the images that its sprites show; None if they are not known yet (see `images_of`)."""
     letters: int = field(default=0, compare=False, repr=False)

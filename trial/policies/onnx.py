@@ -1,9 +1,9 @@
 """Runs policies that are ONNX files, by onnxruntime on one thread of the CPU.
 
-An input or output is known by its name, as the usual exports have it: RLlib's (`obs`, `state_ins` or `state_in_0` …,
-`seq_lens`; `output`, `state_outs` or `state_out_0` …), those of sb3-contrib (`episode_starts`), and any pairs with
-`_in` and `_out` or `h` and `hn`. An older RLlib numbers its states wrongly, so that a second state has the name
-`seq_lens`. That one has two axes; the real `seq_lens` has one.
+The name of an input or output says what it is for. These names are known: RLlib's (`obs`, `state_ins` or `state_in_0`
+…, `seq_lens`; `output`, `state_outs` or `state_out_0` …), those of sb3-contrib (`episode_starts`), and any pairs with
+`_in` and `_out` or `h` and `hn`. An older RLlib numbers its states wrongly, so that the second state has the name
+`seq_lens`. This state has two axes; the real `seq_lens` has one.
 """
 
 from __future__ import annotations
@@ -335,7 +335,7 @@ def _sha256(file: Path) -> str:
 
 
 def _short(error: Exception) -> str:
-    """onnxruntime's message on one line, without its error number and the places in its code."""
+    """Return onnxruntime's message on one line, without its error number and the places in its code."""
     line = " ".join(str(error).split())
     message = line.rpartition(" : ")[2] or line
     return message if len(message) <= 200 else f"{message[:200]}…"

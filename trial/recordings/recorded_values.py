@@ -13,9 +13,9 @@ import numpy as np
 LISTED = 100
 """The most numbers of an array that the field `extra` has as a list. Larger arrays are packed."""
 MOST_VALUES = 2_000_000
-"""The most values that are converted in one value. Containers that hold each other in many ways would have no end."""
+"""The most values that are converted in one value. Containers that hold one another may have an immense number."""
 CUT_OFF = "<cut off>"
-"""Stands in a container for the values that were left out."""
+"""The text in a container that stands for the values that were left out."""
 _DEPTH = 20  # the most levels of nesting
 _TEXT = 1000  # the most characters of an object that is converted to its text
 _INT_BITS = 10_000  # Python converts no longer integers to text (sys.set_int_max_str_digits)

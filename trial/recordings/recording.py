@@ -103,9 +103,9 @@ def observation(value: Any) -> Any:
 def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tuple[dict[str, Any], dict[str, int]]:
     """Convert the values that an agent's `step` returned beside Gymnasium's for a recording, `left` bytes at most.
 
-    A value that does not fit together with those before it is replaced by `{"tooLarge": bytes}`. The second result has
-    the least sizes of these values, by name. After `MOST_TOO_LARGE` of them the rest is left out, and `"<cut off>"` is
-    the number of values left out.
+    A value for which the values before it leave no room is replaced by `{"tooLarge": bytes}`. The second result has the
+    sizes of these values by name; a value that was not converted whole is at least so large. After `MOST_TOO_LARGE` of
+    them the rest is left out, and `"<cut off>"` is the number of values left out.
     """
     recorded: dict[str, Any] = {}
     too_large: dict[str, int] = {}

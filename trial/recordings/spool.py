@@ -36,7 +36,7 @@ class Spool:
             self.folder = Path(tempfile.mkdtemp(prefix="trial-"))
 
     def open(self, key: str) -> Recording:
-        """Open a new recording for this key; if there is one, for the key with a number. Raises OSError."""
+        """Open a new recording for this key; for the key with a number if the key has a recording. Raises OSError."""
         for number in range(1, 100):
             numbered = with_number(key, number)
             path = self.folder / f"{numbered}.part"

@@ -44,8 +44,8 @@ def process_request(
 ) -> Response | None:
     """Return the answer to an HTTP request that opens no WebSocket; None: go on with the WebSocket's handshake.
 
-    The path of programs, /gym, exists only if `gym` (in the section `trial`) is not `none`. A program that asks for
-    environments must show the token here: later its protocol has no message for a refusal.
+    `gym` is the key of the section `trial`: if it is `none`, there is no path /gym, which programs open. A program
+    that asks for environments must show the token here, since its protocol has no message for a later refusal.
     """
     path = urlsplit(request.path).path
     if path == "/healthz":
@@ -70,7 +70,7 @@ def process_request(
 def select_subprotocol(
     websocket: ServerConnection, offered: Sequence[Subprotocol], *, gym: str = "none"
 ) -> Subprotocol | None:
-    """Return the preferred one of the subprotocols that the client offers; None for clients of HIPPO and Gymie."""
+    """Return the subprotocol to use. None if the client offers none of ours, as HIPPO's and Gymie's clients do."""
     if gym == "environments" and is_program(websocket):
         return forms.SUBPROTOCOL if forms.SUBPROTOCOL in offered else None
     return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
