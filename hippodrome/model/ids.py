@@ -10,6 +10,8 @@ import re
 import secrets
 from datetime import datetime
 
+from protocol.keys import NAME
+
 PROJECT_ID = re.compile(r"(?!_)[A-Za-z0-9_-]{1,64}")
 """A valid project id. It stands in S3 keys, in the family of a task definition, in an image's tag and in links.
 
@@ -17,7 +19,6 @@ ECS takes letters, digits, `-` and `_` in a family (API_RegisterTaskDefinition);
 DNS name holds a project's id. Our own folders in the bucket begin with `_`, so no id does; a registration also refuses
 `SSL`, the folder of the certificates.
 """
-USER_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _HOST = re.compile(r"(?!xn--)[a-z0-9](?:[a-z0-9_-]{0,61}[a-z0-9])?")
 _WARM_ID = re.compile(r"~[0-9a-f]{20}")
 _SERVER_NAME = re.compile(r"(s[a-z2-7]{20})-([1-9][0-9]{0,2})")
@@ -33,7 +34,7 @@ def is_project_id(text: object) -> bool:
 
 def is_user_id(text: object) -> bool:
     """Return whether `text` can be a participant's id: 1 to 64 letters, digits, dashes and underscores."""
-    return isinstance(text, str) and USER_ID.fullmatch(text) is not None
+    return isinstance(text, str) and NAME.fullmatch(text) is not None
 
 
 def warm_id(project_id: str, asked: datetime, number: int) -> str:

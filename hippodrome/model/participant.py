@@ -129,15 +129,13 @@ def may_have_server(project: Project, step: Step) -> bool:
 
     They may from the step at which servers start on, and before the step at which they stop.
     """
-    start = project.events.start_server_step
-    at, first = project.index(step.key), project.index(start) if start else None
+    at, first = project.index(step.key), project.index(project.events.start_server_step)
     return at is not None and first is not None and first <= at and not is_past_server(project, step)
 
 
 def is_past_server(project: Project, step: Step) -> bool:
     """Return whether the participant needs no server any more at this step: it is the stop step or a later one."""
-    stop = project.events.stop_server_step
-    at, last = project.index(step.key), project.index(stop) if stop else None
+    at, last = project.index(step.key), project.index(project.events.stop_server_step)
     return at is not None and last is not None and at >= last
 
 

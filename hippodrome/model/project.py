@@ -196,7 +196,7 @@ class Project(Record, frozen=True):
         """Return the key of a step page; `file` is the page's name without `.html`."""
         return step_key(self.id, file, self.page_folder)
 
-    def index(self, key: str) -> int | None:
+    def index(self, key: str | None) -> int | None:
         """Return the position of this step, from 0; None if the project has no such step."""
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.model import ids
+from protocol.keys import NAME
 
-user_ids = st.from_regex(ids.USER_ID, fullmatch=True)
+user_ids = st.from_regex(NAME, fullmatch=True)
 
 
 @pytest.mark.parametrize("text", ["", "a" * 65, "a b", "../x", "a\0", "ä", "a/b", "a.b", "a\n", None, 7, ["a"]])

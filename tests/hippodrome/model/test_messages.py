@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from hippodrome.model import ids, messages
 from hippodrome.model.messages import StartServer, StopServer, to_message
+from protocol.keys import NAME
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.text(),
@@ -64,7 +65,7 @@ def test_messages_with_malformed_ids_are_not_parsed(user: object) -> None:
     assert messages.parse_stop_server({"projectId": "maze", "userId": user}) is None
 
 
-@given(st.from_regex(ids.PROJECT_ID, fullmatch=True), st.from_regex(ids.USER_ID, fullmatch=True), st.integers(1, 9))
+@given(st.from_regex(ids.PROJECT_ID, fullmatch=True), st.from_regex(NAME, fullmatch=True), st.integers(1, 9))
 def test_messages_are_parsed_with_and_without_the_envelope_of_sns(project: str, user: str, attempt: int) -> None:
     sent = StartServer(project, user, attempt)
     raw = json.dumps(to_message(sent))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hippodrome.model import ids
 from hippodrome.model.project import Events
 from lambdas import installed as place
+from protocol.keys import NAME
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
 from testing.visitors import Browser
@@ -164,7 +165,7 @@ def test_a_link_without_an_id_is_refused_and_no_id_is_made(closed: FakePlatform)
     assert "by invitation" in answer["body"]
 
 
-IDS = st.from_regex(ids.USER_ID, fullmatch=True)
+IDS = st.from_regex(NAME, fullmatch=True)
 
 
 @given(IDS, IDS, st.text(max_size=40), st.integers(0, 31), st.sampled_from("0123456789abcdef"))
