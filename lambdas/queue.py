@@ -62,11 +62,6 @@ def all_at_once(messages: Sequence[tuple[str, M]], act: Callable[[Sequence[M]], 
     return [message_id for message_id, message in messages if id(message) in again]
 
 
-def batch_response(message_ids: Sequence[str]) -> BatchResponse:
-    """Return the partial batch response that makes SQS deliver these messages again."""
-    return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
-
-
 def response(event: Mapping[str, Any], message_ids: Sequence[str]) -> BatchResponse:
     """Return the partial batch response that makes SQS deliver these messages again.
 
@@ -76,7 +71,7 @@ def response(event: Mapping[str, Any], message_ids: Sequence[str]) -> BatchRespo
     """
     if message_ids and any(isinstance(record, dict) and "Sns" in record for record in event.get("Records") or ()):
         raise RetryLater("a message of the topic failed")
-    return batch_response(message_ids)
+    return {"batchItemFailures": [{"itemIdentifier": message_id} for message_id in message_ids]}
 
 
 def _id_of(record: Any) -> str | None:

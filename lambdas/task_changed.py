@@ -23,4 +23,4 @@ def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
     failed += queue.all_at_once([(i, m) for i, m in events if m.status == "RUNNING"], dns.tasks_running)
     failed += queue.all_at_once([(i, m) for i, m in events if m.status in ENDED], Termination(services).tasks_ended)
     queue.report_failures(services)
-    return queue.batch_response(failed)
+    return queue.response(event, failed)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import re
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-"""The ids that a project, a participant and a step may have."""
+"""The form of the ids of projects, participants and steps."""
 QUESTIONS = "_match/"
 """The folder of the questions to the functions `match` of all projects."""
 QUESTION_ID = re.compile(r"[0-9a-f]{20}")
-"""The id of a question to the function `match`."""
+"""The form of the id of a question to the function `match`."""
 SERVER_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
-"""The names that a server may have."""
+"""The form of the names of servers."""
 
 
 def participant_folder(project_id: str, user_id: str) -> str:
