@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.ports import Settings
@@ -64,7 +64,7 @@ class AwsPlatform:
         """The documents on S3. The variable `BUCKET` must be set."""
         from hippodrome.aws.documents import S3Documents
 
-        return S3Documents(lambda: self._client("s3"), self._needs("documents")("BUCKET"))
+        return S3Documents(lambda: self._client("s3"), self._need("documents", "BUCKET"))
 
     @cached_property
     def signer(self) -> S3Signer:
@@ -80,7 +80,7 @@ class AwsPlatform:
                 raise RuntimeError("there are no AWS credentials to sign requests with; the function needs a role")
             return found.get_frozen_credentials()
 
-        return S3Signer(lambda: self._client("s3"), credentials, self._needs("signer")("BUCKET"))
+        return S3Signer(lambda: self._client("s3"), credentials, self._need("signer", "BUCKET"))
 
     @cached_property
     def tasks(self) -> EcsTasks:
@@ -90,7 +90,7 @@ class AwsPlatform:
         """
         from hippodrome.aws.tasks import EcsTasks
 
-        return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), self._needs("tasks"))
+        return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), partial(self._need, "tasks"))
 
     @cached_property
     def dns(self) -> Route53Dns:
@@ -101,7 +101,7 @@ class AwsPlatform:
         from hippodrome.aws.dns import Route53Dns
 
         host = self.settings.servers_host
-        return Route53Dns(lambda: self._client("route53"), self._needs("dns"), host)
+        return Route53Dns(lambda: self._client("route53"), partial(self._need, "dns"), host)
 
     @cached_property
     def timers(self) -> SchedulerTimers:
@@ -111,7 +111,7 @@ class AwsPlatform:
         """
         from hippodrome.aws.timers import SchedulerTimers
 
-        return SchedulerTimers(lambda: self._client("scheduler"), self._needs("timers"), self.now)
+        return SchedulerTimers(lambda: self._client("scheduler"), partial(self._need, "timers"), self.now)
 
     @cached_property
     def bus(self) -> SnsBus:
@@ -122,14 +122,14 @@ class AwsPlatform:
         """
         from hippodrome.aws.bus import SnsBus
 
-        return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), self._needs("bus"))
+        return SnsBus(lambda: self._client("sns"), lambda: self._client("sqs"), partial(self._need, "bus"))
 
     @cached_property
     def challenges(self) -> Route53Challenges:
         """The TXT records of DNS-01 challenges. It is no port: one machine orders no certificate."""
         from hippodrome.aws.challenges import Route53Challenges
 
-        return Route53Challenges(lambda: self._client("route53"), self._needs("challenges"))
+        return Route53Challenges(lambda: self._client("route53"), partial(self._need, "challenges"))
 
     def now(self) -> datetime:
         return datetime.now(UTC)
@@ -144,16 +144,12 @@ class AwsPlatform:
         with ThreadPoolExecutor(min(MAX_THREADS, len(acts))) as pool:
             return [one.result() for one in [pool.submit(copy_context().run, act) for act in acts]]
 
-    def _needs(self, port: str) -> Callable[[str], str]:
-        """Return a function that reads a variable for this port. It raises RuntimeError if the variable is missing."""
-
-        def need(variable: str) -> str:
-            value = self._env.get(variable, "").strip()
-            if not value:
-                raise RuntimeError(f"the environment variable {variable} is missing; the port {port!r} needs it")
-            return value
-
-        return need
+    def _need(self, port: str, variable: str) -> str:
+        """The value of an environment variable that this port needs. Raises RuntimeError if the variable is missing."""
+        value = self._env.get(variable, "").strip()
+        if not value:
+            raise RuntimeError(f"the environment variable {variable} is missing; the port {port!r} needs it")
+        return value
 
     @cached_property
     def _session(self) -> Any:
