@@ -39,7 +39,7 @@ from hippodrome.lobby.repair import Repair
 from hippodrome.lobby.run import StartedAhead
 from hippodrome.lobby.store import LobbyStore
 from hippodrome.log import logger
-from hippodrome.model import ids
+from hippodrome.model import ids, sessions
 from hippodrome.model.matching import field_of
 from hippodrome.model.memberships import Membership
 from hippodrome.model.project import Project
@@ -176,7 +176,7 @@ class Lobby:
                 now,
                 ids.new_session_id,
                 players=project.players,
-                open_for=self._lookups.open_for(project),
+                open_for=sessions.open_for(project, self._platform.settings),
             )
 
         after = self._store.change(project, settle)
@@ -268,7 +268,7 @@ class Lobby:
         """One run, for a member of a formed session that waits for a server. The members' entries are deleted."""
         now, before = self._platform.now(), known
         servers = self._lookups.servers(project, known, me.label, ())
-        open_for = self._lookups.open_for(project)
+        open_for = sessions.open_for(project, self._platform.settings)
 
         def settle(document: Decisions) -> Decisions:
             nonlocal before

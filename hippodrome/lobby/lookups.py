@@ -35,10 +35,6 @@ class Lookups:
         self._platform = platform
         self._repository = repository
 
-    def open_for(self, project: Project) -> timedelta:
-        """Return for how long after its request a server that was started ahead may be given to a session."""
-        return sessions.open_for(project, self._platform.settings)
-
     def run(
         self,
         project: Project,
@@ -51,7 +47,7 @@ class Lookups:
     ) -> LobbyRun:
         """Return a run that may form the sessions of these confirmed proposals. AWS calls: two reads per member."""
         members, broken = self._members(project, proposals, entries)
-        now, open_for = self._platform.now(), self.open_for(project)
+        now, open_for = self._platform.now(), sessions.open_for(project, self._platform.settings)
         return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
 
     def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
@@ -81,7 +77,7 @@ class Lookups:
             return StartedAhead({})
         waiting, now = known.without_server(), self._platform.now()
         is_first = not waiting or waiting[0] is formed
-        open_for = self.open_for(project)
+        open_for = sessions.open_for(project, self._platform.settings)
         usable = [each.id for each in known.open if each.is_usable(own.players, now, open_for)]
         some = usable[:LOOKED_AT] if is_first else []
         found = self._records(project, [own.id, *some])
