@@ -121,6 +121,14 @@ def test_a_package_that_the_experiment_names_is_not_required_twice(tmp_path: Pat
     assert lines == ["Gymnasium[classic_control]~=1.2", "typing.extensions !=4.0"]
 
 
+def test_files_that_are_left_out_do_not_count_as_too_much(tmp_path: Path) -> None:
+    with (tmp_path / "film.bin").open("wb") as film:
+        film.truncate(600 * 2**20)
+    project, said = project_of(tmp_path)
+    assert "Remark: film.bin is left out: it has 600 MB, and 50 are the most" in said
+    assert not (project / "film.bin").exists()
+
+
 def test_options_without_effect_get_a_remark(tmp_path: Path) -> None:
     _, said = project_of(tmp_path)
     assert "Remark: host has no effect: on one machine only its own browsers reach a study" in said
