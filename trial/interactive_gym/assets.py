@@ -9,13 +9,12 @@ from typing import Any
 
 from trial.interactive_gym.object_contexts import fields_of
 from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.sources import Locate
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 
 
-def asset_files(
-    config: RemoteConfig, locate: Callable[[str], Path | None], remark: Callable[[str], None]
-) -> dict[str, bytes]:
+def asset_files(config: RemoteConfig, locate: Locate, remark: Callable[[str], None]) -> dict[str, bytes]:
     """Return the files of `assets/` by their paths. Call `remark` with a sentence about each image that is left out."""
     files: dict[str, bytes] = {}
     if "assets_dir" in config.given:
@@ -34,7 +33,7 @@ def asset_files(
 
 def _add(
     spec: Mapping[str, Any],
-    locate: Callable[[str], Path | None],
+    locate: Locate,
     remark: Callable[[str], None],
     files: dict[str, bytes],
 ) -> None:

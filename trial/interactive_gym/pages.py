@@ -6,19 +6,15 @@ import html
 import json
 import re
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 from trial.interactive_gym.playing import humans_of
 from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.sources import put
+from trial.interactive_gym.sources import Locate, put
 
 _LINKED = re.compile(r'(?P<before>\b(?:src|href)=")(?P<path>[^":#?{}]+\.[A-Za-z0-9]+)(?=")')
 _TAG = re.compile(r"<[A-Za-z/!]")
 _JINJA = re.compile(r"\{[{%#]")
-
-Locate = Callable[[str], Path | None]
-"""A function that finds a file that an option names, and returns None if there is none."""
 
 
 def welcome(config: RemoteConfig) -> str:

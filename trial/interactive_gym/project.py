@@ -15,7 +15,7 @@ from trial.interactive_gym.configuration_constants import ActionSettings, InputM
 from trial.interactive_gym.looking import Look
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.sources import HASHES, ConfigModule
+from trial.interactive_gym.sources import HASHES, ConfigModule, Locate
 
 LEAST_PATIENCE, MOST_PATIENCE = 10, 3600
 """The limits of `project.patience`, in seconds."""
@@ -199,7 +199,7 @@ def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
 def _players(
     config: RemoteConfig,
     look: Look,
-    find: Callable[[Any], Path | None],
+    find: Locate,
     files: dict[str, bytes],
     remark: Callable[[str], None],
 ) -> dict[Any, tuple[str, str]]:

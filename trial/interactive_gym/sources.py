@@ -8,7 +8,7 @@ import re
 import site
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -17,6 +17,9 @@ from typing import Any
 
 from protocol.players import ONNXRUNTIME
 from trial.interactive_gym.playing import Unplayable
+
+Locate = Callable[[Any], Path | None]
+"""A function that finds the file or folder that an option names, and returns None if there is none."""
 
 MOST_BYTES = 50 * 2**20
 """The most bytes of one file. Larger files are left out."""
@@ -86,8 +89,8 @@ def _source(module: ModuleType, variable: str, file: Path) -> ConfigModule:
     return ConfigModule(name, variable, file, root, vars(module))
 
 
-def locate(source: ConfigModule) -> Any:
-    """Make a function that finds the file or folder that an option names, and returns None if there is none.
+def locate(source: ConfigModule) -> Locate:
+    """Make a function that finds the files and folders that options name.
 
     It looks in the current folder, in the folder of the experiment's file, and in the four folders above that one.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,14 @@ from trial.interactive_gym.configuration_constants import PolicyTypes
 from trial.interactive_gym.looking import Look
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
+from trial.interactive_gym.sources import Locate
 from trial.policies import onnx
 from trial.policies.policy import PolicyError
 
 _LONGEST = 300  # characters of an error
 
 
-def try_policies(config: RemoteConfig, look: Look, find: Callable[[Any], Path | None], root: Path) -> Iterator[str]:
+def try_policies(config: RemoteConfig, look: Look, find: Locate, root: Path) -> Iterator[str]:
     """Try each player's policy with that player's first observation. Yield a sentence if policies cannot be tried.
 
     `find` finds a file that an option names, `root` is the folder of the experiment's modules. Raises Unplayable if a
@@ -56,9 +57,7 @@ def _try_file(player: Any, file: Path, look: Look) -> None:
         raise Unplayable(f"the policy of {player} does not fit: {error}") from error
 
 
-def _try_functions(
-    config: RemoteConfig, player: Any, look: Look, find: Callable[[Any], Path | None], root: Path
-) -> None:
+def _try_functions(config: RemoteConfig, player: Any, look: Look, find: Locate, root: Path) -> None:
     """Make a policy of the experiment's functions, as a server does, and ask it for one action. Raises Unplayable."""
 
     def locate(name: Any) -> Any:
