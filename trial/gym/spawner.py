@@ -147,7 +147,8 @@ class Spawner:
             if pid:
                 self._ended(pid, status)
                 continue
-            strays = self._strays()
+            # A process whose worker has ended is a child of this process.
+            strays = [child for child in linux.children(os.getpid()) if child not in self._workers]
             if not strays:
                 return
             for stray in strays:
@@ -165,11 +166,6 @@ class Spawner:
         if ended.verdict is None and status != 0:
             code, sentence = _FAILED, f"The environment ended its process ({_how(status)})."
         self._tell(ended.number, code, sentence)
-
-    def _strays(self) -> list[int]:
-        """Return the ids of processes whose worker has ended: they are children of the spawner now."""
-        children = linux.children(os.getpid())
-        return [pid for pid in children if pid not in self._workers]
 
     def _watch(self, now: float) -> None:
         """Interrupt or kill workers that are beyond a limit."""

@@ -114,7 +114,6 @@ OPTIONS: tuple[Option, ...] = (
 )  # fmt: skip
 
 BY_NAME = {option.name: option for option in OPTIONS}
-METHODS = tuple(dict.fromkeys(option.method for option in OPTIONS if option.method))
 
 
 def of_method(method: str) -> tuple[str, ...]:
