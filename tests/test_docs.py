@@ -146,6 +146,7 @@ def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
     from trial.agent.agent import AgentAdapter
+    from trial.agent.starting import start
 
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
     names = ("noop", "up", "right", "down", "left")
@@ -155,7 +156,7 @@ def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None
         import gymnasium
 
         gymnasium.register_envs(ale_py)
-    player.start()
+    start(player)
     player.reset(1)
     for action in range(5):
         outcome = player.step(action)

@@ -203,11 +203,6 @@ class AgentAdapter:
         return sys.modules.get("agent") if (self._folder / "agent.py").is_file() else None
 
     def start(self) -> None:
-        """Load the agent, call its `start` and set `action_space`. Raises as `begin` and `name_actions` do."""
-        self.begin()
-        self.name_actions()
-
-    def begin(self) -> None:
         """Load the agent and call its `start`.
 
         Raises AgentError if the agent lacks a method or a method cannot be called, and whatever its own code raises.

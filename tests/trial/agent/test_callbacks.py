@@ -17,6 +17,7 @@ from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
 from trial.agent.callbacks import MOST_VALUES, Callbacks, Session, TrialFacts, listening
+from trial.agent.starting import start
 from trial.recordings import recording
 
 FACTS = TrialFacts("trial-1", "3", 1)
@@ -468,7 +469,7 @@ def test_the_callbacks_of_the_documentation_run(tmp_path):
     text = (Path(__file__).parents[3] / "docs/callbacks.md").read_text()
     (tmp_path / "agent.py").write_text(text.split("```python\n")[1].split("```")[0])
     agent = AgentAdapter(tmp_path, "CartPole-v1", None)
-    agent.start()
+    start(agent)
     callbacks, raised = callbacks_of(agent._agent)
     first, info, _ = agent.reset(1)
     callbacks.episode_began(1, {"player_0": first}, {"player_0": info})

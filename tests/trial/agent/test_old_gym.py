@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from trial.agent.agent import AgentAdapter
+from trial.agent.starting import start
 
 OLD_GYM = Path(__file__).parents[3] / "trial/agent/old_gym"
 
@@ -336,7 +337,7 @@ class Agent():
 def test_an_agent_like_hippos_sample_plays(tmp_path: Path) -> None:
     (tmp_path / "agent.py").write_text(SAMPLE)
     player = AgentAdapter(tmp_path, "MsPacman-v0", None)
-    player.start()
+    start(player)
     assert player.action_space[:2] == ("noop", "up")
     player.reset(1)
     result = player.step(0)

@@ -16,6 +16,7 @@ import pytest
 from trial.agent import signatures
 from trial.agent.agent import AgentAdapter, AgentError, read_step_result
 from trial.agent.calls import AgentCalls
+from trial.agent.starting import start
 from trial.core.actions import Action
 from trial.core.effects import StepCall
 from trial.core.players import PLAYER
@@ -51,7 +52,7 @@ def adapter(folder: Path, source: str, **names: Any) -> AgentAdapter:
 def started_agent(folder: Path, old: str = "", new: str = "", source: str = AGENT) -> AgentAdapter:
     assert old in source
     player = adapter(folder, source.replace(old, new))
-    player.start()
+    start(player)
     return player
 
 
@@ -146,7 +147,7 @@ def close(env):
 def test_functions_without_all_five_names_are_no_agent(tmp_path: Path) -> None:
     player = adapter(tmp_path, "def start(game): pass\ndef step(env, action): pass\n")
     with pytest.raises(AgentError, match=r"no class Agent, and of its functions no render, reset, close"):
-        player.start()
+        start(player)
 
 
 @pytest.mark.parametrize(
