@@ -14,10 +14,10 @@ from hippodrome.model.step_order import ordered
 from protocol.values import is_blank, number_in, path_text, printable, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
-_OF_HIPPO = frozenset(
+_KNOWN_TO_HIPPO = frozenset(
     {"id", "name", "researcher", "teamMembers", "live", "maxRuntime", "useAWS", "awsSetup", "events", "ssl", "steps"}
 )
-_ONLY_HERE = sorted(NAMES["project",] - _OF_HIPPO)
+_UNKNOWN_TO_HIPPO = sorted(NAMES["project",] - _KNOWN_TO_HIPPO)
 """The keys of `project` that HIPPO's script does not know, so a registration by it keeps their earlier values."""
 _LONGEST_SHOWN = 300  # characters of such a value in a remark
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"
@@ -85,7 +85,7 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
     defaults = ProjectKeys().model_dump(mode="json", by_alias=True)
-    kept = {key: earlier[key] for key in _ONLY_HERE if key not in project and key in earlier}
+    kept = {key: earlier[key] for key in _UNKNOWN_TO_HIPPO if key not in project and key in earlier}
     kept = {key: value for key, value in kept.items() if value != defaults[key]}
     remarks += [
         f"project.{key}: {printable(json.dumps(value), _LONGEST_SHOWN)} {_STAYS}" for key, value in kept.items()
