@@ -52,12 +52,6 @@ class Import(NamedTuple):
     module: str
 
 
-def may_run_on_aws(config: Config) -> bool:
-    """Return whether the study may run on AWS: it has `useAWS: true`, or no useAWS, but a `cpu` in awsSetup."""
-    project = config.project
-    return project.use_aws or (not project.given("useAWS") and project.aws_setup.given("cpu"))
-
-
 def missing(folder: Path) -> list[Diagnostic]:
     """Return a mistake for each package that a file imports and the image lacks, at its first import in the file.
 

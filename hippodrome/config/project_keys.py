@@ -334,6 +334,11 @@ class ProjectKeys(Model):
         return self.given("useAWS") and not self.use_aws
 
     @property
+    def may_run_on_aws(self) -> bool:
+        """Whether the study may run on AWS: it has `useAWS: true`, or no useAWS, but a `cpu` in awsSetup."""
+        return self.use_aws or (not self.given("useAWS") and self.aws_setup.given("cpu"))
+
+    @property
     def has_sessions(self) -> bool:
         """Whether several participants share a server."""
         return self.players > 1

@@ -36,7 +36,7 @@ def main(
     label = agent_file.label_of(folder)
     readable = not any(problem.file == label for problem in _mistakes(found))
     playable = config is not None and bool(config.game_steps) and readable
-    if playable and config and agent_imports.may_run_on_aws(config):
+    if playable and config and config.project.may_run_on_aws:
         lacking = [*agent_imports.missing(folder), *agent_imports.missing_for_players(folder, config)]
         found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
     _print(found)

@@ -215,7 +215,7 @@ class AgentReport:
 
     def _not_on_aws(self) -> list[Diagnostic]:
         """Remarks on packages that were loaded here and that servers on AWS lack."""
-        if not agent_imports.may_run_on_aws(self._config):
+        if not self._config.project.may_run_on_aws:
             return []
         found = agent_imports.missing_of_loaded(self._folder, self._config, self._report.get("loaded", ()))
         return [self._at((self._label or AGENT, None), message, remark=True) for message in found]

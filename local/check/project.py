@@ -17,7 +17,7 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
     """
     plays = config is None or bool(config.game_steps)
     found = remarks.remarks_on(folder, config) if config else []
-    if config and plays and agent_imports.may_run_on_aws(config):
+    if config and plays and config.project.may_run_on_aws:
         found += agent_imports.requirement_remarks(folder)
     if config:
         found += check_sessions(folder, config)
