@@ -176,7 +176,7 @@ class _Reader(PageParser):
 
 @dataclass
 class _Fieldset:
-    """An open fieldset. If it is disabled, so are its controls, except those in its first legend."""
+    """An open fieldset. If it is disabled, so are its controls, except for controls in its first legend."""
 
     disabled: bool
     legends: int = 0

@@ -175,7 +175,7 @@ class GameConnection:
         """Whether the bot presses the button that begins the game or goes on."""
         if self._state == "break":
             by_itself = "nextIn" in message  # otherwise the break shows a page with a button
-            # If a break ends by itself, every second bot waits for its end.
+            # If the break ends without the button, every second bot waits for that.
             if not by_itself or self._random.random() < 0.5:
                 return True
         if "people" not in message:

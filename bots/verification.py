@@ -77,7 +77,7 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 class Verification:
     """What was found in the data of what bots sent and played, and what is missing."""
 
-    answers: int = 0  # of pages, found as they were sent
+    answers: int = 0  # to pages, stored exactly as the bots sent them
     answers_sent: int = 0
     games: int = 0  # answers of games found
     games_played: int = 0
@@ -129,7 +129,7 @@ def verify(
 
 
 def _look_at_answers(found: Verification, report: BotReport, folder: Path) -> None:
-    """Compare the stored answers to pages with those that the bot has sent."""
+    """Compare the stored answers to pages with the answers that the bot has sent."""
     for step, sent in report.answers.items():
         found.answers_sent += 1
         if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
@@ -162,7 +162,7 @@ def _look_at_plays(
 
 
 def _recordings(trials: Path, read: dict[Path, list[StoredRecording]]) -> list[StoredRecording]:
-    """The recordings in this folder, read once: several bots share those of a session."""
+    """The recordings in this folder. Each is read once, though several bots share the recordings of a session."""
     if trials not in read:
         read[trials] = [read_recording(path) for path in sorted(trials.glob("*/*.gz"))]
     return read[trials]

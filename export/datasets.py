@@ -59,7 +59,7 @@ class Dataset:
 def build(folder: Path, state: ExportState, project: str, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
     """Make `folder/minari` anew from the converted recordings, and return a summary of each dataset.
 
-    `progress` is called with the number of recordings, and the number of those that are done. Raises OSError.
+    `progress` is called with the number of recordings, and how many of them are done. Raises OSError.
     """
     import minari
 

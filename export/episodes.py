@@ -103,7 +103,7 @@ def until_end_of(rows: list[dict[str, Any]], human: str) -> list[dict[str, Any]]
 
 
 def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a human in a row, by the names of the columns, which have those of the first human."""
+    """The values of a human in a row, by the names of the columns; the row itself has the first human's values."""
     part = _part(row, human)
     idle = header.get("idleActions")
     action = part.get("action")

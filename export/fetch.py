@@ -44,8 +44,8 @@ class Work:
 
 
 class Fetcher:
-    """Fetches and converts files with several workers. `progress` is called with the number of listed files, and the
-    number of those that are done. `damaged` are paths in the folder whose files have changed or are missing."""
+    """Fetches and converts files with several workers. `progress` is called with the number of listed files, and how
+    many of them are done. `damaged` are paths in the folder whose files have changed or are missing."""
 
     def __init__(
         self,
@@ -120,8 +120,8 @@ class Fetcher:
         pool.shutdown()
 
     def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
-        """The work for a unit. For a session it is first the session's document, and then, when its members are
-        `known`, the other files."""
+        """The work for a unit. A session has two: first its document alone; its other files once its members are
+        `known`."""
         owner: ExportedParticipant | Members | None = known
         then = None
         if unit.is_session and known is None:
@@ -256,7 +256,7 @@ def _folder(owner: ExportedParticipant | Members) -> str:
 
 
 def forget_gone(state: ExportState, folder: Path) -> int:
-    """Remove the files that the source does not have any more, such as those of an erased participant, and return how
+    """Remove the files that the source does not have any more, such as the files of an erased participant; return how
     many there were."""
     count = 0
     with state.in_transactions():

@@ -67,7 +67,7 @@ class Tally:
 
 
 def lines(source: Source, project: str, state: ExportState) -> Iterator[Listed]:
-    """Yield the listing of all participants' files, then that of the sessions' files, if the study has sessions."""
+    """Yield all participants' files, then the sessions' files, if the study has sessions."""
     found = state.has_sessions()
     for line in source.list(keys.prefix(project)):
         found = found or _is_session(line.key)
@@ -77,7 +77,7 @@ def lines(source: Source, project: str, state: ExportState) -> Iterator[Listed]:
 
 
 def members(state: ExportState, session: str) -> Members:
-    """Return the members of a session, as far as the state has its document and its participants."""
+    """Return those members of a session who are in the state; none if the state lacks the session's document."""
     version = next((known.version for key, known in state.files_of(session).items() if _is_session(key)), "")
     if not version:
         return Members(session)
@@ -119,7 +119,7 @@ def choose(
 ) -> tuple[list[Item], list[str]]:
     """Return the files of a unit that have to be fetched, and the keys of its other files. Counts them in `tally`.
 
-    `damaged` are paths in the folder whose files have changed or are missing. `mark` is that of a session's members.
+    `damaged` are paths in the folder whose files have changed or are missing. `mark`: see `Members`.
     """
     known = state.files_of(unit.user)
     fetch, unchanged = [], []

@@ -29,7 +29,7 @@ class FieldKind(StrEnum):
 def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str], FieldKind]:
     """Return the kinds of the fields in the study's pages, by step and name, in the order of the pages.
 
-    A field whose kind differs between the pages of its step (those of groups) has the kind TEXT. Pages that cannot be
+    A field whose kind differs between its step's pages for groups has the kind TEXT. Pages that cannot be
     read are left out.
     """
     found: dict[tuple[str, str], set[FieldKind]] = {}

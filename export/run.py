@@ -1,4 +1,4 @@
-"""A run of `make data`: fetches files, removes those that are gone, and writes tables, datasets and the manifest."""
+"""A run of `make data`: fetches new files, removes what the source has lost, and writes all tables and the manifest."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def _datasets(folder: Path, state: ExportState, project_id: str, options: Option
 
 
 def _sound_minari(folder: Path) -> bool:
-    """Whether the datasets' files are those of the last manifest."""
+    """Whether the datasets' files are as the last manifest lists them."""
     try:
         last = manifest.read(folder)
     except Problem:

@@ -47,7 +47,7 @@ class Source(Protocol):
         """A text that differs between all sources: for a folder, it has the path."""
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """Yield all files whose keys begin with `prefix`; those of one participant stand together."""
+        """Yield all files whose keys begin with `prefix`; the files of one participant stand together."""
 
     def read(self, key: str, most: int) -> bytes:
         """Return a document. Raises FileGone, and TooLarge if it has more than `most` bytes."""

@@ -214,7 +214,7 @@ class ExportState:
             self._db.execute("COMMIT")
 
     def save(self, user: str, unchanged: Iterable[str], fetched: Iterable[SourceFile]) -> None:
-        """Save the fetched files of a participant or session, and that the source still has those in `unchanged`."""
+        """Save the fetched files of a participant or session, and that the source still has the keys in `unchanged`."""
         run = self.run
         if user:
             self._db.execute("UPDATE participants SET seen=? WHERE user=?", (run, user))
@@ -314,9 +314,10 @@ class ExportState:
             yield participant, found
 
     def episodes(self) -> Iterator[tuple[ExportedParticipant | None, str, Mapping[str, Any]]]:
-        """Yield each episode after its participant and its file: first those of sessions, then by number and file.
+        """Yield the participant, the file and the facts of each episode, in the order of numbers and files.
 
-        A session's episode has None for the participant. It has `session`, and in `people` the numbers by player.
+        The episodes of sessions come first, with None for the participant. Their facts have `session`, and in `people`
+        the participants' numbers by player.
         """
         rows = self._db.execute(
             "SELECT p.user, p.number, p.folder, p.document, p.membership, f.path, e.document FROM files f"

@@ -132,8 +132,8 @@ _FROM_TEXT: Mapping[str, Callable[[str], Any]] = {"whole": int, "number": float}
 
 
 def fit(value: Any, kind: str) -> Any:
-    """Return a value for a column of this type. Texts that are numbers stay texts: in CSV they stand as they were sent,
-    and for Parquet `_typed` converts them."""
+    """Return a value for a column of this type. Texts that are numbers stay texts: CSV has what was sent, and for
+    Parquet `_typed` converts them."""
     if kind == "texts":
         return [clean(item) for item in (value if isinstance(value, list) else [value])]
     if kind == "text":

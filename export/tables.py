@@ -1,4 +1,4 @@
-"""Makes the tables of episodes, callbacks, presence, identities and problems. (`answers.py` makes those of answers.)
+"""Makes all tables but those of answers (`answers.py`): episodes, callbacks, presence, identities and problems.
 
 All rows are read one at a time, so that memory does not grow with the study.
 """
@@ -140,7 +140,7 @@ def callback_columns(in_sessions: bool) -> list[Column]:
 def callbacks(state: ExportState, folder: Path, in_sessions: bool) -> Iterator[list[Any]]:
     """Yield a row per line that a callback of the agent has recorded. `folder` holds the converted recordings.
 
-    In a session, the row's participant is the one whose player the line names, if it names one.
+    If the line names a player of a session, the row's participant is the one who plays this player.
     """
     for participant, first, path, row in _lines(state, folder, "callbacks", ("callback",)):
         other = _other_fields(row)

@@ -16,8 +16,8 @@ def user_ids(
 ) -> list[str]:
     """Return an id for each of the `players`, such that `matching` by groups lets them play together.
 
-    With `group` all ids belong to one group; with `mixed` they belong to different groups, as far as there are enough.
-    `new` makes an id from a number. If `MOST_TRIED` of them do not suffice, there are fewer ids than players.
+    With `group` all ids belong to one group. With `mixed` each belongs to the next group, and after the last group
+    comes the first again. `new` makes an id from a number. If `MOST_TRIED` ids do not suffice, the result is shorter.
     """
     made = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):

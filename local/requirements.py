@@ -21,9 +21,9 @@ OF_THE_IMAGE = ROOT / "requirements" / "trial.txt"
 
 
 def wanted(folder: Path) -> Path | None:
-    """Return the project's `requirements.txt`; None if there is none, or if it is that of a clone of HIPPO Gym.
+    """Return the project's `requirements.txt`; None if there is none, or if the project is a clone of HIPPO Gym.
 
-    HIPPO Gym's own file names versions for Python 3.7, which cannot be installed (docs/hippo.md).
+    The clone's file names versions for Python 3.7, which cannot be installed (docs/hippo.md).
     """
     try:
         found = layout.find(folder)

@@ -159,7 +159,7 @@ class _Queue:
         return []
 
     def _deliver(self, batch: Sequence[_QueuedMessage]) -> None:
-        """Call the function with these messages; remove those that succeeded, and deliver the others again later."""
+        """Call the function with these messages; remove each that succeeded, and deliver the others again later."""
         batch = [queued for queued in batch if self._count(queued)]
         if not batch:
             return

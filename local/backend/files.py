@@ -32,7 +32,7 @@ def read_json(path: Path) -> Any:
 
 
 def names(folder: Path, suffix: str = "") -> list[str]:
-    """Return the sorted names in a folder that end with `suffix`, without those of unfinished files. Raises OSError.
+    """Return the sorted names in a folder that end with `suffix`, without unfinished files. Raises OSError.
 
     `Path.glob` would take a folder that cannot be read for an empty one.
     """

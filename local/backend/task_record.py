@@ -78,7 +78,7 @@ class TaskFolder:
         files.write_json(self.file(task.name), _to_json(task), durable=task.version == 0)
 
     def load(self) -> Iterator[TaskRecord]:
-        """Read the records; those that cannot be parsed are left out. Raises OSError."""
+        """Yield the records. A record that cannot be parsed is left out. Raises OSError."""
         for name in files.names(self.path, ".json"):
             try:
                 yield _from_json(files.read_json(self.path / name))

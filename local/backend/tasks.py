@@ -141,7 +141,7 @@ class ProcessTasks:
     # What local mode calls beside the port
 
     def start(self) -> None:
-        """Take over the servers of an earlier process: follow those that still run, and send the others' last events.
+        """Take over the servers of an earlier process: follow each that runs, and send the last events of the others.
 
         Raises OSError; it may then be called again.
         """

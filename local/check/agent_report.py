@@ -221,7 +221,7 @@ class AgentReport:
         return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:
-        """The mistake for which the agent did not play to the end; if it did, those in the number of actions."""
+        """The mistake for which the agent did not play to the end; if it did, mistakes in the number of actions."""
         report, call = self._report, self._call()
         if report.get("over") or report.get("foreign"):
             return self._actions()
@@ -282,7 +282,7 @@ class AgentReport:
         return called[1] if called else None
 
     def _callbacks(self) -> list[Diagnostic]:
-        """Mistakes in callbacks that raised, and a remark on one that took too long. Neither ends the game."""
+        """Mistakes: callbacks that raised. A remark on a callback that took too long. Neither ends the game."""
         callbacks = self._report.get("callbacks") or {}
         found = []
         for error in callbacks.get("errors", ()):
@@ -337,7 +337,7 @@ class AgentReport:
         return [self._in_config(("trial", "actionSpace"), message, remark=names < count)]
 
     def _arrows(self) -> list[Diagnostic]:
-        """Remarks on arrows of `ui` and keys that do nothing, as far as the environment names its actions."""
+        """Remarks on arrows of `ui` and keys that do nothing; none if the names of the actions are not known."""
         names, source = self._report.get("actions", ()), read_source(self._folder)
         if not names:
             return []

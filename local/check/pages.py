@@ -1,4 +1,4 @@
-"""Checks step pages, each by itself and all together."""
+"""Checks step pages: the text of each, and where the study shows it."""
 
 from __future__ import annotations
 

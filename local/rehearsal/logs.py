@@ -43,7 +43,7 @@ class FunctionLog:
         self._size = self._log.stat().st_size if self._log.is_file() else 0
 
     def warnings(self) -> list[str]:
-        """Return the warnings and errors that are new, a line each, as often as they were logged."""
+        """Return the new warnings and errors: a line for each time that one was logged."""
         found = []
         try:
             lines = self._log.read_bytes()[self._size :].splitlines()

@@ -36,9 +36,9 @@ def report(
 ) -> bool:
     """Print the table and what went wrong; return whether everything is as it should be.
 
-    `recorded`: whether the study keeps recordings. `live`: whether participants get in. `warnings` are those of the
-    functions' log, `crashes` the errors of agent.py. `found` is None if the folder of the data is not known, and `left`
-    is None if nobody looked for servers that are left over.
+    `recorded`: whether the study keeps recordings. `live`: whether participants get in. `warnings` come from the
+    functions' log; `crashes` are the errors of agent.py. `found` is None if the folder of the data is not known, and
+    `left` is None if nobody looked for servers that are left over.
     """
     table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")
     for name, value in [

@@ -137,7 +137,7 @@ class StudyProcess:
 def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
     """Return the server processes of a data folder, which are found by their environment.
 
-    With `users`, return only those whose owner is one of these: a participant's id, or a session's.
+    With `users`, return only servers of these owners: ids of participants and sessions.
     """
     store = str(data.resolve())
     found = []
@@ -238,7 +238,7 @@ def sessions_not_open(data: Path, project_id: str) -> set[str]:
 def open_records(data: Path, users: Collection[str] | None) -> list[str]:
     """Return the labels of the servers whose records are not closed.
 
-    With `users`, return only those whose owner is one of these: a participant's id, or a session's.
+    With `users`, return only servers of these owners: ids of participants and sessions.
     """
     records = ((path.stem, document(path)) for path in sorted((data / "_servers").glob("*.json")))
     return [
@@ -254,7 +254,7 @@ class Leftovers:
 
     processes: int = 0
     records: list[str] = field(default_factory=list)
-    local_mode_killed: bool = False  # because it did not end by itself
+    local_mode_killed: bool = False  # since Ctrl-C did not end it
 
     def words(self) -> list[str]:
         """Return lines that say what is left over; none if nothing is."""

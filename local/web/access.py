@@ -49,7 +49,7 @@ def refusal(
 
 
 def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: Collection[str]) -> dict[str, str]:
-    """Return the headers to send with a response. `sent` are those that the function has returned.
+    """Return the headers to send with a response. `sent` are the headers that the function has returned.
 
     On AWS any origin may read responses, since only participants have their links. Here a study's id suffices, so only
     `origins` get the CORS headers. Pages of this server may send each other a referrer: without that, browsers send

@@ -43,7 +43,7 @@ class App:
         await send({"type": "http.response.body", "body": body})
 
     def close(self) -> None:
-        """Call no more functions; those that run end by themselves."""
+        """Call no more functions. Functions that run now go on to their end."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _answer(self, scope: Scope, receive: Receive) -> GatewayResponse | None:
@@ -110,7 +110,7 @@ def _message(status: int, text: str) -> GatewayResponse:
 
 
 def _nothing_here(method: str, accept: str) -> GatewayResponse:
-    """The answer for a path without a route: that of API Gateway, or a page if a browser asks for one."""
+    """The answer for a path without a route: a page for browsers, and API Gateway's answer for programs."""
     if method not in ("GET", "HEAD") or "text/html" not in accept:
         return _message(404, "Not Found")
     text = "Please open your study link again. It looks like /next?projectId=…"

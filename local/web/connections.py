@@ -26,8 +26,8 @@ def most() -> int:
 class HttpConnection(H11Protocol):
     """uvicorn's connection, which is closed when its client is too slow.
 
-    If there are more connections than `most`, the one that has waited longest for a request is closed. If all of them
-    are being answered, the newest is closed.
+    If there are more connections than `most` allows, this closes the connection that has waited longest for a request;
+    if all others have a request that is being answered, it closes the newest.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -38,7 +38,7 @@ class HttpConnection(H11Protocol):
         self._arm(HEADER_SECONDS)
         if len(self.connections) > most():
             waiting = [each for each in self.connections if isinstance(each, HttpConnection) and not each.answering]
-            oldest = min(waiting, key=lambda each: each._since, default=self)
+            oldest = min(waiting, key=lambda each: each._since)  # `waiting` has at least this connection
             self.connections.discard(oldest)  # `connection_lost` is called only later
             oldest.transport.abort()
 
