@@ -32,9 +32,9 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
     A field whose kind differs between its step's pages for groups has the kind TEXT. Pages that cannot be
     read are left out.
     """
-    found: dict[tuple[str, str], set[FieldKind]] = {}
     if project is None:
         return {}
+    found: dict[tuple[str, str], set[FieldKind]] = {}
     for step in project.steps:
         for file in step.files:
             for name, kind in fields_of(_page(source, project.page_key(file))).items():

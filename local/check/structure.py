@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -169,11 +170,10 @@ class _Reader(PageParser):
             ):
                 return radio
             for place in ("fieldset", "row"):
-                here, there = getattr(radio, place), {getattr(each, place) for each in before}
-                if here and here not in there and sum(getattr(each, place) == here for each in same) > 1:
-                    counts = [sum(getattr(each, place) == one for each in before) for one in there if one]
-                    if any(count > 1 for count in counts):
-                        return radio
+                here, earlier = getattr(radio, place), Counter(getattr(each, place) for each in before)
+                begins = here and here not in earlier and sum(getattr(each, place) == here for each in same) > 1
+                if begins and any(count > 1 for one, count in earlier.items() if one):
+                    return radio
         return None
 
     def open_tags(self) -> Iterator[Diagnostic]:
