@@ -37,7 +37,9 @@ _ATTRIBUTE = re.compile(
 )
 _ABSOLUTE = re.compile(r"/|#|\?|\ue000|[a-zA-Z][a-zA-Z0-9+.-]*:|\Z")
 _SRCSET = re.compile(r"(\A\s*|,\s+)(\S+)")
-_ORIGIN = re.compile(r"\s*(https?://[^/\s?#\\]+)", re.IGNORECASE)
+_IGNORED = re.compile(r"\A[\0- ]+|[\t\r\n]")
+_NAMES_HOST = re.compile(r"//|https?:", re.IGNORECASE)
+_ORIGIN = re.compile(r"https?://[^/\s?#]+", re.IGNORECASE)
 
 _RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # no tags inside
 _DROPPED = frozenset({"html", "head", "body", "form", "meta", "base"})
@@ -212,10 +214,11 @@ class _Preparation:
 
     def _may_run(self, address: str) -> bool:
         """Whether a script is the researcher's: in the page, among the project's files, or on a host in `hosts`."""
-        origin = _ORIGIN.match(address)
-        if origin:
-            return origin[1].lower() in self._hosts
-        return not address.strip().replace("\\", "/").startswith("//") and "\ue000" not in address
+        plain = _IGNORED.sub("", address).replace("\\", "/")  # as browsers read an address
+        if _NAMES_HOST.match(plain):
+            origin = _ORIGIN.match(plain)
+            return origin is not None and origin[0].lower() in self._hosts
+        return "\ue000" not in address
 
     def _address(self, name: str, found: re.Match[str]) -> str:
         attribute, value = found["name"].lower(), found["value"]

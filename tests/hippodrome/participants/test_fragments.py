@@ -195,6 +195,15 @@ def test_scripts_of_other_hosts_get_the_nonce_only_if_the_project_allows_the_hos
     assert ["nonce" in each.named("script")[0] for each in found] == [True, False, False, False]
 
 
+@pytest.mark.parametrize(
+    "address",
+    ["/\t/bad.example/a.js", "\n//bad.example/a.js", "https:///bad.example/a.js", "HTTPS:\\\\bad.example/a.js"],
+)
+def test_an_address_that_browsers_read_as_another_host_gets_no_nonce(address: str) -> None:
+    (script,) = Tags(prepare(f'<script src="{address}"></script>', BASE).render({}, "N")).named("script")
+    assert "nonce" not in script
+
+
 def test_an_authors_nonce_has_no_effect() -> None:
     assert prepare('<script nonce="old">1</script>').render({}, "N").startswith('<script nonce="N" nonce="old">')
 
