@@ -211,15 +211,9 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         bar = progress.add_task("Reading the records of servers", total=None)
         every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
     sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}
-    by_project = {
-        one.id: spent([r for r in every if r.project_id == one.id], prices, at, sizes)
-        for one in projects
-        if project or any(r.project_id == one.id for r in every)
-    }
-    waited = {
-        name: spent([r for r in every if r.project_id == name and r.is_warm_server], prices, at, sizes)
-        for name in by_project
-    }
+    owned = {one.id: [r for r in every if r.project_id == one.id] for one in projects}
+    by_project = {name: spent(found, prices, at, sizes) for name, found in owned.items() if project or found}
+    waited = {name: spent([r for r in owned[name] if r.is_warm_server], prices, at, sizes) for name in by_project}
     now_warm = [
         warm(one.id, one.warm_servers, one.size.cpu, one.size.memory, prices)
         for one in projects

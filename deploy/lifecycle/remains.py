@@ -16,7 +16,7 @@ from deploy.lifecycle.removal import FoundInstallation, Removal
 from deploy.stack import acm_records, inventory, retained_bucket
 from deploy.stack.acm_records import Validation
 from deploy.stack.inventory import ListedResource
-from deploy.stack.listings import KINDS
+from deploy.stack.listings import LISTINGS
 
 LISTED = 180
 """The seconds for which AWS may still list deleted resources: a queue for up to 60 (SQS API reference, DeleteQueue), a
@@ -117,10 +117,11 @@ class Remains:
         rows = [*self._rows()]
         if rows:
             screen.table(["what", "left", "a month", ""], rows)
-        removed_kinds = {KINDS.get(one.type, "") for one in self.remembered} - {"", *(one.kind for one in self.left)}
+        kinds = {LISTINGS[one.type].kind for one in self.remembered if one.type in LISTINGS}
+        removed_kinds = kinds - {one.kind for one in self.left}
         if removed_kinds:
-            kinds = count(len(removed_kinds), "other kind" if rows else "kind")
-            screen.result(f"{kinds} of things looked at: nothing left.")
+            number = count(len(removed_kinds), "other kind" if rows else "kind")
+            screen.result(f"{number} of things looked at: nothing left.")
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
         for kind in sorted({one.kind for one in self.left}):

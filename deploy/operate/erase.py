@@ -63,14 +63,14 @@ def command(
     projects = _projects(account, installation) if everywhere else [project_id(project)]
     erasers = [Eraser(account, installation, name, user) for name in projects]
     found = {eraser.project: eraser.look() for eraser in erasers}
-    if not everywhere and not any(found.values()):
+    concerned = [name for name, one in found.items() if one]
+    if not everywhere and not concerned:
         _must_be_known(projects[0], _projects(account, installation), stack)
     if not json or dry_run:
         _show(found, json, dry_run)
     if dry_run:
-        return Exit.CHANGES if any(found.values()) else Exit.DONE
-    if any(found.values()):
-        concerned = [name for name, one in found.items() if one]
+        return Exit.CHANGES if concerned else Exit.DONE
+    if concerned:
         screen.confirm(f"Erase this participant for good from {', '.join(concerned)}?", yes)
     began, whole = datetime.now(UTC), False
     target = receipt or _new_receipt(began)
@@ -87,7 +87,7 @@ def command(
     if json:
         screen.result_json(made)
     _warn_of_unreadable(erasers)
-    if any(found.values()):
+    if concerned:
         screen.success(f"Everything is gone. The receipt: {target}")
         screen.info("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
     else:

@@ -92,8 +92,10 @@ def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
             f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
             "the count begins anew, and with it the hours of maxServerHours.",
         )
-    for key in sorted(entry.key for entry in documents.list(limits.participant_slots_folder(project.id))):
-        if project.max_participants is not None and not _is_readable(documents, key, ParticipantSlots):
+    limited = project.max_participants is not None
+    slots = documents.list(limits.participant_slots_folder(project.id)) if limited else ()
+    for key in sorted(entry.key for entry in slots):
+        if not _is_readable(documents, key, ParticipantSlots):
             yield bad(
                 check,
                 f"{key} cannot be read: some newcomers are not let in.",
