@@ -58,7 +58,10 @@ class Template:
 
     @cached_property
     def body(self) -> Mapping[str, Any]:
-        """The content: `!Ref x` as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}. Raises `Problem`."""
+        """The content: `!Ref x` as {"Ref": x}, `!GetAtt a.b` as {"Fn::GetAtt": ["a", "b"]}.
+
+        Raises `Problem` if the text is not YAML, or has no Resources.
+        """
         try:
             found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:

@@ -73,7 +73,8 @@ def apply(
 ) -> ApplyOutcome:
     """Make the stack, or change it, as template and settings say, and print each step. May be repeated at any time.
 
-    Checks first whether that can succeed, and asks before anything is lost. Raises `Problem`.
+    Checks first whether that can succeed, and asks before anything is lost. Raises `Problem` if a check finds an
+    obstacle, the answer is no, or CloudFormation fails.
     """
     began = time.monotonic()
     Stack(account, stack).settle()

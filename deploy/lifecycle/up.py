@@ -62,9 +62,10 @@ def study_in(folder: Path) -> project_folder.ProjectFolder | None:
 
 
 def certify(account: Account, stack: str) -> Report:
-    """Order the servers' certificate if one is due. Before the first real one, a test certificate is ordered.
+    """Order the servers' certificate if it is due. Before the first real certificate, a test certificate is ordered.
 
-    A certificate that was uploaded by hand stays. One of another authority is renewed there. Raises `Problem`.
+    A certificate that was uploaded by hand stays. A certificate of another authority is renewed there. Raises `Problem`
+    if an order fails.
     """
     installation = find_installation(account, stack)
     certificate_transfer.take_over(account, installation)

@@ -246,7 +246,7 @@ class Eraser:
                 Termination(ServerServices(self._platform)).stop(stops)
 
     def _wait(self) -> None:
-        """Wait until no task is left that could store something; stop tasks that appear. Raises `Problem`."""
+        """Stop tasks that appear, and wait until none is left. Raises `Problem` if one runs after `WAIT` seconds."""
 
         def left() -> list[RunningTask]:
             tasks, draining = self._tasks()

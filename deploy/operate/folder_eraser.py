@@ -171,10 +171,11 @@ def _runs(path: Path, folders: set[str]) -> bool:
 def erase(
     data: Path, project: str, user: str, *, dry_run: bool, confirm: Callable[[int, int], None]
 ) -> tuple[Erased | None, list[str], int]:
-    """Erase, unless `dry_run`, nothing is found or `confirm` raises.
+    """Erase the participant, unless `dry_run`, nothing is found or `confirm` raises.
 
-    Return what was done (None: nothing), the keys of documents that cannot be read, and how many documents were found.
-    Raises `Problem`.
+    `confirm` gets how many files and how many sessions were found. Return what was done (None: nothing), the keys of
+    documents that cannot be read, and how many files and sessions were found. Raises `Problem` if there is no such
+    folder, and as `FolderEraser.run` does.
     """
     if not data.is_dir():
         raise Problem(f"There is no folder {data}.", "Name the data folder of `make run`.")

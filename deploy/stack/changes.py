@@ -85,7 +85,10 @@ def _same_text(stored: str, ours: str) -> bool:
 
 
 def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
-    """Build the functions, read the stack, and determine its parameters. Changes nothing in AWS. Raises `Problem`."""
+    """Build the functions, read the stack, and determine its parameters. Changes nothing in AWS.
+
+    Raises `Problem` if a setting is missing or refused, the functions cannot be built, or the stack is of others.
+    """
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
     source = Template.read()

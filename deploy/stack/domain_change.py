@@ -35,7 +35,7 @@ def moves(prepared: Prepared) -> bool:
 
 
 def check(prepared: Prepared) -> None:
-    """Check that servers may have names in the domain of the new parameters. Raises `Problem`. Changes nothing."""
+    """Raise `Problem` if servers must not have names in the domain of the new parameters. Changes nothing."""
     if not moves(prepared):
         return
     before, after = _before(prepared), servers_domain(prepared.parameters)
@@ -51,7 +51,7 @@ def check(prepared: Prepared) -> None:
 
 
 def check_site(prepared: Prepared) -> None:
-    """Check that no server uses the site's present address, if that changes. Raises `Problem`.
+    """Raise `Problem` if the site's address changes and a server uses the present one.
 
     A server asks the site for a presigned request for each document (`hippodrome/servers/signing.py`). A domain name of
     API Gateway can only be replaced, so CloudFormation deletes the old one.
@@ -67,7 +67,7 @@ def check_site(prepared: Prepared) -> None:
 
 
 def check_network(prepared: Prepared) -> None:
-    """Check that no server runs in the present network, if another one replaces it. Raises `Problem`.
+    """Raise `Problem` if another network replaces the present one and a server runs there.
 
     CloudFormation would delete the route to the Internet that the servers use, and then fail to delete the rest.
     """
@@ -88,7 +88,7 @@ def _refuse(running: Collection[Server], why: str, advice: str) -> None:
 
 
 def certify(prepared: Prepared) -> None:
-    """Obtain a certificate for servers' new names before any server has such a name. Raises `Problem`.
+    """Obtain a certificate for servers' new names before any server has such a name. Raises `Problem` if that fails.
 
     If the present names have no certificate, nothing is ordered here; `certificate` orders one later.
     """

@@ -23,9 +23,9 @@ _WHICH = "`python -m deploy destroy --dry-run` names the buckets that it has kep
 
 
 def open_bucket(account: Account, name: str, project: str) -> Bucket:
-    """Open a bucket that is the account's own and holds data of this project's participants. Raises `Problem`.
+    """Open a bucket that `destroy` has kept. If the list of projects is missing in it, this only warns.
 
-    If the list of projects is missing, this only warns: the answers can be read without it.
+    Raises `Problem` if the bucket is not the account's own, or holds no data of this project's participants.
     """
     _must_be_ours(account, name)
     source, present = Bucket(account.client("s3"), name, account.id), projects(account, name)

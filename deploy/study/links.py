@@ -61,7 +61,7 @@ def command(
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
     """Ask the function that has the secret for signatures. Return them by id, in the order of `users`.
 
-    Raises `Problem`.
+    Raises `Problem` if the function fails, or is too old to sign links.
     """
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
@@ -80,7 +80,7 @@ def link(site: str, project: Project, user_id: str, signature: str) -> str:
 
 
 def _read(file: Path) -> list[str]:
-    """Read the ids in a file, in their order, each once, without empty lines. Raises `Problem`."""
+    """Read the ids in a file, in their order, each once. Raises `Problem` if a line is neither an id nor empty."""
     try:
         text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

@@ -32,7 +32,10 @@ class Changes:
 
 
 def compare(account: Account, bucket: str, project_id: str, folder: Path, more: Iterable[Path] = ()) -> Changes:
-    """Compare folder and bucket. Changes nothing. `more` are pages outside of the folder. Raises `Problem`."""
+    """Compare folder and bucket. Changes nothing. `more` are pages outside of the folder.
+
+    Raises `Problem` if a file is too large, or is a link out of the project folder.
+    """
     prefix = f"{project_id}/steps/"
     files = {prefix + file.name: file for file in [*_files(folder), *more]}
     stored = _listing(account, bucket, prefix)

@@ -158,7 +158,10 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
-    """Register the study, and return what was done, as JSON data. Raises `Problem`."""
+    """Register the study, and return what was done, as JSON data.
+
+    Raises `Problem` if the study cannot be registered, the image cannot be built, or the answer to a question is no.
+    """
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)

@@ -45,9 +45,10 @@ def plan(
     base: str = "",
     trial: Mapping[str, Any] | None = None,
 ) -> ImagePlan:
-    """Compare the project's files with the images in the repository. Changes nothing. Raises `Problem`.
+    """Compare the project's files with the images in the repository. Changes nothing.
 
     `again`: build an image in any case, without layers of earlier ones. `base` and `trial` are as in `make_bundle`.
+    Raises `Problem` as `make_bundle` does, or if the repository is gone.
     """
     bundle = make_bundle(folder, base, trial)
     repository = ImageRepository(account, installation["Repository"])
@@ -59,7 +60,7 @@ def plan(
 
 
 def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
-    """Build the image of the plan unless the repository has it, and return it. Raises `Problem`.
+    """Build the image of the plan unless the repository has it, and return it. Raises `Problem` if that fails.
 
     This machine's Docker builds it. If no Docker answers, or with `on_aws`, CodeBuild does.
     """

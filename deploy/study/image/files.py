@@ -32,9 +32,8 @@ _OF_HIPPO = {"Trials", "fullchain.pem", "privkey.pem", "cert.pem", "private_key.
 def project_files(folder: Path) -> dict[str, Path]:
     """Choose the files for the image. Return them by their paths below agent.py's folder, with slashes.
 
-    Raises `Problem`.
-
-    They come from the project folder; of a clone of HIPPO Gym from its folder App, as in HIPPO's own images.
+    They come from the project folder; of a clone of HIPPO Gym from its folder App, as in HIPPO's own images. Raises
+    `Problem` if a file or link must not go into an image, or the files are too many or too large.
     """
     folder = folder.resolve()
     code = layout.agent_folder(folder)

@@ -55,7 +55,10 @@ class Copy:
         return self._made
 
     def make(self, of: Project) -> int:
-        """Copy the pages of the project `of`, register the copy, and return the number of pages. Raises `Problem`."""
+        """Copy the pages of the project `of`, register the copy, and return the number of pages.
+
+        Raises `Problem` if the installation does not take the registration.
+        """
         documents = self._platform.documents
         for key, name in (pages := page_files(documents, of)).items():
             found = documents.get(key)

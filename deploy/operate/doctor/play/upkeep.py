@@ -61,7 +61,7 @@ class Timer:
         self._scene.platform.bus.publish(Topic.START, to_message(StartServer(self._scene.copy.id, self.user)))
 
     def end(self) -> None:
-        """Check that the timer has ended the server. Raises `CheckFailed`."""
+        """Move the timer, and wait until it has ended the server. Raises `CheckFailed` if it does not."""
         scene, platform = self._scene, self._scene.platform
         record = scene.wait(
             self._ready,
@@ -116,10 +116,7 @@ class Timer:
 
 
 def sweep(scene: RehearsalContext, closed: Server | None) -> None:
-    """Make a timer and a name for a closed server, run the sweep, and check that it removes both.
-
-    Raises `CheckFailed`.
-    """
+    """Make a timer and a name for a closed server, and run the sweep. Raises `CheckFailed` if it leaves one of them."""
     if closed is None or not closed.is_closed:
         raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
     platform = scene.platform
@@ -158,7 +155,7 @@ def _type_of(body: bytes) -> str:
 
 
 def alarm(scene: RehearsalContext) -> None:
-    """Set an alarm to ALARM by hand, check that its topic got a message, and set it back. Raises `CheckFailed`.
+    """Set an alarm to ALARM by hand, and set it back. Raises `CheckFailed` if its topic got no message.
 
     CloudWatch sets an alarm back to its actual state by itself, often within seconds; its actions are in the alarm's
     history (CloudWatch API Reference, SetAlarmState). Whether a mail arrives, only the mailbox's owner can see.
@@ -211,7 +208,10 @@ def _sent_to_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
 
 
 def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
-    """Add the line on how long AWS took for each stage, with the simulation's times beside. Raises `CheckFailed`."""
+    """Add the line on how long AWS took for each stage, beside the simulation's times.
+
+    Raises `CheckFailed` if no server ran.
+    """
     tasks = _tasks(scene, records)
     measured: dict[str, list[float]] = {stage: [] for stage in STAGES}
     for record in records:
