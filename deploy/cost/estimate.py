@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from console.formatting import count
 from deploy.cost.prices import HOURS, Prices, Range, Usd
 
 BENCH_STEPS = 5  # steps of the example study
@@ -246,17 +247,17 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
     ]
 
 
-def _fixed(what: str, count: int, price: float, free: float) -> CostLine:
-    """Return a line for `count` resources, likely within the free tier, which other use may have exhausted."""
-    least = max(0.0, count - free) * price
-    return CostLine(what, f"{count}", Usd(least, least, count * price))
+def _fixed(what: str, number: int, price: float, free: float) -> CostLine:
+    """Return a line for so many resources, of which `free` are free, unless the account uses these already."""
+    least = max(0.0, number - free) * price
+    return CostLine(what, f"{number}", Usd(least, least, number * price))
 
 
 def assumptions(study: StudyToEstimate) -> list[str]:
     """Write the assumptions of the estimate, in sentences."""
     low, likely, high = study.server_minutes
     known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
-    found = [f"{study.participants:,} participants who do all {study.steps} steps."]
+    found = [f"{count(study.participants, 'participant')}, and each does all {study.steps} steps."]
     if study.games:
         whom = f" {study.players}" if study.has_sessions else ""
         found.append(

@@ -93,6 +93,11 @@ def test_the_documentation_states_the_cost_of_an_idle_installation() -> None:
         assert "about two dollars" in (ROOT / page).read_text(encoding="utf-8"), page
 
 
+def test_the_estimate_names_one_participant_in_the_singular() -> None:
+    assert assumptions(MAZE)[0].startswith("100 participants, ")
+    assert assumptions(replace(MAZE, participants=1))[0].startswith("1 participant, ")
+
+
 def test_a_study_without_a_game_needs_no_servers() -> None:
     lines = {line.what: line for line in study_lines(StudyToEstimate(**{**vars(MAZE), "games": False}), Prices())}
     assert not any(what.startswith(("Servers", "Public")) for what in lines)

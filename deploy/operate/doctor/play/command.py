@@ -13,6 +13,7 @@ from typing import Any
 
 from bots.crowd import SIGNALS
 from console import screen
+from console.formatting import count
 from console.problem import Problem
 from deploy.core.finding import Finding, Mark, bad
 from deploy.cost.prices import REGION
@@ -39,9 +40,10 @@ def played(
         raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the transcript.")
     usd = upkeep.estimate(project, bots)
     screen.info(
-        f"{bots} bots and three servers more, about ten minutes, {minutes} at most. It costs about ${usd.likely:.2f}, "
-        f"${usd.high:.2f} at most (list prices of {REGION}). {project.id} itself is not touched: a copy of it is "
-        "registered, and removed at the end. One alarm is set off: its mail says that it is a rehearsal."
+        f"{count(bots, 'bot')} and three servers more, about ten minutes, {minutes} at most. "
+        f"It costs about ${usd.likely:.2f}, ${usd.high:.2f} at most (list prices of {REGION}). "
+        f"{project.id} itself is not touched: a copy of it is registered, and removed at the end. "
+        "One alarm is set off: its mail says that it is a rehearsal."
     )
     screen.confirm("Begin?", yes)
     began = datetime.now(UTC)
