@@ -77,13 +77,12 @@ class Function:
         return packed.getvalue()
 
 
-def functions(target: Target, root: Path = ROOT, wheels: WheelCache | None = None) -> list[Function]:
+def functions(target: Target, root: Path = ROOT) -> list[Function]:
     """Find the functions in `lambdas/` (each module with a `handler`), and collect their files for this target.
 
     Raises `Problem` if an imported package is not pinned or cannot be downloaded.
     """
-    tree = _Tree(root)
-    wheels = wheels or WheelCache(target)
+    tree, wheels = _Tree(root), WheelCache(target)
     return [_function(name, tree, wheels, target.python) for name in tree.handlers()]
 
 

@@ -6,7 +6,7 @@ import contextlib
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -118,13 +118,11 @@ class ChangeSet:
 
 
 @contextlib.contextmanager
-def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = time.sleep) -> Iterator[ChangeSet]:
-    """Upload the template and make a change set.
-
-    After the block, delete the change set, and the empty stack that a first change set makes.
+def change_set(prepared: Prepared, keep: bool) -> Iterator[ChangeSet]:
+    """Upload the template and make a change set. Delete it after the block, with the empty stack of a first one.
 
     With `keep`, for a block that executes the change set, it stays if it has changes and the block raises nothing.
-    Raises `Problem` if CloudFormation refuses it.
+    Raises `Problem` if CloudFormation refuses the change set.
     """
     client = prepared.account.client("cloudformation")
     url = prepared.bucket.put_template(prepared.template.text)
@@ -148,7 +146,7 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
     made = ChangeSet(answer["Id"], answer["StackId"])
     kept = False
     try:
-        made.changes = _wait(client, made, sleep)
+        made.changes = _wait(client, made)
         made.warnings = _findings(client, made, "WARN")
         yield made
         kept = keep and bool(made.changes)
@@ -157,7 +155,7 @@ def change_set(prepared: Prepared, keep: bool, sleep: Callable[[float], None] = 
             _discard(client, made, prepared)
 
 
-def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[dict[str, Any]]:
+def _wait(client: Any, made: ChangeSet) -> list[dict[str, Any]]:
     pause = 0.2
     while True:
         answer = client.describe_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
@@ -171,7 +169,7 @@ def _wait(client: Any, made: ChangeSet, sleep: Callable[[float], None]) -> list[
                 f"CloudFormation cannot make a plan of this: {reason or answer['Status']}",
                 details=_findings(client, made, "FAIL"),
             )
-        sleep(pause)
+        time.sleep(pause)
         pause = min(3.0, pause * 1.5)
     changes = list(answer.get("Changes", ()))
     while answer.get("NextToken"):

@@ -47,9 +47,9 @@ def remaining(account: Account, stack: str) -> float:
     return min(max(left), max(KEPT.values()) + MARGIN)
 
 
-def wait(account: Account, stack: str, executor: Executor | None = None) -> None:
+def wait(account: Account, stack: str) -> None:
     """Wait until the names are free, with a progress bar."""
-    executor = executor or Executor()
+    executor = Executor()
     title = "EventBridge is still deleting the timers of an earlier stack: waiting for that"
     executor.wait(lambda: _group_is_deleting(account, stack), LONGEST, pause=PAUSE, title=title)
     left = round(remaining(account, stack))

@@ -32,6 +32,7 @@ class Resource(NamedTuple):
     physical_id: str
 
 
+MEASURED = 200_000  # versions of a bucket whose sizes are added up
 REMEMBERED = 10  # stacks of one name, deleted ones included, whose resources are listed
 
 
@@ -242,10 +243,10 @@ def service_roles(account: Account) -> list[str]:
     return found
 
 
-def stored(account: Account, bucket: str, most: int = 200_000) -> int:
-    """Return the bytes of all versions in a bucket; only of the first `most` versions if there are more."""
+def stored(account: Account, bucket: str) -> int:
+    """Return the bytes of all versions in a bucket; only of the first `MEASURED` versions if there are more."""
     found = VersionedBucket(account, bucket).versions()
-    return sum(version.size for version in itertools.islice(found, most))
+    return sum(version.size for version in itertools.islice(found, MEASURED))
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:

@@ -195,15 +195,16 @@ def _wanted(context: CheckContext, given: str | None) -> Project | None:
     """Find the registered project with the id or folder `given`. Raises `Problem` if it is not registered."""
     if given is None:
         return None
-    project_id = given
-    if options.is_folder(given):
-        from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
-
-        project_id = project_folder.read(Path(given)).id
     registered = participants.registered_projects(context.platform.documents, [])
-    if options.is_folder(given) and not any(one.id == project_id for one in registered):
+    if not options.is_folder(given):
+        return participants.choose(registered, given)[0]
+    from deploy.core import project_folder  # noqa: PLC0415 - pydantic and YAML
+
+    project_id = project_folder.read(Path(given)).id
+    found = next((one for one in registered if one.id == project_id), None)
+    if found is None:
         raise Problem(f"The project {project_id} is not registered.", f"Run `python -m deploy register {given}`.")
-    return participants.choose(registered, project_id)[0]
+    return found
 
 
 def _rehearse(context: CheckContext) -> list[Finding]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from console import screen
 from console.problem import Problem
@@ -49,10 +49,9 @@ _ADVICE: tuple[tuple[str, str], ...] = (
 
 
 class BuildLog:
-    """The log of a build. `show` gets each line; the last lines are kept."""
+    """The log of a build. It shows each line, and keeps the last lines."""
 
-    def __init__(self, show: Callable[[str], None] | None = None) -> None:
-        self._show = show or (lambda line: screen.info(f"  {line}", style="dim"))
+    def __init__(self) -> None:
         self._last: deque[str] = deque(maxlen=400)
 
     def add(self, text: str) -> None:
@@ -61,7 +60,7 @@ class BuildLog:
             line = _CONTROL.sub("", raw).rstrip()
             if line:
                 self._last.append(line)
-                self._show(line)
+                screen.info(f"  {line}", style="dim")
 
     def failure(self, summary: str, more: Iterable[str] = ()) -> Problem:
         """Return the problem to raise for a failed build, with advice.

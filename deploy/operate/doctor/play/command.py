@@ -48,7 +48,7 @@ def played(
     screen.confirm("Begin?", yes)
     began = datetime.now(UTC)
     with _as_interrupt(), _watched() as progress:
-        play = Play(context, project, bots, progress, minutes=minutes)
+        play = Play(context, project, bots, progress, minutes)
         try:
             play.run()
         finally:

@@ -16,7 +16,7 @@ from deploy.core import explain
 from deploy.core.finding import Mark
 from deploy.operate.doctor import addresses
 from deploy.operate.doctor.check_context import CheckContext, CheckFailed
-from deploy.operate.doctor.play import WITHIN, upkeep
+from deploy.operate.doctor.play import upkeep
 from deploy.operate.doctor.play.copy import Copy, left_behind, remove
 from deploy.operate.doctor.play.scene import RehearsalContext
 from deploy.operate.doctor.play.transcript import LINES, Transcript
@@ -42,9 +42,8 @@ class Play:
         context: CheckContext,
         project: Project,
         bots: int,
-        progress: Callable[[str], None] = lambda _: None,
-        *,
-        minutes: float = WITHIN,
+        progress: Callable[[str], None],
+        minutes: float,
     ) -> None:
         self._context, self._project, self._bots, self._progress = context, project, bots, progress
         self._copy = Copy(context.account, context.installation, context.platform)
@@ -124,7 +123,7 @@ class Play:
         pages = self._copy.make(self._project)
         self.transcript.hide(self._copy.project.salt)
         self._progress("waiting until every function knows the copy")
-        self._scene.sleep((FRESH + timedelta(seconds=1)).total_seconds())
+        time.sleep((FRESH + timedelta(seconds=1)).total_seconds())
         self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")
 
     def _remove_old_copies(self) -> None:

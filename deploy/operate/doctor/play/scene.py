@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass
 class RehearsalContext:
-    """The input of every part. When `clock` says `until`, the rehearsal must end."""
+    """The input of every part. When `time.monotonic()` is `until`, the rehearsal must end."""
 
     context: CheckContext
     copy: Copy
@@ -32,8 +32,6 @@ class RehearsalContext:
     transcript: Transcript
     progress: Callable[[str], None]
     until: float
-    clock: Callable[[], float] = time.monotonic
-    sleep: Callable[[float], None] = time.sleep
 
     @property
     def platform(self) -> Platform:
@@ -45,7 +43,7 @@ class RehearsalContext:
 
     def left(self) -> float:
         """The seconds until the rehearsal must end."""
-        return max(self.until - self.clock(), 0.0)
+        return max(self.until - time.monotonic(), 0.0)
 
     def bot(self, name: str, play: float) -> Bot:
         """Make a bot with a signed link, which plays for `play` seconds. The transcript hides its id."""
@@ -65,11 +63,11 @@ class RehearsalContext:
 
     def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
         """Call `look` until it returns a value, and return that. Raises `failed` after `seconds`, or at `until`."""
-        began = self.clock()
+        began = time.monotonic()
         while (found := look()) is None:
-            spent = self.clock() - began
+            spent = time.monotonic() - began
             if spent > seconds or not self.left():
                 raise failed
             self.progress(f"{activity}, {spent:.0f} s")
-            self.sleep(PAUSE)
+            time.sleep(PAUSE)
         return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -59,10 +59,9 @@ class TranscriptLine:
 class Transcript:
     """Collects the lines of a rehearsal. `clean` removes secrets from every text first."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self) -> None:
         self.lines: list[TranscriptLine] = []
-        self._clock = clock
-        self._began = clock()
+        self._began = time.monotonic()
         self._secrets: set[str] = set()
 
     def hide(self, *secrets: str | None) -> None:
@@ -84,7 +83,7 @@ class Transcript:
     def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
         """Add a line with the figures `seconds`. Raises KeyError if its key is not among `LINES`."""
         LINES[key]
-        at = round(self._clock() - self._began, 1)
+        at = round(time.monotonic() - self._began, 1)
         self.lines.append(TranscriptLine(key, mark, self.clean(text), self.clean(advice), at, seconds))
 
     def good(self, key: str, text: str, **seconds: Any) -> None:
