@@ -25,7 +25,7 @@ class Client:
     window: Window
     player: str
     sent: tuple[object, ...] = ()
-    """The values (`state_of`) that the client was sent last."""
+    """The values (`Clients.state_of`) that the client was sent last."""
 
 
 class Clients:
@@ -50,6 +50,8 @@ class Clients:
         """The pictures that clients show now; None before the first ones."""
         self.frame_id = 0
         """The id of these pictures."""
+        self._members: Hashable = None
+        """The last value of `TrialSession.session_version`; None if one participant plays."""
 
     def add(self, human: str, connection: Hashable, window: Window, player: str) -> Client:
         """Add a client of the human who plays this player. The human's earlier client must have been removed."""
@@ -99,15 +101,15 @@ class Clients:
 
     def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send each client the state of its trial, if one of the values in it has changed."""
-        progress.session_version = participants.session_version()
+        self._members = participants.session_version()
         for client in self.by_human.values():
             player = client.player
-            state = state_of(progress, player)
+            state = self.state_of(progress, player)
             if client.sent == state:
                 continue
             client.sent = state
             times = None
-            if self._timed or progress.on_break or progress.session_version is not None:
+            if self._timed or progress.on_break or self._members is not None:
                 times = self._timing.state_times(progress, now, participants.session_fields(now))
             text = messages.state(
                 progress.state.value,
@@ -118,6 +120,12 @@ class Clients:
                 **(_state_arguments(progress, player, times) if times is not None else {}),
             )
             self._emit(SendState(client.connection, text, progress.frame_rate))
+
+    def state_of(self, progress: TrialProgress, player: str) -> tuple[object, ...]:
+        """Return the state, the episode, the score and others: if one changes, a client is sent the state again."""
+        score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
+        frozen = progress.shows_first_picture
+        return progress.state, progress.episode, score, progress.frame_rate, frozen, self._members, to_act
 
     def show(self, pictures: Pictures) -> None:
         """Send each client its new picture, under a new frame id."""
@@ -135,13 +143,6 @@ class Clients:
     def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
         """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for the member."""
         self._emit(SendDone(client.connection, episodes, score, outcome))
-
-
-def state_of(progress: TrialProgress, player: str) -> tuple[object, ...]:
-    """Return the state, the episode, the score and others: if one of them changes, a client is sent the state again."""
-    score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
-    members, frozen = progress.session_version, progress.shows_first_picture
-    return progress.state, progress.episode, score, progress.frame_rate, frozen, members, to_act
 
 
 def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:

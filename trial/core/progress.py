@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 
 from protocol.trial import TrialSection
@@ -47,12 +47,8 @@ class TrialProgress:
         self.humans = tuple(name for name, player in self.players.items() if player.human)
         self.first = self.humans[0]
         """The first player that a human plays. Records name its action and score before those of the others."""
-        self.action_space = self.players[self.first].action_space
-        """The names of the first human's actions."""
         self.choices = Choices(config, self.players, self.humans)
         """Decides what each player does at the next step."""
-        self.controls = self.choices.controls
-        """By player, the keys and buttons of each human."""
         self.turns = self.choices.turns
         """The present turn; None in real time."""
         self.state = PlayState.READY
@@ -78,8 +74,6 @@ class TrialProgress:
         """The episodes and breaks that are over and not recorded yet, in order. The caller removes them."""
         self._failures = 0
         self._good_episodes = 0
-        self.session_version: Hashable = None
-        """In a session: a value that changes whenever the fields about members do (`TrialSession.session_version`)."""
 
     @property
     def several(self) -> bool:

@@ -28,7 +28,8 @@ class Recordings:
         """Ask the shell to open a recording that begins with the present episode. `seed` is the episode's."""
         self.is_awaited = True
         players = tuple(progress.players.values()) if progress.several else ()
-        self._emit(OpenRecording(progress.episode, seed, progress.frame_rate, progress.action_space, players))
+        action_space = progress.players[progress.first].action_space
+        self._emit(OpenRecording(progress.episode, seed, progress.frame_rate, action_space, players))
 
     def opened(self) -> None:
         """Note that the shell has opened the recording."""

@@ -47,7 +47,7 @@ from typing import Any, Literal
 from trial.core import messages, records
 from trial.core.agent_call import AgentCall
 from trial.core.beginning import Beginning
-from trial.core.clients import Client, Clients, state_of
+from trial.core.clients import Client, Clients
 from trial.core.commands import Commands
 from trial.core.effects import (
     AgentTimeout,
@@ -243,7 +243,7 @@ class Trial:
         self._tell_moved("on_return" if player in self._have_come else "on_join", player)
         self._have_come.add(player)
         self._clients.send_controls(client, self.progress, participants, now)
-        client.sent = state_of(self.progress, player)
+        client.sent = self._clients.state_of(self.progress, player)
         words = participants.sentence(player) or self._failed_words
         if words is None and self._beginning.begun_again == self.progress.episode and not self.progress.steps:
             words = EPISODE_BEGINS_AGAIN

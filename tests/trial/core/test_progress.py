@@ -145,7 +145,7 @@ def test_a_stop_ends_the_trial_and_lets_go_of_the_keys():
     game.act("up", True)
     game.stop()
     assert (game.state, game.outcome, game.ended) == (PlayState.ENDED, "stopped", [Episode(1, 0, 0.0, "stopped")])
-    assert game.controls[PLAYER].held == ()
+    assert game.choices.controls[PLAYER].held == ()
     assert game.episodes_played == 0
     for again in (game.stop, game.start, game.pause, game.leave, game.reset, game.go_on):
         again()
@@ -169,7 +169,7 @@ def test_a_break_lets_go_of_the_keys_and_ignores_those_that_are_tapped_in_it():
     game.act("up", True)
     game.stepped({PLAYER: 1.0}, True, False)
     assert (game.state, game.on_break, game.episode) == (PlayState.BREAK, True, 1)
-    assert game.controls[PLAYER].held == ()
+    assert game.choices.controls[PLAYER].held == ()
     game.act("left", True)
     game.act("left", False)
     game.go_on()
