@@ -36,7 +36,7 @@ class Clients:
         config: TrialSection,
         timing: Timing,
         emit: Callable[[Effect], None],
-        assets: Sequence[Mapping[str, Any]] = (),
+        assets: Sequence[Mapping[str, Any]],
     ) -> None:
         """`assets` describe the images of a game that is drawn by objects."""
         self._timing = timing

@@ -68,7 +68,7 @@ class Policies:
     """The policies of all players that no human plays."""
 
     def __init__(
-        self, players: Iterable[Player], *, frame_skip: int = 1, seconds: float | None = None, repeats_last: bool = True
+        self, players: Iterable[Player], *, frame_skip: int, seconds: float | None, repeats_last: bool
     ) -> None:
         """`players` are those that policies play. `seconds`: turn by turn, how long a policy may take; None: real time.
 

@@ -18,7 +18,6 @@ from trial.policies.thread import PolicyThread
 Acted = Callable[[str, int, int | None, Exception | None], None]
 """A function that gets the player, the id of a question, and the action, or None and the policy's exception."""
 
-NO_POLICIES: Mapping[str, Policy] = {}
 _UNUSED = -1  # the id of questions whose answers are not used
 
 
@@ -61,8 +60,8 @@ class Places:
         self,
         players: Iterable[Player],
         policies: Mapping[str, Policy],
-        stand_ins: Mapping[str, Policy] = NO_POLICIES,
-        seats: Sequence[str] = (),
+        stand_ins: Mapping[str, Policy],
+        seats: Sequence[str],
     ) -> None:
         """Set who plays. From then on each policy belongs to this trial alone.
 
