@@ -31,7 +31,7 @@ class Choices:
     """
 
     def __init__(self, config: TrialSection, players: Mapping[str, Player], humans: Sequence[str]) -> None:
-        """`players` are the environment's, in its order; `humans` are the names of those that humans play."""
+        """`players` are the environment's, in its order; `humans` are the names of the players that humans play."""
         self._config = config
         self._players = players
         self._humans = humans

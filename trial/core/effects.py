@@ -92,7 +92,7 @@ class ResetCall(Call):
     episode: int
     seed: int
     asked: frozenset[str] = frozenset()
-    """The players whose policies begin the episode, too: those of all policies except programs."""
+    """The players that policies play, except programs: these policies begin the episode, too."""
     fields: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of the reset's line in the recording, in a session."""
 
@@ -233,7 +233,7 @@ class SaveAnswer:
     """Wait until all recordings are stored, then store the answers, if there are any.
 
     The shell answers with `Trial.member_saved` for each member's answer, and with `answer_saved` once all answers are
-    stored, also those of earlier `SaveMember`.
+    stored, including the answers of earlier `SaveMember`.
     """
 
     answers: Mapping[str, Any] | None
@@ -249,7 +249,7 @@ class SaveMember:
     human: str
     answers: Mapping[str, Any]
     later: Mapping[str, Any] | None = None
-    """The answer of each later game step, if the member does not play those either; None if they do."""
+    """The answer of each later game step, if the member does not play the later steps either; else None."""
 
 
 # ---- the log

@@ -17,7 +17,7 @@ FIELDS_KEPT = 32 * 1024 * 1024
 
 
 class Word(NamedTuple):
-    """A word of feedback. `player` is that of the participant who gave it; None if there is one participant."""
+    """A word of feedback. `player` is the player of the participant who gave it; None if there is one participant."""
 
     text: str
     player: str | None = None

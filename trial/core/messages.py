@@ -1,4 +1,4 @@
-"""The messages of docs/wire.md: reads those of clients, and builds those of the server. Pure."""
+"""Reads the messages of clients, and builds the messages of the server (docs/wire.md). Pure."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ def controls(
 
     It has `words` only if the project has words of its own, the players only if there are several, and `toAct` only
     turn by turn. `scene` are the fields of a game that is drawn by objects. `input_of_project` are the project's keys,
-    labels and kind of input. The other arguments are those of `state`, or keys of the project.
+    labels and kind of input. The other arguments are as in `state`, or keys of the project.
     """
     return json.dumps(
         {
@@ -295,10 +295,7 @@ def state(
 
 
 def seconds(**times: float | None) -> dict[str, float]:
-    """Return the fields of a message that hold times in seconds, rounded to milliseconds, without those that are None.
-
-    An infinite time is left out, too.
-    """
+    """Return the times, in seconds, for a message: rounded to milliseconds, without times that are None or infinite."""
     return {name: round(time, 3) for name, time in times.items() if time is not None and time < math.inf}
 
 

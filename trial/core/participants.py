@@ -1,6 +1,6 @@
 """The participants of a trial: `Alone` for one, `TrialSession` (`trial/core/session.py`) for several. Pure.
 
-Both have the same methods. They decide when the game is held and goes on, and what is answered for whom.
+Both have the same methods. They decide when the game is held and goes on, and which answer is stored for whom.
 """
 
 from __future__ import annotations

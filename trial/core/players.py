@@ -62,7 +62,7 @@ class View(NamedTuple):
     observations: Mapping[str, Any] = _NOTHING
     infos: Mapping[str, Any] = _NOTHING
     masks: Mapping[str, Mask] = _NOTHING
-    """The actions that are legal now, for those players for which the environment gives a mask."""
+    """The actions that are legal now, for each player for which the environment gives a mask."""
 
 
 def alone(action_space: tuple[str, ...]) -> tuple[Player, ...]:

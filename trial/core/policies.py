@@ -70,8 +70,9 @@ class Policies:
     def __init__(
         self, players: Iterable[Player], *, frame_skip: int, seconds: float | None, repeats_last: bool
     ) -> None:
-        """`players` are those that policies play. `seconds`: turn by turn, how long a policy may take; None: real time.
+        """`players` are the players that policies play.
 
+        `seconds`: turn by turn, how long a policy may take; None: real time.
         `repeats_last`: at steps for which `frame_skip` asks for no action, the last action is taken again.
         """
         self._places = {player.name: _Place(player) for player in players}
@@ -146,7 +147,7 @@ class Policies:
         return AskPolicy(player, self._asks, view.observations.get(player), view.infos.get(player), place.mask)
 
     def acted(self, player: str, ask_id: int, action: Any) -> str | None:
-        """Take a policy's answer. Return what is wrong with it; None if it is valid or answers an earlier question."""
+        """Take a policy's answer. Return its mistake in words; None if it is valid or answers an earlier question."""
         place = self._places.get(player)
         if place is None or place.asked != ask_id:
             return None

@@ -46,7 +46,7 @@ class TrialProgress:
         self.players = {player.name: player for player in players}
         self.humans = tuple(name for name, player in self.players.items() if player.human)
         self.first = self.humans[0]
-        """The first player that a human plays. Records name its action and score before those of the others."""
+        """The first player that a human plays. Records name its action and its score first."""
         self.choices = Choices(config, self.players, self.humans)
         """Decides what each player does at the next step."""
         self.turns = self.choices.turns
@@ -56,7 +56,7 @@ class TrialProgress:
         """How the trial has ended: finished, stopped, failed or partnerLeft; None while it goes on."""
         self.frame_rate = config.starting_frame_rate
         self.episode = 1
-        """The number of the present episode; in a break, of the one that is over."""
+        """The number of the present episode; in a break, the number of the episode that is over."""
         self.steps = 0
         """The number of steps in this episode."""
         self.total_steps = 0
@@ -200,8 +200,9 @@ class TrialProgress:
     def act(self, name: str, held: bool | None, *, lasts: bool = False, player: str | None = None) -> None:
         """Take a button that a human presses (`held` is None), or a key that goes down (True) or up (False).
 
-        Raises CommandRefused. `name` is that of an action or a key. With `lasts`, the action acts until the next one,
-        also over pauses and episodes; an unknown name ends it. `player`: None is the first player that a human plays.
+        Raises CommandRefused. `name` is the name of an action or a key. With `lasts`, the action acts until the next
+        one, also over pauses and episodes; an unknown name ends it. `player`: None is the first player that a human
+        plays.
 
         While the game is held, a button has no effect. A key that goes down then acts on the first step after the hold,
         even if it was released; with `input: single` it never acts.

@@ -69,7 +69,7 @@ def result(
 
 
 def number(over: Episode | Break) -> int:
-    """Return the number of the episode that is over; for a break, that of the episode before it."""
+    """Return the number of the episode that is over, or of the episode before the break that is over."""
     return over.after if isinstance(over, Break) else over.number
 
 

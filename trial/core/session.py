@@ -309,7 +309,7 @@ class TrialSession:
         self._say_each(lambda player: self.sentence(player) if player in players else None)
 
     def _save_refused(self, seconds: float) -> None:
-        """Store the answers of members who were refused while the others play on: of this game and of the later ones.
+        """Store the answers of members who were refused while the others play on: to this game and to all later games.
 
         So they go on at once, and never come to a later game of the session, which they could not play either.
         """

@@ -14,7 +14,7 @@ from trial.pictures.scene import Scene
 from trial.pictures.scene_object import CheckedObject
 
 SCENE, PACKED_SCENE, ASSET = 4, 5, 6
-"""Kinds of binary messages; those of frames are in `trial/pictures/frames.py`."""
+"""Kinds of binary messages; the kinds of frames are in `trial/pictures/frames.py`."""
 HEADER = struct.Struct("!BI")
 """Kind, id."""
 ASSET_HEADER = struct.Struct("!BHI")
@@ -25,7 +25,7 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False)
 
 
 class SceneEncoder:
-    """Encodes the scenes of one connection: the first scene whole, of each later one the changes since the one before.
+    """Encodes the scenes of one connection: the first scene whole, then the changes from each scene to the next.
 
     A WebSocket loses no message and keeps their order, so the client has the scene that was sent last.
     """
@@ -106,7 +106,7 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
 
 
 def _fields(before: CheckedObject, now: CheckedObject) -> dict[str, Any]:
-    """Return the fields that have changed; None as the value of those that have their default again."""
+    """Return the fields that have changed, with None for a field that has its default again."""
     if list(before) == list(now):  # the usual case
         return dict(compress(now.items(), map(ne, before.values(), now.values())))
     changed = {key: value for key, value in now.items() if key not in before or before[key] != value}

@@ -100,11 +100,9 @@ def shown_name(value: Any, index: int) -> str:
 
 
 def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) -> CheckedObject:
-    """Check an object's fields, and return those to send.
+    """Check an object's fields, and return the fields to send. Raises UnusableValue if the object cannot be drawn.
 
-    Each field that its type lacks gives a sentence in `problems`.
-
-    Raises UnusableValue if the object cannot be drawn.
+    Each field that its type does not have gives a sentence in `problems`.
     """
     kind = fields.get("type")
     table = TYPES.get(kind) if isinstance(kind, str) else None
@@ -284,7 +282,7 @@ _NEEDED: Any = object()  # in the place of a default
 _DEFAULT_TWEEN = 50  # ms, as in Interactive Gym
 _OTHER_NAMES = {"uuid": "id", "object_type": "type", "image_name": "image", "opacity": "alpha", "rotation": "angle"}
 _COMMON_FIELDS = frozenset({"type", "permanent", "remove", "tween", "tween_duration", "object_size"})
-"""The fields that an object of each type may have, apart from those in TYPES."""
+"""The fields that an object of each type may have, apart from its fields in TYPES."""
 
 _place, _length = _number(-_FARTHEST, _FARTHEST), _number(0, _FARTHEST)
 _Table = Mapping[str, tuple[Callable[[Any], Any], Any]]

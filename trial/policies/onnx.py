@@ -219,7 +219,7 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
 
 
 def _observation_inputs(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
-    """Return the inputs for the observation: those with its parts' names, or one with a usual name, or the first."""
+    """Return the inputs for the observation: one for each part, by its name; or one with a usual name; or the first."""
     if isinstance(first, Mapping):
         parts = tuple(port for port in inputs if port.name in first)
         if len(parts) == len(first):

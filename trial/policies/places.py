@@ -24,7 +24,7 @@ _UNUSED = -1  # the id of questions whose answers are not used
 def load_policies(
     players: Iterable[Player], folder: Path, agent_module: Any, observation_spaces: Mapping[str, Any]
 ) -> dict[str, Policy]:
-    """Load the policies of those players that have one, by player. It blocks the thread that calls it.
+    """Load the policies of all players that have one, by player. It blocks the thread that calls it.
 
     Raises PolicyError with a sentence that names the player, and whatever the researcher's classes raise.
     """

@@ -173,5 +173,5 @@ def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int |
 
 @cache
 def _trust() -> ssl.SSLContext:
-    """Return a context that trusts the system's authorities; in the image those of Debian's ca-certificates."""
+    """Return a context that trusts the system's authorities; in the image, Debian's ca-certificates brings them."""
     return ssl.create_default_context()

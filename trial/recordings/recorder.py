@@ -29,7 +29,7 @@ FLUSH_SECONDS = 0.5
 
 
 class Recorder:
-    """Writes the recordings and answers of one trial, and reads those of earlier servers of the same step."""
+    """Writes the recordings and answers of one trial, and reads what earlier servers of the step have written."""
 
     def __init__(self, settings: TrialSettings, step: str, trial_id: str, store: Store, spool: Spool) -> None:
         self._settings = settings
@@ -207,8 +207,8 @@ class Recorder:
     ) -> None:
         """Store the answer of a member of a session. An answer that exists is not changed.
 
-        `later` is the answer of each later game step, if the member does not play those either. These answers are
-        stored first: as soon as the present step has its answer, the member goes on, and must not come to a later game.
+        `later` is the answer of each later game step, if the member does not play them either. These answers are stored
+        first: as soon as the present step has its answer, the member goes on, and must not come to a later game.
         """
         settings = self._settings
         group = next((member.group for member in settings.members if member.user_id == user_id), None)

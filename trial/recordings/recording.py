@@ -8,7 +8,7 @@ failed), `end` (an episode ends, or the server must end), `break` (a break ends)
 A `step` says how its action was chosen. `human` is the number of the action that the participant's keys chose (null if
 no key acted). `action` and `actionName` are the action taken. `by` is who chose it: `agent` (the agent reports the
 action as its own, even if it is the human's), or one of `trial.core.actions.By`. Times are UTC:
-2026-11-21T14:46:40.123456Z. docs/data.md describes all fields, and those of several players.
+2026-11-21T14:46:40.123456Z. docs/data.md describes all fields.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ _MOST_PACKAGES = 100
 
 @functools.cache
 def packages(agent_dir: Path) -> tuple[str, ...]:
-    """Return the packages that the project's requirements.txt names, such as those of its games."""
+    """Return the packages that the project's requirements.txt names, such as the packages of its games."""
     names: dict[str, None] = {}
     for file in (agent_dir / "requirements.txt", REQUIRED):
         with contextlib.suppress(OSError, UnicodeDecodeError):
@@ -274,6 +274,6 @@ class Recording:
 
 
 def read(data: bytes) -> list[dict[str, Any]]:
-    """Return the complete lines of a recording, also of one that is cut off anywhere."""
+    """Return the complete lines of a recording, even if its end is missing."""
     text = zlib.decompressobj(31).decompress(data)
     return [json.loads(part) for part in text.split(b"\n")[: text.count(b"\n")]]

@@ -97,7 +97,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
 
 
 def _step(line: Mapping[str, Any], words: tuple[Word, ...]) -> RecordedStep:
-    # The action that the agent was asked to take: that of the line, unless the agent reported another one (`agent`).
+    # The action that the agent was asked to take. The line has it, unless the agent reported another one (`agent`).
     advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
     parts = line.get("players") or {}
     players = {

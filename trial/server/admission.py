@@ -1,4 +1,4 @@
-"""Admits clients: checks their first message, and tells those who may not play now why.
+"""Admits clients: checks their first message, and tells a client that may not play now the reason.
 
 The checks are in `handshake.py`. This module decides their order, waits until the server knows who plays there, and
 checks that a member of a session has answered the game steps before.
@@ -41,7 +41,7 @@ class Admission:
     """Admits the participant of this server, or the members of its session.
 
     `settings` returns the present settings: a server may learn only later who plays there. `finished_steps` are the
-    game steps whose answers are stored, in a session those of all members.
+    game steps whose answers are stored; in a session, the answers of all members.
     """
 
     def __init__(

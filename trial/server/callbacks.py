@@ -51,7 +51,7 @@ class TrialCallbacks:
         return self._callbacks is not None and self._callbacks.busy
 
     def begin(self, callbacks: Callbacks) -> None:
-        """Use `callbacks`, those of the agent that has started."""
+        """Use the callbacks of the agent, which has started."""
         self._callbacks = callbacks
 
     def close(self) -> None:

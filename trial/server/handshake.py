@@ -77,7 +77,7 @@ def select_subprotocol(
 
 
 async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
-    """Wait for the first message. If it has no token, it gets the one in the address. Raises CloseConnection."""
+    """Wait for the first message. If it has no token, it gets the token in the address. Raises CloseConnection."""
     try:
         async with asyncio.timeout(seconds):
             data = await websocket.recv()
@@ -118,8 +118,8 @@ def check_member(websocket: ServerConnection, user_id: str | None, settings: Tri
 def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str], origins: Collection[str]) -> None:
     """Check that a client has one of the tokens, or needs no token. Raises CloseConnection.
 
-    A client needs no token if it has no subprotocol and its page has one of `origins`: those of the project's front
-    end, if `plainClients` is on. The caller compares the client's id.
+    A client needs no token if it has no subprotocol and its page has one of `origins`, the origins of the project's
+    front end if `plainClients` is on. The caller compares the client's id.
     """
     if hello.token is not None or websocket.subprotocol is not None:
         if not any(_matches(hello.token, token) for token in tokens):

@@ -219,9 +219,9 @@ class TrialLoop:
         self._apply(effects)
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
-        """Return the stored answers: first, if the step is over; second, those of some members, if it is not.
+        """Return the stored answer if the step is over, else None; and the answers of some members if it is not over.
 
-        The first is the participant's answer, or in a session all members' by their ids.
+        In a session, both hold members' answers by the members' ids.
         """
         if not self._settings.session:
             return await self._recorder.earlier_answers(), {}
@@ -374,7 +374,7 @@ class TrialLoop:
         self._saving.add_done_callback(self._saved)
 
     async def _save_all(self, effect: SaveAnswer) -> None:
-        """Store the answers after the recordings. Return when those of earlier `SaveMember` are stored, too."""
+        """Store the answers after the recordings. Also wait until the answers of earlier `SaveMember` are stored."""
         await self._recorder.save(effect.answers)
         for human, answers in effect.by_human.items():
             self._save_member(SaveMember(human, answers))

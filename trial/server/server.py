@@ -77,7 +77,7 @@ class TrialServer:
         )
         self._agent_ready: asyncio.Task[StartedAgent | None]
         self._failure = 1  # the exit status if an error ends the server
-        self._trial: TrialLoop | None = None  # the last one that has begun
+        self._trial: TrialLoop | None = None  # the last trial that has begun
         self._trials: list[TrialLoop] = []  # all; after the end of a trial, its policies or callbacks may still run
         self._finished_steps: set[str] = set()
         self._search: Search
@@ -163,7 +163,7 @@ class TrialServer:
             self._lifetime.end_in(TELL_SECONDS, "error")
             return None
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
-            settings = self.settings  # the present ones: a warm server may have been assigned meanwhile
+            settings = self.settings  # the present settings: a warm server may have been assigned meanwhile
             self._failure = exits.LATE_AGENT if isinstance(error, AgentTimeout) else exits.NO_AGENT
             log.error("the agent cannot be started\n%s", report(error, settings.agent_dir, settings.private))
             self._lifetime.end_in(TELL_SECONDS, "error")

@@ -65,7 +65,7 @@ class StartedAgent:
     def players_of(self, settings: TrialSettings) -> TrialPlayers:
         """Return who plays in one trial. Each trial gets policy objects of its own. Raises as `start`.
 
-        `settings` are the present ones: since its start, a server may have been assigned to a group and a session.
+        `settings` are the present settings: since its start, a server may have been assigned to a group and a session.
         """
         playing = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
         return self._with_members(playing, settings) if settings.session else playing

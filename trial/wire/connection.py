@@ -28,8 +28,8 @@ from trial.wire.player_socket import PlayerSocket
 log = logging.getLogger("trial")
 
 SUBPROTOCOLS = ("hippodrome.3", "hippodrome.2", "hippodrome.1")
-"""The subprotocols, the preferred one first. Clients with the first draw scenes; those with the last take only lossless
-frames."""
+"""The subprotocols, the preferred one first. Clients with the first draw scenes; clients with the last take only
+lossless frames."""
 REST_SECONDS = 0.25
 """A lossy frame is made exact if no other picture follows within this time or 2.5 frames, whichever is longer."""
 

@@ -1,4 +1,4 @@
-"""Reads a client's messages after the first, and refuses those that are too many or make no sense. Pure."""
+"""Reads a client's messages after the first, and refuses messages that are too many or make no sense. Pure."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class PlayerSocket(ServerConnection):
         return generator.gi_code is _FOR_A_FRAME and protocol.current_size is None and protocol.state is State.OPEN
 
     def process_event(self, event: Event) -> None:
-        """Take a frame from `websockets`, which reads those that `data_received` has left to it."""
+        """Take a frame that `websockets` has read, because `data_received` did not read it."""
         if not (isinstance(event, Frame) and self._heard(event)):
             super().process_event(event)
 

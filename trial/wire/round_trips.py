@@ -2,7 +2,7 @@
 
 A browser answers a ping by itself, without the page, "as soon as is practical" (RFC 6455, 5.5.2 and 5.5.3). A ping
 waits until earlier data are sent, as the game's pictures do. So the round trip is the one that the participant
-experiences, with the server's own delays. It takes 6 bytes to the browser and 10 back, without those of TCP and TLS.
+experiences, with the server's own delays. It takes 6 bytes to the browser and 10 back, without TCP and TLS.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ export function releaseAll(tell = true) {
   document.querySelectorAll(".pressed").forEach((button) => button.classList.remove("pressed"));
 }
 
-// A single action that is not held.
+// Sends an action once, without holding it down.
 export function tap(action) {
   if (!isRunning()) {
     start();

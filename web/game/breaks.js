@@ -1,4 +1,4 @@
-// The break between two games: the score of the one that is over, and how long it is until the next.
+// The break between two games: the score of the game that is over, and the time until the next game.
 import { releaseAll } from "./actions.js";
 import { overlays, showOverlay } from "./overlay.js";
 import { duration, find, points, setText } from "./page.js";

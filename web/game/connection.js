@@ -1,4 +1,4 @@
-// The WebSocket to the participant's server (docs/wire.md): handshake, acknowledgements, and finding out that it is dead.
+// The WebSocket to the participant's server (docs/wire.md): handshake, acknowledgements, and how the page notices that it is dead.
 import { startDrawing } from "./drawing.js";
 import { canDecode, canInflate, decodeJpeg, readHeader, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
@@ -81,7 +81,7 @@ function acknowledge(own, id) {
 
 // On bad Wi-Fi a connection can be dead for minutes before the browser notices.
 
-// The next message is one that the server must answer.
+// Notes that the server must answer the next message.
 export function expectAnswer() {
   if (link?.welcome && !link.asked) link.asked = performance.now();
 }

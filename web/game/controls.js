@@ -65,7 +65,7 @@ function commandsOf(shown, { words }) {
   ]);
 }
 
-// Those buttons of `all` that the project offers. Each is a command, its label, and its key in `ui` if that differs.
+// Makes the buttons that the project offers, out of `all`: each is a command, its label, and its key in `ui` if that differs.
 export function commandButtons(shown, all) {
   const buttons = all.filter(([name, , key = name]) => shown.has(key)).map(([name, label]) => {
     const button = make("button", { type: "button", textContent: label });

@@ -8,7 +8,7 @@ const SOON = 10; // a screen reader says when so many seconds are left
 
 const timeLeft = make("span", { id: "left", title: TEXT.timeLeft, hidden: true });
 let startsAt = null; // when the first picture begins to move
-let endsAt = null; // when the time is over, if the game goes on as it does
+let endsAt = null; // when the time is over, if the game is not held before
 let saidSoon = false;
 
 overlays.freeze = { title: TEXT.getReady, band: true };
