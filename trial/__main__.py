@@ -33,8 +33,8 @@ def main() -> int:
     """
     os.umask(0o077)  # only this user may read recordings, answers, and the files that the agent writes
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(message)s")
-    # Python takes cached bytecode for current if the source has the same size and second. An agent.py that was edited
-    # within that second would run as it was before.
+    # Python uses cached bytecode if the source has the same size and was changed in the same second. An agent.py that
+    # was edited twice within a second would run in its first version.
     sys.dont_write_bytecode = True
     sys.setswitchinterval(0.001)  # seconds for which the agent's thread may keep the event loop's thread waiting
     try:

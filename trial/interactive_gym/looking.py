@@ -152,8 +152,8 @@ def _is_whole(value: Any) -> bool:
 
 def _check_players(players: tuple[Any, ...], observation: Any) -> None:
     """Raise Unplayable if there are observations of players who are not in `policy_mapping`."""
-    observed = list(observation) if isinstance(observation, Mapping) else None
-    if observed is not None and not set(observed) <= set(players):
+    observed = list(observation) if isinstance(observation, Mapping) else []
+    if not set(observed) <= set(players):
         raise Unplayable(
             f"the environment's players are {', '.join(map(repr, observed))}, and policy_mapping has "
             f"{', '.join(map(repr, players))}: write the environment's names"

@@ -24,14 +24,14 @@ def welcome(config: RemoteConfig) -> str:
 
 
 def around(config: RemoteConfig) -> tuple[dict[str, str], dict[str, str]]:
-    """Make the pages before the game and those after it. Return both by the pages' names, in their order."""
-    before: list[Any] = getattr(config, "before", [])
-    after: list[Any] = getattr(config, "after", [])
-    if not before and not after:
-        return {"welcome": welcome(config)}, {"final": final(config)}
-    first = {_name("before", number, scene): _static(scene) for number, scene in enumerate(before, 1)}
-    last = {_name("after", number, scene): _static(scene) for number, scene in enumerate(after, 1)}
-    return first or {"welcome": welcome(config)}, last or {"final": final(config)}
+    """Make the pages before the game, and the pages after it. Return both by the pages' names, in their order."""
+    before = _scenes("before", getattr(config, "before", ()))
+    after = _scenes("after", getattr(config, "after", ()))
+    return before or {"welcome": welcome(config)}, after or {"final": final(config)}
+
+
+def _scenes(where: str, scenes: Iterable[Any]) -> dict[str, str]:
+    return {_name(where, number, scene): _static(scene) for number, scene in enumerate(scenes, 1)}
 
 
 def _name(where: str, number: int, scene: Any) -> str:

@@ -72,9 +72,8 @@ def _find(config: Any) -> ConfigModule | None:
         names = getattr(module, "__dict__", {})
         variable = next((name for name, value in names.items() if value is config and name.isidentifier()), None)
         file = _file(module)
-        if variable is None or file is None or file.is_relative_to(_HIPPODROME / "trial"):
-            continue
-        return _source(module, variable, file)
+        if variable is not None and file is not None and not file.is_relative_to(_HIPPODROME / "trial"):
+            return _source(module, variable, file)
     return None
 
 
@@ -190,6 +189,7 @@ def _imports(file: Path) -> Iterator[str]:
 
 
 def _beside(folder: Path, target: Path) -> Iterator[Path]:
+    """Yield the files in the folder and below it, without hidden files, data, virtual environments and projects."""
     for path in sorted(folder.iterdir()):
         if path.name in _LEFT_OUT or path.name.startswith(".") or path == target or path.is_symlink():
             continue
@@ -235,6 +235,7 @@ def _of_hippodrome(file: Path) -> bool:
 
 
 def _file(module: Any) -> Path | None:
+    """Return the path of the module's source file; None if it has none."""
     name = getattr(module, "__file__", None)
     return _resolved(name) if isinstance(name, str) and name.endswith(".py") else None
 
