@@ -205,7 +205,8 @@ def _players(
 ) -> dict[Any, tuple[str, str]]:
     """Return, by player, the value in `trial.players`, and the policy's class in agent.py or an empty name.
 
-    Adds the files of policies to `files`.
+    Adds the files of policies to `files`. Raises Unplayable if a class would find another policy's file under the name
+    of its own (`playing.located`).
     """
     players: dict[Any, tuple[str, str]] = {}
     for number, (player, plays) in enumerate(playing.mapping_of(config).items()):
@@ -220,6 +221,8 @@ def _players(
             remark(f"the policy of {player} is not found: {plays}")
         if looking.is_file(config, plays) and look.joined_as_sorted:
             players[player] = (f"sample:policies/{name}", "")
+        elif file is not None and name != file.name and plays not in files:
+            raise Unplayable(f"policy_mapping has two files that are called {file.name}: give them different names")
         else:
             players[player] = (f"agent:Policy{number}", f"Policy{number}")
     return players

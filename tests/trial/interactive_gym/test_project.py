@@ -163,6 +163,25 @@ def test_players_and_their_policies_become_keys_of_the_study(tmp_path: Path) -> 
     read_project(project)
 
 
+THREE = (
+    TOGETHER.replace('1: "brains/two.txt"', '1: "left/two.txt", 2: "right/two.txt"')
+    .replace("(0, 1)", "(0, 1, 2)")
+    .replace("1: spaces.Discrete(3)", "1: spaces.Discrete(3), 2: spaces.Discrete(3)")
+    .replace("1: {}", "1: {}, 2: {}")
+)
+
+
+def test_files_of_functions_with_the_same_name_are_refused_if_one_would_hide_the_other(tmp_path: Path) -> None:
+    """Files below the experiment's folder keep their folders. Others are copied to `policies/`."""
+    for folder, inside in (("left", "1"), ("right", "2")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "two.txt").write_text(inside)
+    said = refusal_of(tmp_path / "mine", THREE)
+    assert said == "policy_mapping has two files that are called two.txt: give them different names"
+    project, _ = project_of(tmp_path, THREE)
+    assert (project / "left/two.txt").read_text() + (project / "right/two.txt").read_text() == "12"
+
+
 def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
     package = tmp_path / "examples" / "car"
     write(package, ALONE.replace("import helper", "from examples.car import helper"), "car_server.py")
