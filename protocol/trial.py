@@ -19,7 +19,7 @@ RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
 MAX_OWN_CONTROLS = 32
 OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
 SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
-"""Keys of games of several participants (`project.players`). A registration leaves out those with default values."""
+"""Keys of games of several participants (`project.players`). A registration leaves out a key with its default value."""
 MAX_EPISODES = 1_000_000
 LONGEST_BREAK = 600
 """Seconds."""

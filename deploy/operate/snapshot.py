@@ -200,7 +200,7 @@ class InstallationMonitor:
             look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
         look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
         look.recent = found
-        look.members = dict(self._members([server for server in look.servers if server.is_sessions]))
+        look.members = dict(self._members([server for server in look.servers if server.is_of_session]))
 
     def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
         """Yield the names of sessions' servers, each with the number of members. Reads each formed session once."""

@@ -175,7 +175,7 @@ def _warm(look: Snapshot, project: Project) -> Mapping[str, int]:
 
 def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
     now = look.at
-    of_session = {"session": True, "members": look.members.get(server.name, 0)} if server.is_sessions else {}
+    of_session = {"session": True, "members": look.members.get(server.name, 0)} if server.is_of_session else {}
     return {
         "server": server.name,
         "project": server.project_id,
@@ -245,7 +245,7 @@ def _servers(look: Snapshot) -> list[RenderableType]:
     counts = ", ".join(f"{count:,} {state}" for state, count in sorted(states.items())) or "none"
     waiting = sum(server.is_warm_server for server in look.servers)
     counts += f", {waiting:,} of them warm" if waiting else ""
-    sessions = sum(server.is_sessions for server in look.servers)
+    sessions = sum(server.is_of_session for server in look.servers)
     members = sum(look.members.values())
     counts += f", {sessions:,} of sessions with {count(members, 'member')}" if sessions else ""
     tasks = "" if look.tasks is None else f" ({look.tasks:,} tasks on ECS)"
@@ -306,7 +306,7 @@ def _kind(server: Server, members: int | None) -> str:
     kind = "Spot" if server.spot else "on demand"
     if server.is_warm_server:
         return f"{kind}, warm"
-    if server.is_sessions:
+    if server.is_of_session:
         kind += ", started ahead" if members is None else f", session of {members}"
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 

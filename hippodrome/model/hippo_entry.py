@@ -25,7 +25,7 @@ USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes: HIPPO's default, and the m
 _PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 
 
-def is_hippos(entry: Mapping[str, Any]) -> bool:
+def is_from_hippo(entry: Mapping[str, Any]) -> bool:
     """Return whether HIPPO wrote this entry: its steps are a map. In our entries they are a list."""
     return isinstance(entry.get("steps"), dict)
 

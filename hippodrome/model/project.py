@@ -243,13 +243,13 @@ class UnreadableEntry(NamedTuple):
 class MasterList(Record, frozen=True):
     """`project_master_list.json`, in HIPPO's form. An entry that cannot be read does not affect the others.
 
-    `hippos`: the JSON of the entries that HIPPO wrote, by project id. Their projects are among `projects`; the JSON is
-    written back unchanged.
+    `by_hippo`: the JSON of the entries that HIPPO wrote, by project id. It is written back unchanged; `projects` has
+    their projects.
     """
 
     projects: list[Project] = msgspec.field(default_factory=list)
     unreadable: tuple[UnreadableEntry, ...] = ()
-    hippos: Mapping[str, bytes] = msgspec.field(default_factory=dict)
+    by_hippo: Mapping[str, bytes] = msgspec.field(default_factory=dict)
 
     def find(self, project_id: str) -> Project | None:
         """Return the project with this id; None if the list has no entry of it that can be read."""
@@ -280,14 +280,14 @@ class MasterList(Record, frozen=True):
         """Return the list as it is stored. It holds no secret, since researchers may read it."""
         projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
         unread = tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable)
-        return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.hippos.items()})
+        return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.by_hippo.items()})
 
     def with_project(self, project: Project) -> MasterList:
         """Return the list with this project, which replaces any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
         projects = sorted([*others, project], key=lambda p: p.id)
         unread = tuple(entry for entry in self.unreadable if entry.id != project.id)
-        return MasterList(projects, unread, {key: raw for key, raw in self.hippos.items() if key != project.id})
+        return MasterList(projects, unread, {key: raw for key, raw in self.by_hippo.items() if key != project.id})
 
 
 class _MasterListDocument(Record, frozen=True):
@@ -305,11 +305,11 @@ def read_list(body: bytes) -> MasterList:
         try:
             projects.append(_checked(from_json(raw, Project)))
         except (ValueError, RecursionError) as error:
-            if hippo_entry.is_hippos(_as_object(raw)):
+            if hippo_entry.is_from_hippo(_as_object(raw)):
                 others.append(raw)
             else:
                 unread.append(_unreadable(raw, error))
-    hippos: dict[str, bytes] = {}
+    by_hippo: dict[str, bytes] = {}
     for raw in others:
         try:
             project = _checked(from_data(hippo_entry.fields_of(_as_object(raw)), Project))
@@ -319,8 +319,8 @@ def read_list(body: bytes) -> MasterList:
             unread.append(_unreadable(raw, error))
         else:
             projects.append(project)
-            hippos[project.id] = raw
-    return MasterList(projects, tuple(unread), hippos)
+            by_hippo[project.id] = raw
+    return MasterList(projects, tuple(unread), by_hippo)
 
 
 def _checked(project: Project) -> Project:
@@ -338,7 +338,7 @@ def _unreadable(raw: bytes, error: Exception) -> UnreadableEntry:
 def write_list(listed: MasterList) -> bytes:
     """Return the master list as JSON. Entries that cannot be read, or that HIPPO wrote, are written back unchanged."""
     projects = [
-        msgspec.Raw(listed.hippos.get(project.id) or msgspec.json.encode(project)) for project in listed.projects
+        msgspec.Raw(listed.by_hippo.get(project.id) or msgspec.json.encode(project)) for project in listed.projects
     ]
     return to_json(_MasterListDocument([*projects, *(msgspec.Raw(entry.raw) for entry in listed.unreadable)]))
 

@@ -130,7 +130,7 @@ class Server(Record, frozen=True):
         return ids.is_warm_id(self.user_id)
 
     @property
-    def is_sessions(self) -> bool:
+    def is_of_session(self) -> bool:
         """Whether it is the server of a session, on which several participants play."""
         return is_session_id(self.user_id)
 
@@ -149,7 +149,7 @@ class Server(Record, frozen=True):
         The result is False for records of earlier versions, which do not name their steps, and for a session's server,
         on which others play.
         """
-        return bool(self.game_steps) and not self.is_sessions and step_key not in self.game_steps
+        return bool(self.game_steps) and not self.is_of_session and step_key not in self.game_steps
 
     def is_open(self, attempt: int) -> bool:
         """Return whether the record is at this attempt and not closed."""

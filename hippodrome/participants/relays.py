@@ -112,7 +112,9 @@ class Relays:
         self._authorize(project, user_id, form, record)
         if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
-        if record is None or record.is_closed or record.is_sessions:  # the participant leaves the lobby or the session
+        if (
+            record is None or record.is_closed or record.is_of_session
+        ):  # the participant leaves the lobby or the session
             message, name = StopServer(project.id, user_id), ids.server_name(ids.server_label(project.id, user_id), 1)
         else:
             message, name = StopServer(project.id, user_id, record.attempt), record.name
@@ -126,7 +128,7 @@ class Relays:
         """Raise `Refusal` unless the form has the token of this server or a ticket of this participant."""
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
-        if expected and record and record.is_sessions:
+        if expected and record and record.is_of_session:
             expected = member_token(expected, user_id)
         if expected and ids.secrets_equal(str(token), expected):
             return

@@ -62,7 +62,7 @@ class Replacement:
 
     def _players(self, closed: Server) -> list[str]:
         """The ids of the participants who play on this server; none if its session is not formed yet."""
-        if not closed.is_sessions:
+        if not closed.is_of_session:
             return [closed.user_id]
         return members_of(self._services.repository, closed.project_id, closed.user_id)
 

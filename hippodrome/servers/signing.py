@@ -142,7 +142,7 @@ class ServerAccess:
     may_match: bool = False  # whether it may answer questions to `match` as long as it has no members
 
     @property
-    def is_sessions(self) -> bool:
+    def is_of_session(self) -> bool:
         """Whether it is the server of a session."""
         return is_session_id(self.user_id)
 
@@ -158,7 +158,7 @@ class ServerAccess:
 
     @property
     def _recordings(self) -> str:
-        folder = session_recordings_folder if self.is_sessions else recordings_folder
+        folder = session_recordings_folder if self.is_of_session else recordings_folder
         return folder(self.project_id, self.user_id)
 
     def is_open(self, now: datetime) -> bool:
@@ -185,7 +185,7 @@ class ServerAccess:
 
     @property
     def _is_asked_to_match(self) -> bool:
-        return self.may_match and self.is_sessions and not self.members and self.closed is None
+        return self.may_match and self.is_of_session and not self.members and self.closed is None
 
     def _is_groups(self, key: str) -> bool:
         """Whether this is the key of an answer of the function `match`, and this server may write such an answer."""
@@ -198,12 +198,12 @@ class ServerAccess:
             return True
         if key in self.certificate or key == handover_key(self.project_id, self.name):
             return True
-        if self.is_sessions and key == session_key(self.project_id, self.user_id):
+        if self.is_of_session and key == session_key(self.project_id, self.user_id):
             return True
         return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key))
 
     def _is_answer(self, key: str) -> bool:
-        players = self.members if self.is_sessions else (self.user_id,)
+        players = self.members if self.is_of_session else (self.user_id,)
         return any(key == answer_key(self.project_id, user, step) for user in players for step in self.game_steps)
 
     def _is_earlier(self, key: str) -> bool:
@@ -281,7 +281,7 @@ class Signing:
         if not ids.secrets_equal(asked.credential, secret.credential(asked.server, nonce)):
             raise refused
         found = self._access(stored.server, asked.server)
-        if found is not None and found.is_sessions:
+        if found is not None and found.is_of_session:
             found = replace(found, members=members_of(self._repository, found.project_id, found.user_id))
         if found is None or not found.is_open(self._platform.now()):
             logger.info("a server that has ended asked for requests", extra={"server": asked.server})

@@ -221,7 +221,7 @@ def _owner_environment(project: Project, record: Server, settings: Settings) -> 
         # Whoever is assigned the server at the last moment still gets all of maxRuntime, and a session also the time to
         # wait for its members.
         deadline += lifetime_asked_for(project, settings)
-    elif record.is_sessions:
+    elif record.is_of_session:
         owner = {environment.SESSION: record.user_id}
     else:
         group = environment.group_text(project.group(record.user_id))

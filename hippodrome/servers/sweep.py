@@ -230,7 +230,7 @@ class Sweep:
         A session is in its lobby before its server has a record. It leaves the lobby when its document is written, or
         when its server is not needed any more.
         """
-        running = [stored.server for stored in self._open() if stored.server.is_sessions]
+        running = [stored.server for stored in self._open() if stored.server.is_of_session]
         unlisted = [
             record
             for record in running

@@ -175,7 +175,7 @@ class World:
             if stored is None or stored.server.ready is None:
                 continue
             owner = stored.server.user_id
-            if stored.server.is_sessions and self.repository.session("maze", owner) is None:
+            if stored.server.is_of_session and self.repository.session("maze", owner) is None:
                 continue  # the server waits for its session
             since = max(stored.server.ready, self.played.get(owner, stored.server.ready))
             if self.platform.now() - since > NOT_PLAYED:
@@ -192,7 +192,7 @@ class World:
                     one.server = None
                 continue
             now = self.played[owner] = self.platform.now()
-            session = self.repository.session("maze", owner) if record.is_sessions else None
+            session = self.repository.session("maze", owner) if record.is_of_session else None
             users = session.user_ids if session else [owner]
             are_here = len(there) == len(users) or now - min(one.since for one in there) > ABSENT
             if are_here and self.chance.random() < 0.15:

@@ -110,7 +110,7 @@ class Handovers:
     def _write_handover(self, project: Project, record: Server) -> None:
         own = ids.server_name(record.label, record.attempt)
         # The group of a session is in the session's document.
-        group = None if record.is_sessions else project.group(record.user_id)
+        group = None if record.is_of_session else project.group(record.user_id)
         handover = Handover(record.user_id, group, own)
         with contextlib.suppress(Conflict):  # written by an earlier delivery
             self._platform.documents.create(handover_key(project.id, record.name), handover.to_json())

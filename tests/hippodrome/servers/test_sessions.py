@@ -101,7 +101,7 @@ def test_a_session_gets_one_server_of_its_own(platform: FakePlatform, servers: S
         servers.start(START)
     (request,) = platform.tasks.running.values()
     assert request.name == f"{LABEL}-1"
-    assert record(platform).is_sessions
+    assert record(platform).is_of_session
     assert platform.timers.due[f"{LABEL}-1"][1] == {
         "projectId": "maze", "userId": SESSION, "attempt": 1, "reason": "deadline",
     }  # fmt: skip
@@ -531,7 +531,7 @@ def test_one_server_is_started_ahead_for_every_two_participants_who_are_under_wa
         deliver(platform, servers)
     found = open_sessions(platform)
     assert len(found) == wanted
-    assert all(one.is_sessions and one.state is ServerState.READY for one in found)
+    assert all(one.is_of_session and one.state is ServerState.READY for one in found)
     assert Sweep(platform).run().sessions == 0
 
 
