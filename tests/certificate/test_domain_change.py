@@ -10,6 +10,7 @@ from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates.order import read_stored
 from hippodrome.certificates.rules import FORMER, FailureReason, OrderFailed, location
 from tests.certificate.test_command import own
+from tests.deploy.installation import access_keys
 from tests.deploy.stack.test_domain_change import prepared, world
 
 NEW = location("servers.example.org", "example.org")

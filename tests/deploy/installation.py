@@ -26,6 +26,7 @@ import msgspec
 import pytest
 
 from deploy.__main__ import main
+from deploy.aws.account import Account, open_account
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.participant import Participant, participant_key
@@ -299,6 +300,20 @@ def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: 
 
 
 @pytest.fixture
+def access_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the access keys of an administrator into the environment."""
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def account(access_keys: None) -> Account:
+    """Return the account as the commands open it."""
+    return open_account()
+
+
+@pytest.fixture
 def installed() -> Iterator[Installed]:
+    """Return a new installation."""
     with Installed() as world:
         yield world

@@ -17,9 +17,7 @@ from deploy.stack.settings import StackSettings
 from tests import first_hour
 from tests.deploy.fake_cloudformation import Step
 from tests.deploy.registering import write_study
-from tests.deploy.stack_world import DOMAIN, World, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import DOMAIN, World
 
 DELETED: list[Step] = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
 

@@ -17,7 +17,7 @@ from hippodrome.model.server import Reason
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import Repository
 from testing.studies import study
-from tests.deploy.installation import KEYS, Installed, installed, process  # noqa: F401
+from tests.deploy.installation import Installed
 from tests.deploy.operate.test_stop import start
 
 
@@ -61,13 +61,11 @@ def erase(world: Installed) -> None:
     ],
 )
 def test_finding_and_removing_leftovers_takes_these_calls(
-    installed: Installed,  # noqa: F811
+    installed: Installed,
     remove: Callable[[Installed], None],
     expected: dict[str, int],
-    monkeypatch: pytest.MonkeyPatch,
+    access_keys: None,
 ) -> None:
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     installed.register(msgspec.structs.replace(study(), task_definition="hippodrome"))
     start(installed, "maze", "alice", "bob")
     repository = Repository(installed.platform.documents)

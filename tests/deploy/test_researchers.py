@@ -15,10 +15,8 @@ from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.studies import study
-from tests.deploy.registering import RegisterWorld, machine, register_world
+from tests.deploy.registering import RegisterWorld
 from tests.infra.test_researchers import SHOWN
-
-__all__ = ["machine", "register_world"]
 
 AS_IAM = {
     "s3:ListObjectsV2": "s3:ListBucket",

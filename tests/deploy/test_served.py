@@ -15,9 +15,8 @@ import pytest
 from testing import moto_world
 from testing.moto_world import MotoWorld
 from tests.contract.backends import MotoBackend, name
-from tests.deploy.installation import Installed, installed
+from tests.deploy.installation import Installed
 
-__all__ = ["installed"]
 SIGNED = "AWS4-HMAC-SHA256 Credential=x/20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=0"
 AT_ONCE = 8
 

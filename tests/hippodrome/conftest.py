@@ -1,4 +1,4 @@
-"""A platform in memory for the tests of this folder. Files whose tests need another one have a fixture of the same name."""
+"""Fixtures of this folder's tests: a platform in memory, which a file can replace by its own, and an account in moto."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from lambdas import installed
 from testing import studies
 from testing.fake_platform import FakePlatform
+from testing.moto_world import moto_world  # noqa: F401 - a fixture
 
 
 @pytest.fixture

@@ -12,15 +12,12 @@ from console.problem import Problem
 from deploy.aws import versions as versioned
 from deploy.aws.account import Account, open_account
 from deploy.aws.versions import Version, VersionedBucket
-from tests.deploy.installation import KEYS
 
 NAME = "hippodrome-data"
 
 
 @pytest.fixture
-def account(monkeypatch: pytest.MonkeyPatch) -> Iterator[Account]:
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
+def account(access_keys: None) -> Iterator[Account]:
     with mock_aws():
         account = open_account(region="us-east-1")
         account.client("s3").create_bucket(Bucket=NAME)

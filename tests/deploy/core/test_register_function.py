@@ -14,9 +14,7 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import KEY, SecretCache
 from testing.studies import study
 from tests.deploy.installation import STACK
-from tests.deploy.registering import RegisterWorld, machine, register_world
-
-__all__ = ["machine", "register_world"]
+from tests.deploy.registering import RegisterWorld
 
 
 def hide(register_world: RegisterWorld) -> None:

@@ -1,7 +1,5 @@
 """`doctor` names unreadable documents of an installation with a remedy, and the other commands go on without them."""
 
-# ruff: noqa: F811 - fixtures are imported, and asked for by their names
-
 from __future__ import annotations
 
 import json
@@ -21,8 +19,8 @@ from hippodrome.storage.secret import SecretCache
 from protocol.keys import session_key
 from protocol.session import Member, SessionDocument
 from testing.studies import PAGES, study
-from tests.deploy.installation import Installed, installed  # noqa: F401
-from tests.deploy.operate.test_doctor import account, context  # noqa: F401
+from tests.deploy.installation import Installed
+from tests.deploy.operate.test_doctor import context
 
 USER = "R_3fGxW2vPqT9aBcD"
 CHECKS = {"documents": documents.documents, "pages": documents.step_pages}

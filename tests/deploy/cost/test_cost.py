@@ -31,7 +31,7 @@ from deploy.cost.spent import spent
 from hippodrome.config import read_project
 from hippodrome.model.server import PastAttempt, Reason, Server, ServerState
 from testing.studies import study
-from tests.deploy.installation import ROOT, Installed, environment, installed, process  # noqa: F401
+from tests.deploy.installation import ROOT, Installed, environment, process
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 MAZE = StudyToEstimate(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
@@ -322,7 +322,7 @@ trial: {game: Maze-v0}
 
 
 def test_the_estimate_says_what_warm_servers_cost_an_hour_and_a_day(
-    installed: Installed,  # noqa: F811
+    installed: Installed,
     capsys: Any,
     tmp_path: Path,
 ) -> None:
@@ -344,7 +344,7 @@ def test_the_estimate_says_what_warm_servers_cost_an_hour_and_a_day(
 
 
 def test_spending_has_a_line_for_waiting_and_the_present_cost_of_live_projects(
-    installed: Installed,  # noqa: F811
+    installed: Installed,
     capsys: Any,
 ) -> None:
     live = study(warm_servers=4)
@@ -391,21 +391,21 @@ def test_the_estimate_needs_no_account(capsys: Any, monkeypatch: Any) -> None:
     assert found["prices"]["region"] == "us-east-1"
 
 
-def test_cost_reports_mistakes_in_config_yml(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_cost_reports_mistakes_in_config_yml(installed: Installed, capsys: Any, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text("project:\n  id: maze\n  maxRuntime: soon\n")
     ran = installed.run(capsys, "cost", str(tmp_path))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "config.yml:3" in ran.err
 
 
-def test_games_longer_than_max_runtime_are_refused(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_games_longer_than_max_runtime_are_refused(installed: Installed, capsys: Any) -> None:
     ran = installed.run(capsys, "cost", "--minutes", "30.5")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "runs 30.5 minutes: its maxRuntime is 30" in ran.err
     assert installed.run(capsys, "cost", "--minutes", "30").code == Exit.DONE
 
 
-def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: Any) -> None:
     other = msgspec.structs.replace(study(), id="other")
     installed.register(study(), other)
     for number in range(3):
@@ -422,7 +422,7 @@ def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: An
     assert "No project named labyrinth" in installed.run(capsys, "cost", "--project", "labyrinth").err
 
 
-def test_cost_takes_the_folder_of_a_project(installed: Installed, capsys: Any, tmp_path: Path) -> None:  # noqa: F811
+def test_cost_takes_the_folder_of_a_project(installed: Installed, capsys: Any, tmp_path: Path) -> None:
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     (tmp_path / "config.yml").write_text("project:\n  id: maze\n")
@@ -440,7 +440,7 @@ def answer_bill(world: Installed, *answers: dict[str, float]) -> None:
         world.answer("ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": groups}]})
 
 
-def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> None:
     installed.register(study())
     answer_bill(
         installed,
@@ -463,7 +463,7 @@ def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> No
     ],
 )
 def test_without_cost_explorer_only_the_bill_is_missing(
-    installed: Installed,  # noqa: F811
+    installed: Installed,
     capsys: Any,
     code: str,
     says: str,
@@ -480,7 +480,7 @@ def test_without_cost_explorer_only_the_bill_is_missing(
     assert f"! No bill: {says}" in shown.out
 
 
-def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any) -> None:  # noqa: F811
+def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any) -> None:
     for name, value in {"AWS_ACCESS_KEY_ID": "t", "AWS_SECRET_ACCESS_KEY": "t", "AWS_REGION": "us-east-1"}.items():
         monkeypatch.setenv(name, value)
     ecs = {"Keys": ["Amazon Elastic Container Service"], "Metrics": {"UnblendedCost": {"Amount": "1.5", "Unit": "USD"}}}
@@ -492,7 +492,7 @@ def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any
     assert (found.tagged, found.fargate, found.requests) == ({"Amazon Elastic Container Service": 4.5}, None, 2)
 
 
-def test_as_a_process(installed: Installed) -> None:  # noqa: F811
+def test_as_a_process(installed: Installed) -> None:
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     with installed.served() as env:

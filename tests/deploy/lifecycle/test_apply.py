@@ -18,9 +18,7 @@ from deploy.lifecycle.plan import plan
 from deploy.stack.changes import Prepared
 from deploy.stack.settings import StackSettings
 from tests.deploy.fake_cloudformation import NOTHING, changed_resource, happy, invalid, refusal
-from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function
 
 FIRST = StackSettings(domain=DOMAIN)
 AGAIN = StackSettings()

@@ -27,10 +27,8 @@ from hippodrome.model.messages import StartServer
 from testing.servers import Servers
 from testing.studies import study
 from testing.template import template
-from tests.deploy.installation import KEYS, Installed
-from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function, world
-
-__all__ = ["world"]
+from tests.deploy.installation import Installed
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, function
 
 DATA = "hippodrome-bucket-abc123"
 TAG = [{"Key": "hippodrome:stack", "Value": "hippodrome"}]
@@ -514,10 +512,10 @@ def test_remains_of_a_foreign_deleted_stack_are_left_alone(installed: World, mon
     assert buckets(installed) == {theirs}
 
 
-def test_warm_servers_are_stopped_also_those_that_start_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warm_servers_are_stopped_also_those_that_start_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, access_keys: None
+) -> None:
     """The sweep of a live study starts warm servers again until the sweep itself is deleted."""
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     kept = study(task_definition="hippodrome", warm_servers=2)
     with Installed() as installation:
         installation.register(kept)

@@ -33,9 +33,9 @@ from tests.deploy.real_stack import (
     same_record,
     zone_records,
 )
-from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World, world
+from tests.deploy.stack_world import ACCOUNT, DOMAIN, REGION, World
 
-__all__ = ["installed", "world"]
+__all__ = ["installed"]
 
 
 @pytest.fixture

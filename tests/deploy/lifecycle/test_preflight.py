@@ -25,9 +25,7 @@ from deploy.stack.changes import prepare
 from deploy.stack.settings import StackSettings
 from tests.certificate.nameserver import SERVFAIL, answering, ask_only
 from tests.deploy.registering import write_study
-from tests.deploy.stack_world import DOMAIN, World, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import DOMAIN, World
 
 FIRST = StackSettings(domain=DOMAIN)
 NOBODY = Delegation((), "The Internet knows no name servers for example.org.")

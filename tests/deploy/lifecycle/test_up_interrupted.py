@@ -15,9 +15,7 @@ from deploy.lifecycle import up
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import happy
 from tests.deploy.registering import write_study
-from tests.deploy.stack_world import DOMAIN, World, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import DOMAIN, World
 
 
 class InterruptedClient:

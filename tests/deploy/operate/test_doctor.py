@@ -18,7 +18,7 @@ import msgspec
 import pytest
 
 from console.problem import Exit
-from deploy.aws.account import Account, find_installation, open_account
+from deploy.aws.account import Account, find_installation
 from deploy.aws.hosted_zone import Delegation
 from deploy.core.finding import Finding, Mark, examine
 from deploy.operate.doctor import CHECKS, addresses, capacity, images, safety
@@ -34,7 +34,7 @@ from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study
 from tests.certificate.pebble import make_ca
 from tests.deploy.certificates import chain
-from tests.deploy.installation import KEYS, ROOT, Installed, installed, process  # noqa: F401
+from tests.deploy.installation import ROOT, Installed, process
 
 TLS_ONLY = {
     "Effect": "Deny",
@@ -46,7 +46,7 @@ V2 = "application/vnd.docker.distribution.manifest.v2+json"
 
 
 @pytest.fixture
-def world(installed: Installed) -> Installed:  # noqa: F811
+def world(installed: Installed) -> Installed:
     """A healthy installation with one live project."""
     installed.register(project(installed))
     for file, source in PAGES.items():
@@ -95,13 +95,6 @@ def definition(world: Installed, name: str = "hippodrome-maze", container: str =
 def project(world: Installed, **changes: Any) -> Project:
     task = changes.pop("task_definition", None) or definition(world)
     return msgspec.structs.replace(study(task_definition=task, server_port=443), **changes)
-
-
-@pytest.fixture
-def account(monkeypatch: Any) -> Account:
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
-    return open_account()
 
 
 def context(account: Account, at_once: int = 20, **changes: Any) -> CheckContext:
@@ -335,7 +328,7 @@ def test_a_missing_certificate_is_bad(world: Installed, account: Account) -> Non
 # Capacity
 
 
-def fresh(installed: Installed) -> None:  # noqa: F811
+def fresh(installed: Installed) -> None:
     installed._answers.clear()
 
 

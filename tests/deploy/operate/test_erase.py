@@ -33,7 +33,7 @@ from hippodrome.storage.repository import Repository
 from testing import template as cfn
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import KEYS, CommandResult, Installed, installed  # noqa: F401
+from tests.deploy.installation import CommandResult, Installed
 from tests.test_docs import code
 
 STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
@@ -42,13 +42,11 @@ ANN, ANNA = "annabel-0042", "annabel-0042b"
 
 
 @pytest.fixture
-def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed:  # noqa: F811
+def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: None) -> Installed:
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", -VALID_SECONDS)
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     return installed
 
 

@@ -32,7 +32,7 @@ from protocol.keys import groups_key, session_key, sessions_folder, waiting_key
 from protocol.session import parse
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import KEYS, CommandResult, Installed, installed  # noqa: F401
+from tests.deploy.installation import CommandResult, Installed
 from tests.export.session_world import (
     ANN,
     BOB,
@@ -54,13 +54,11 @@ LABEL = ids.server_label("maze", ANN)
 
 
 @pytest.fixture
-def world(installed: Installed, tmp_path: Path, monkeypatch: Any) -> Installed:  # noqa: F811
+def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: None) -> Installed:
     installed.register(STUDY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
     monkeypatch.setattr("deploy.operate.eraser.SIGNING", -VALID_SECONDS - STORE_AFTER_CLOSE.total_seconds())
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     return installed
 
 

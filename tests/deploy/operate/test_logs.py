@@ -16,7 +16,7 @@ from deploy.operate import logs
 from deploy.operate.log_lines import moment, read
 from testing import template as cfn
 from testing.studies import study
-from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.deploy.installation import Installed, process
 
 NOW = datetime.now(UTC)
 
@@ -49,7 +49,7 @@ def test_each_log_group_of_the_template_has_a_source() -> None:
     assert all(group.startswith(resource_names.log_prefixes("lab")) for group in groups)
 
 
-def test_the_sites_access_log_is_read_with_the_others(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_the_sites_access_log_is_read_with_the_others(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "next_step", log_message("INFO", "first"), ago=50)
     put_messages(installed, "api", '{"route":"GET /next","status":"200"}', ago=40)
     assert [one["source"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["next_step", "api"]
@@ -60,7 +60,7 @@ def lines(ran: Any) -> list[dict[str, Any]]:
     return [json.loads(line) for line in ran.out.splitlines()]
 
 
-def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "start_server", log_message("INFO", "first", server="s1"), ago=50)
     put_messages(installed, "trial", "2026-11-21 17:26:57,496 WARNING second", ago=40, stream="maze/trial/1")
     put_messages(
@@ -79,14 +79,14 @@ def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, cap
     assert "ERROR   third  code=SlowDown" in text
 
 
-def test_lines_with_metrics_are_not_shown(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_lines_with_metrics_are_not_shown(installed: Installed, capsys: Any) -> None:
     metrics = json.dumps({"_aws": {"CloudWatchMetrics": []}, "Stack": "hippodrome", "Servers": [4.0]})
     put_messages(installed, "sweep", log_message("INFO", "swept", tasks=0), metrics)
     assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["swept"]
     assert "metrics  Stack=hippodrome Servers=[4.0]" in installed.run(capsys, "logs", "--all").out
 
 
-def test_logs_says_that_there_are_no_lines(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_logs_says_that_there_are_no_lines(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "sweep", log_message("INFO", "swept"))
     ran = installed.run(capsys, "logs", "--errors", "--since", "10m")
     assert (ran.code, ran.out) == (Exit.DONE, "")
@@ -100,13 +100,13 @@ def test_events_without_ids_are_followed() -> None:
     assert logs._id_of({**events[0], "eventId": "e"}) == "e"
 
 
-def test_lines_of_more_than_a_page_are_all_shown(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_lines_of_more_than_a_page_are_all_shown(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "next_step", *[log_message("INFO", f"line {n}") for n in range(10_500)], ago=600)
     ran = installed.run(capsys, "logs", "next_step", "--json")
     assert [one["message"] for one in lines(ran)] == [f"line {n}" for n in range(10_500)]
 
 
-def test_errors_can_be_shown_alone_with_the_tracebacks_of_trials(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_errors_can_be_shown_alone_with_the_tracebacks_of_trials(installed: Installed, capsys: Any) -> None:
     trial = ["t 1 INFO fine", "2026-11-21 17:26:57 INFO fine", "2026-11-21 17:26:58 ERROR the agent failed"]
     put_messages(
         installed,
@@ -139,7 +139,7 @@ def test_errors_can_be_shown_alone_with_the_tracebacks_of_trials(installed: Inst
     assert "id-of-somebody" not in ran.out
 
 
-def test_the_lines_of_one_project_can_be_shown_alone(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_the_lines_of_one_project_can_be_shown_alone(installed: Installed, capsys: Any) -> None:
     other = msgspec.structs.replace(study(), id="other")
     installed.register(study(), other)
     mine, theirs = installed.record("alice"), installed.record("alice", project=other)
@@ -159,13 +159,13 @@ def test_the_lines_of_one_project_can_be_shown_alone(installed: Installed, capsy
     assert "No project named labyrinth" in installed.run(capsys, "logs", "--project", "labyrinth").err
 
 
-def test_without_permission_to_list_groups_those_of_the_template_are_read(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_without_permission_to_list_groups_those_of_the_template_are_read(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "stop_server", log_message("INFO", "hello"))
     installed.fail("logs:DescribeLogGroups", "AccessDeniedException", status=400)
     assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["hello"]
 
 
-def test_since_says_how_far_back_lines_are_shown(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_since_says_how_far_back_lines_are_shown(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "sweep", log_message("INFO", "old"), ago=7200)
     put_messages(installed, "sweep", log_message("INFO", "new"), ago=5)
     assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["new"]
@@ -213,7 +213,7 @@ def test_hostile_lines_hold_no_escape_sequences_and_become_valid_json(message: s
     json.dumps(line.as_json())
 
 
-def test_following_shows_each_event_once_including_late_ones(installed: Installed) -> None:  # noqa: F811
+def test_following_shows_each_event_once_including_late_ones(installed: Installed) -> None:
     put_messages(installed, "sweep", log_message("INFO", "one"), ago=20)
     reader = logs.Reader(installed.client("logs"), "hippodrome")
     more = iter([(log_message("INFO", "two"), 2.0), (log_message("INFO", "late"), 15.0)])
@@ -233,7 +233,7 @@ def test_following_shows_each_event_once_including_late_ones(installed: Installe
     assert shown == ["one", "two", "late"]
 
 
-def test_as_a_process(installed: Installed) -> None:  # noqa: F811
+def test_as_a_process(installed: Installed) -> None:
     put_messages(
         installed, "start_server", log_message("INFO", "starting", server="s"), log_message("ERROR", "it failed")
     )

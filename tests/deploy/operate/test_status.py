@@ -23,13 +23,13 @@ from protocol.keys import session_key
 from protocol.session import Member, SessionDocument
 from testing.studies import study
 from tests.deploy.certificates import chain
-from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.deploy.installation import Installed, process
 
 CLOSED = msgspec.structs.replace(study(), id="old", live=False)
 
 
 @pytest.fixture
-def world(installed: Installed) -> Installed:  # noqa: F811
+def world(installed: Installed) -> Installed:
     installed.register(study(), CLOSED)
     return installed
 
@@ -291,7 +291,7 @@ def test_a_broken_list_of_projects_is_reported_in_a_sentence(world: Installed, c
     assert "The list of projects cannot be read" in look(world, capsys)["problems"]["projects"]
 
 
-def test_status_of_an_installation_without_projects_says_so(installed: Installed, capsys: Any) -> None:  # noqa: F811
+def test_status_of_an_installation_without_projects_says_so(installed: Installed, capsys: Any) -> None:
     assert look(installed, capsys)["projects"] == []
     assert "No project is registered yet" in installed.run(capsys, "status").out
 

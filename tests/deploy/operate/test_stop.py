@@ -20,13 +20,13 @@ from hippodrome.ports import DnsRecord, RunningTask, TaskRequest
 from hippodrome.storage.repository import Repository
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import Installed, installed, process  # noqa: F401
+from tests.deploy.installation import Installed, process
 
 OTHER = msgspec.structs.replace(study(), id="other")
 
 
 @pytest.fixture
-def world(installed: Installed) -> Installed:  # noqa: F811
+def world(installed: Installed) -> Installed:
     definition = "hippodrome"
     installed.register(
         msgspec.structs.replace(study(), task_definition=definition),

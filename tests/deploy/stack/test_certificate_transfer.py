@@ -20,9 +20,7 @@ from hippodrome.certificates.order import Issued, OrderRequest, read_chain
 from hippodrome.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
 from tests.deploy.certificates import chain
 from tests.deploy.lifecycle.test_destroy import TAG, buckets, make_bucket
-from tests.deploy.stack_world import DOMAIN, REGION, World, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import DOMAIN, REGION, World
 
 FULLCHAIN, PRIVKEY, STATE = location(f"servers.{DOMAIN}", DOMAIN)
 

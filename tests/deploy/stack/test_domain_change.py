@@ -16,14 +16,12 @@ from deploy.stack import domain_change
 from deploy.stack.changes import Prepared
 from deploy.stack.stack import Stack
 from hippodrome.model.server import ServerState
-from tests.deploy.installation import KEYS, Installed
+from tests.deploy.installation import Installed
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installed]:
+def world(monkeypatch: pytest.MonkeyPatch, access_keys: None) -> Iterator[Installed]:
     """An installation of an earlier version: servers have names directly below example.org."""
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     # Gap: moto's hosted zones have ids that begin with anything. AWS's begin with Z.
     monkeypatch.setattr(HostedZoneIdentifier, "generate", lambda *_, **__: "Z0123456789ABCDEFGHIJ")
     with Installed(ServersHost="") as made:

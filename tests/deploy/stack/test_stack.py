@@ -19,9 +19,7 @@ from deploy.stack import stack as stacks
 from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.settings import StackSettings, option
 from deploy.stack.stack import Stack
-from tests.deploy.stack_world import ACCOUNT, REGION, TEMPLATE, World, function, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import ACCOUNT, REGION, TEMPLATE, World, function
 
 FAILED_CREATION = [
     ("CREATE_IN_PROGRESS", [("Vpc", "AWS::EC2::VPC", "CREATE_IN_PROGRESS", "")]),

@@ -15,9 +15,7 @@ from deploy.stack.settings import StackSettings
 from deploy.stack.states import StackAction
 from testing.exploration import sample
 from tests.deploy.fake_cloudformation import Step, happy
-from tests.deploy.stack_world import DOMAIN, World, world
-
-__all__ = ["world"]
+from tests.deploy.stack_world import DOMAIN, World
 
 CLOUDFORMATION = botocore.session.get_session().get_service_model("cloudformation")
 STATES: list[str] = CLOUDFORMATION.shape_for("StackStatus").enum

@@ -12,10 +12,8 @@ import yaml
 
 from console.problem import Exit
 from deploy.study.image.follow import advice
-from tests.deploy.registering import LOG_GROUP, RegisterWorld, fake_docker, folder, machine, register_world
+from tests.deploy.registering import LOG_GROUP, RegisterWorld, fake_docker
 from trial import check
-
-__all__ = ["folder", "machine", "register_world"]
 
 
 def test_a_build_gets_its_variables_and_its_log_is_shown(

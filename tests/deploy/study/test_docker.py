@@ -9,9 +9,7 @@ import pytest
 from console.problem import Exit, Problem
 from deploy.study.image import docker
 from deploy.study.image.bundle import make_bundle
-from tests.deploy.registering import RegisterWorld, docker_calls, fake_docker, folder, machine, register_world
-
-__all__ = ["folder", "machine", "register_world"]
+from tests.deploy.registering import RegisterWorld, docker_calls, fake_docker
 
 
 def test_docker_builds_where_it_runs(

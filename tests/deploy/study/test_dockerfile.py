@@ -15,11 +15,10 @@ import yaml
 
 from deploy.study.image.bundle import make_bundle
 from hippodrome.ports import PORTS
-from tests.deploy.recipe import Container, Recipe, recipe, stages
-from tests.deploy.registering import folder, machine, register_world, write_study
+from tests.deploy.recipe import Container, Recipe, stages
+from tests.deploy.registering import write_study
 from tests.trial.conftest import client_of, grid_agent
 
-__all__ = ["folder", "machine", "recipe", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 

@@ -10,11 +10,9 @@ import pytest
 
 from deploy.study.image.bundle import make_bundle
 from testing.waiting import until
-from tests.deploy.recipe import Container, Recipe, recipe, stages
-from tests.deploy.registering import folder, machine, register_world, write_study
+from tests.deploy.recipe import Container, Recipe, stages
+from tests.deploy.registering import write_study
 from tests.trial.conftest import grid_agent
-
-__all__ = ["folder", "machine", "recipe", "register_world"]
 
 
 def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "150", **trial: Any) -> tuple[int, str]:

@@ -13,9 +13,8 @@ import pytest
 
 from deploy.study.image import bundle
 from deploy.study.image.bundle import make_bundle
-from tests.deploy.registering import folder, machine, register_world, write_study
+from tests.deploy.registering import write_study
 
-__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 

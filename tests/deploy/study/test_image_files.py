@@ -12,9 +12,8 @@ from console.problem import Problem
 from deploy.study.image import files
 from deploy.study.image.bundle import make_bundle
 from deploy.study.image.files import Ignore, project_files
-from tests.deploy.registering import folder, machine, register_world, write_study
+from tests.deploy.registering import write_study
 
-__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 
 

@@ -19,13 +19,13 @@ from lambdas import update_project_master_list
 from testing.studies import PAGES, study
 from testing.visitors import Browser
 from tests.deploy.installation import CommandResult
-from tests.deploy.registering import RegisterWorld, machine, register_world  # noqa: F401
+from tests.deploy.registering import RegisterWorld
 
 SIGNED = msgspec.structs.replace(study(), signed_links=True)
 
 
 @pytest.fixture
-def world(register_world: RegisterWorld) -> RegisterWorld:  # noqa: F811
+def world(register_world: RegisterWorld) -> RegisterWorld:
     register_world.register(SIGNED, msgspec.structs.replace(study(), id="open"))
     for file, source in PAGES.items():
         register_world.put(f"maze/steps/{file}.html", source.encode())

@@ -20,13 +20,9 @@ from tests.deploy.registering import (
     RegisterWorld,
     bodies,
     configure,
-    folder,
-    machine,
-    register_world,
     write_study,
 )
 
-__all__ = ["folder", "machine", "register_world"]
 ROOT = Path(__file__).resolve().parents[3]
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]

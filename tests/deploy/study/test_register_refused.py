@@ -14,9 +14,8 @@ from deploy.study import pages
 from hippodrome import registry
 from hippodrome.registry import NotRegistered
 from testing.files import write_files
-from tests.deploy.registering import CONFIG, RegisterWorld, configure, folder, machine, register_world, write_study
+from tests.deploy.registering import CONFIG, RegisterWorld, configure, write_study
 
-__all__ = ["folder", "machine", "register_world"]
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]
 

@@ -16,10 +16,8 @@ from testing.aws_events import ACCOUNT
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import Judge, evaluator
-from tests.deploy.installation import KEYS
-from tests.deploy.registering import CONFIG, RegisterWorld, folder, machine, register_world, write_study
+from tests.deploy.registering import CONFIG, RegisterWorld, write_study
 
-__all__ = ["folder", "machine", "register_world"]
 Capsys = pytest.CaptureFixture[str]
 
 
@@ -50,10 +48,8 @@ def _together(register_world: RegisterWorld, *folders: Path) -> list[dict[str, A
 
 
 def test_two_projects_registered_at_once_are_both_registered(
-    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    register_world: RegisterWorld, tmp_path: Path, access_keys: None
 ) -> None:
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     names = [f"study-{number}" for number in range(4)]
     folders = [write_study(tmp_path / name, CONFIG.replace("id: maze", f"id: {name}")) for name in names]
     results = _together(register_world, *folders)
@@ -66,10 +62,8 @@ def test_two_projects_registered_at_once_are_both_registered(
 
 
 def test_two_versions_registered_at_once_both_succeed_and_share_one_image(
-    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    register_world: RegisterWorld, tmp_path: Path, access_keys: None
 ) -> None:
-    for name, value in KEYS.items():
-        monkeypatch.setenv(name, value)
     folders = [
         write_study(tmp_path / who, CONFIG.replace("A maze", who), steps__thanks_DOT_html=who) for who in ("Ada", "Bob")
     ]

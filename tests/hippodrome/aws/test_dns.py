@@ -1,7 +1,5 @@
 """What `Route53Dns` asks of Route 53, and what it makes of its answers."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -14,7 +12,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import retry
 from hippodrome.model import ids
 from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 
 def _record(n: int, host: str | None = None) -> DnsRecord:

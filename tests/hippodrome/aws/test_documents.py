@@ -1,7 +1,5 @@
 """What `S3Documents` makes of S3's answers, beyond the contract."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 import pytest
@@ -10,7 +8,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import documents
 from hippodrome.aws.documents import content_type
 from hippodrome.ports import Conflict
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 KEY = "study/users/P1/participant.json"
 

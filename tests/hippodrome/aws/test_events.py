@@ -1,7 +1,5 @@
 """The events that `MotoWorld` makes have the shape of those in `tests/events`."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 import base64
@@ -12,7 +10,7 @@ import pytest
 
 from hippodrome.ports import TaskRequest
 from testing import aws_events
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 NAME = "s" + "a" * 20 + "-1"
 

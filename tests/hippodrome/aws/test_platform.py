@@ -1,7 +1,5 @@
 """`AwsPlatform`: what it loads, when, and what it says when something is missing."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 import subprocess
@@ -11,7 +9,7 @@ import pytest
 
 from hippodrome.aws import AwsPlatform
 from hippodrome.ports import DnsRecord, Topic
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 
 def _loaded(code: str) -> set[str]:

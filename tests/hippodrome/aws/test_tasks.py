@@ -1,7 +1,5 @@
 """What `EcsTasks` asks of ECS and EC2, and what it makes of their answers."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 from dataclasses import replace
@@ -12,7 +10,7 @@ from botocore.exceptions import ClientError
 
 from hippodrome.aws.tasks import client_token
 from hippodrome.ports import NoCapacity, Refused, TaskRequest
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 NAME = "s" + "a" * 20 + "-1"
 REQUEST = TaskRequest(NAME, "hippodrome", "hippodrome", 0.25, 0.5, {"TOKEN": "secret", "USER_ID": "P1"})

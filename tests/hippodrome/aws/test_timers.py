@@ -1,7 +1,5 @@
 """What `SchedulerTimers` and `SnsBus` ask of AWS, beyond the contract."""
 
-# ruff: noqa: F401, F811 - the fixture is imported, and asked for by its name
-
 from __future__ import annotations
 
 import json
@@ -11,7 +9,7 @@ import pytest
 from botocore.exceptions import ClientError
 
 from hippodrome.ports import Topic
-from testing.moto_world import MotoWorld, moto_world
+from testing.moto_world import MotoWorld
 
 NAME = "s" + "a" * 20 + "-1"
 MESSAGE = {"projectId": "study", "userId": "P1"}

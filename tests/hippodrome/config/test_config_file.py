@@ -7,9 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import ConfigErrors, read_project
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, small
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, small
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import ConfigErrors, fargate, parse_registration
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
-
-__all__ = ["folder"]
-
+from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, read, small
 
 # Keys
 

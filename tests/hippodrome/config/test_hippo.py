@@ -17,9 +17,7 @@ from hippodrome.config import Config, parse_registration, read_project
 from hippodrome.config.__main__ import main
 from hippodrome.config.hippo import CLOSING_PAGE, adapt
 from protocol.values import Plain
-from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, read, small
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import HIPPO, SMALL, mistakes, read, small
 
 
 def remarks(config: Config) -> list[str]:

@@ -9,9 +9,7 @@ import pytest
 from hippodrome.config import read_project
 from hippodrome.config.hippo_pages import hosts
 from hippodrome.config.project_keys import MAX_HOSTS
-from tests.hippodrome.config.folder import SMALL, folder
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import SMALL
 
 
 @pytest.fixture

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import ConfigErrors, layout, read_project, remarks
-from tests.hippodrome.config.folder import SMALL, folder
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import SMALL
 
 APPS = ("App", "src/hippogym_app")
 

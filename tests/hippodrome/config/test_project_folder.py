@@ -9,10 +9,7 @@ import pytest
 
 from hippodrome.config import ConfigErrors, read_project
 from hippodrome.config.__main__ import main
-from tests.hippodrome.config.folder import HIPPO, SMALL, folder, mistakes, only_mistake, read, small
-
-__all__ = ["folder"]
-
+from tests.hippodrome.config.folder import HIPPO, SMALL, mistakes, only_mistake, read, small
 
 # Accepted folders
 

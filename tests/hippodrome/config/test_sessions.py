@@ -8,9 +8,7 @@ import pytest
 
 from hippodrome.config import ConfigErrors, parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
-from tests.hippodrome.config.folder import folder, mistakes, only_mistake, read, small
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import mistakes, only_mistake, read, small
 
 TWO = "players: {a: human, b: human}\n"
 STEPS = "1: consent\n2: game\n3: thanks\n"

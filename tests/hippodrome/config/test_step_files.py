@@ -7,10 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.config import remarks
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
-
-__all__ = ["folder"]
-
+from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, read, small
 
 # The last step
 

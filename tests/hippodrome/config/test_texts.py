@@ -12,9 +12,7 @@ from hippodrome.config import english, parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
 from hippodrome.model.project import Project
 from hippodrome.model.texts import ENGLISH, texts_of
-from tests.hippodrome.config.folder import SMALL, folder, mistakes, only_mistake, read, small
-
-__all__ = ["folder"]
+from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, read, small
 
 ROOT = Path(__file__).parents[3]
 GERMAN = (ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8")
