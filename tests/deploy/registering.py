@@ -18,18 +18,19 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import botocore.handlers
 import pytest
 from botocore.awsrequest import AWSResponse
 from botocore.response import StreamingBody
 
+from console.problem import Exit
 from deploy.study.image import codebuild
 from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json
 from lambdas import installed, update_project_master_list
-from tests.deploy.installation import Installed
+from tests.deploy.installation import CommandResult, Installed
 
 LOG_GROUP = "/hippodrome/hippodrome/image"
 
@@ -286,7 +287,26 @@ def register_world(machine: None) -> Iterator[RegisterWorld]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Return a study's folder."""
     return write_study(tmp_path / "study")
+
+
+class Register(Protocol):
+    """`register` of the folder with more arguments; with `code`, it has to end so."""
+
+    def __call__(self, *arguments: str, code: Exit | None = None) -> CommandResult: ...
+
+
+@pytest.fixture
+def register(register_world: RegisterWorld, capsys: pytest.CaptureFixture[str], folder: Path) -> Register:
+    """Return what registers the folder."""
+
+    def call(*arguments: str, code: Exit | None = None) -> CommandResult:
+        ran = register_world.run(capsys, "register", str(folder), *arguments)
+        assert code is None or ran.code == code, ran.err
+        return ran
+
+    return call
 
 
 def configure(folder: Path, *changes: tuple[str, str]) -> None:

@@ -9,21 +9,16 @@ import pytest
 from console.problem import Exit, Problem
 from deploy.study.image import docker
 from deploy.study.image.bundle import make_bundle
-from tests.deploy.registering import RegisterWorld, docker_calls, fake_docker
+from tests.deploy.registering import Register, RegisterWorld, docker_calls, fake_docker
 
 
 def test_docker_builds_where_it_runs(
-    register_world: RegisterWorld,
-    folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     register_world.docker = fake_docker(tmp_path / "bin")
     monkeypatch.setenv("PATH", str(register_world.docker))
     register_world.put_image("maze-aaaaaaaaaaaa")
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    register(code=Exit.DONE)
     assert register_world.builds == []
     calls = docker_calls(register_world.docker)
     login = next(call for call in calls if call["words"][0] == "login")
@@ -37,37 +32,28 @@ def test_docker_builds_where_it_runs(
     assert {"Dockerfile", "trial/__main__.py", "project/agent.py", "requirements/project.txt"} <= set(
         calls[-1]["files"]
     )
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    register(code=Exit.DONE)
     assert docker_calls(register_world.docker) == calls  # the image is not built twice
 
 
 def test_build_on_aws_does_not_use_docker(
-    register_world: RegisterWorld,
-    folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     register_world.docker = fake_docker(tmp_path / "bin")
     monkeypatch.setenv("PATH", str(register_world.docker))
-    assert register_world.run(capsys, "register", str(folder), "--build-on-aws").code == Exit.DONE
+    register("--build-on-aws", code=Exit.DONE)
     assert len(register_world.builds) == 1
     assert docker_calls(register_world.docker) == []
 
 
 def test_a_failure_of_docker_is_reported(
-    register_world: RegisterWorld,
-    folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    register_world: RegisterWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     register_world.docker = fake_docker(
         tmp_path / "bin", build=1, says="#7 ERROR: No matching distribution found for nosuch"
     )
     monkeypatch.setenv("PATH", str(register_world.docker))
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert "requirements.txt asks for nosuch" in ran.err
     assert register_world.project() is None
 

@@ -17,6 +17,7 @@ from hippodrome.model import ids
 from lambdas import next_step, start_server
 from tests.deploy.registering import (
     CONFIG,
+    Register,
     RegisterWorld,
     bodies,
     configure,
@@ -31,9 +32,8 @@ Capsys = pytest.CaptureFixture[str]
 # --- the whole way ------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_becomes_a_link(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+def test_a_folder_becomes_a_link(register_world: RegisterWorld, register: Register) -> None:
+    ran = register(code=Exit.DONE)
     assert LINK in ran.out.split()
     project = register_world.project()
     assert project is not None
@@ -49,8 +49,8 @@ def test_a_folder_becomes_a_link(register_world: RegisterWorld, folder: Path, ca
     assert register_world.builds[0].env["IMAGE"] == f"{register_world.repository}:{tag}"
 
 
-def test_register_answers_in_json(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    answer = register_world.run(capsys, "register", str(folder), "--json").json
+def test_register_answers_in_json(register_world: RegisterWorld, register: Register) -> None:
+    answer = register("--json").json
     assert answer["link"] == LINK
     assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 0}
     assert answer["imageBuilt"] is True
@@ -59,9 +59,9 @@ def test_register_answers_in_json(register_world: RegisterWorld, folder: Path, c
     assert answer["live"] is True
 
 
-def test_register_makes_the_task_definition(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_register_makes_the_task_definition(register_world: RegisterWorld, folder: Path, register: Register) -> None:
     configure(folder, ("cpu: 1, memory: 2", "cpu: 0.5, memory: 3"))
-    answer = register_world.run(capsys, "register", str(folder), "--json").json
+    answer = register("--json").json
     ecs = register_world.client("ecs")
     found = ecs.describe_task_definition(taskDefinition="hippodrome-maze", include=["TAGS"])
     task, tags = found["taskDefinition"], {tag["key"]: tag["value"] for tag in found["tags"]}
@@ -89,19 +89,19 @@ def test_register_makes_the_task_definition(register_world: RegisterWorld, folde
 
 
 def test_a_study_takes_the_installations_port_when_it_is_registered_again(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, register: Register
 ) -> None:
     register_world.change(ServerPort="5000")
-    register_world.run(capsys, "register", str(folder))
+    register()
     first = register_world.project()
     (container,) = register_world.client("ecs").describe_task_definition(taskDefinition=first.task_definition)[
         "taskDefinition"
     ]["containerDefinitions"]
     assert (first.server_port, container["portMappings"][0]["containerPort"]) == (5000, 5000)
     assert not container.get("systemControls")
-    assert "Nothing to do" in register_world.run(capsys, "register", str(folder), "--dry-run").out
+    assert "Nothing to do" in register("--dry-run").out
     register_world.change(ServerPort="443")
-    register_world.run(capsys, "register", str(folder))
+    register()
     again = register_world.project()
     assert again.server_port == 443
     assert again.task_definition != first.task_definition
@@ -140,13 +140,13 @@ def test_a_participant_comes_and_a_server_starts(register_world: RegisterWorld, 
     assert call.params["startedBy"] == ids.server_name(ids.server_label("ms-pacman", "ada"), 1)
 
 
-def test_a_study_without_a_game_needs_no_image(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_a_study_without_a_game_needs_no_image(register_world: RegisterWorld, folder: Path, register: Register) -> None:
     configure(
         folder,
         ("{1: consent, 2: game, 3: thanks}", "{1: consent, 2: thanks}"),
         ("trial:\n  game: ALE/MsPacman-v5\n", ""),
     )
-    answer = register_world.run(capsys, "register", str(folder), "--json").json
+    answer = register("--json").json
     assert (answer["image"], answer["taskDefinition"]) == (None, None)
     assert register_world.project().task_definition is None
     assert (register_world.builds, register_world.image_tags(), register_world.revisions()) == ([], [], [])
@@ -155,12 +155,12 @@ def test_a_study_without_a_game_needs_no_image(register_world: RegisterWorld, fo
 # --- again --------------------------------------------------------------------------------------------------------
 
 
-def test_register_without_changes_does_nothing(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    register_world.run(capsys, "register", str(folder))
+def test_register_without_changes_does_nothing(register_world: RegisterWorld, register: Register) -> None:
+    register()
     before = bodies(register_world)
     salt = register_world.project().salt
     with register_world.recording() as calls:
-        answer = register_world.run(capsys, "register", str(folder), "--json").json
+        answer = register("--json").json
     writes = {"s3:DeleteObject", "ecs:RegisterTaskDefinition", "codebuild:StartBuild"}
     assert not writes & {call.action for call in calls}
     assert not [call for call in calls if call.action == "s3:PutObject" and "/steps/" in call.params["Key"]]
@@ -171,11 +171,11 @@ def test_register_without_changes_does_nothing(register_world: RegisterWorld, fo
     assert register_world.project().salt == salt != ""
 
 
-def test_only_the_changed_page_is_uploaded(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    register_world.run(capsys, "register", str(folder))
+def test_only_the_changed_page_is_uploaded(register_world: RegisterWorld, folder: Path, register: Register) -> None:
+    register()
     (folder / "steps/consent.html").write_text("<p>May we?</p>")
     with register_world.recording() as calls:
-        register_world.run(capsys, "register", str(folder))
+        register()
     put = [call.params["Key"] for call in calls if call.action == "s3:PutObject"]
     assert [key for key in put if key.startswith("maze/")] == ["maze/steps/consent.html"]
     assert register_world.get("maze/steps/consent.html") == b"<p>May we?</p>"
@@ -183,39 +183,38 @@ def test_only_the_changed_page_is_uploaded(register_world: RegisterWorld, folder
 
 
 def test_a_live_study_keeps_its_pages_until_its_new_image_exists(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    register(code=Exit.DONE)
     before = bodies(register_world)
     (folder / "steps/consent.html").write_text("<p>Another consent</p>")
     (folder / "agent.py").write_text("# another agent\n")
     register_world.outcome = "FAILED"
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.FAILED
+    register(code=Exit.FAILED)
     assert bodies(register_world) == before
 
 
-def test_a_page_whose_etag_is_no_md5_is_read(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_a_page_whose_etag_is_no_md5_is_read(register_world: RegisterWorld, register: Register) -> None:
     """With a KMS key the ETag is no hash of the content, so the content itself is compared."""
-    register_world.run(capsys, "register", str(folder))
+    register()
     s3 = register_world.client("s3")
     listed = s3.list_objects_v2(Bucket=register_world.env["BUCKET"], Prefix="maze/steps/")["Contents"]
     lines = [{**line, "ETag": f'"{hashlib.md5(line["Key"].encode()).hexdigest()}"'} for line in listed]
     register_world.answer("s3:ListObjectsV2", {"Contents": lines, "IsTruncated": False})
     with register_world.recording() as calls:
-        answer = register_world.run(capsys, "register", str(folder), "--json").json
+        answer = register("--json").json
     assert answer["pages"]["same"] == 3
     assert [call.params["Key"] for call in calls if call.action == "s3:GetObject" and "/steps/" in call.params["Key"]]
 
 
-def test_deleted_pages_are_removed_last(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    register_world.run(capsys, "register", str(folder))
+def test_deleted_pages_are_removed_last(register_world: RegisterWorld, folder: Path, register: Register) -> None:
+    register()
     (folder / "steps/consent.html").unlink()
     for group in range(2):
         (folder / f"steps/consent-{group}.html").write_text(f"<p>{group}</p>")
     register_world.put("maze/users/ada/answers/1.json", b"{}")
     register_world.put("maze-two/steps/consent.html", b"another project's")
-    ran = register_world.run(capsys, "register", str(folder), "--yes")
-    assert ran.code == Exit.DONE, ran.err
+    register("--yes", code=Exit.DONE)
     assert register_world.keys("maze/steps/") == [
         f"maze/steps/{name}" for name in ("consent-0.html", "consent-1.html", "maze.png", "thanks.html")
     ]
@@ -226,19 +225,17 @@ def test_deleted_pages_are_removed_last(register_world: RegisterWorld, folder: P
 
 
 def test_another_size_is_another_revision_of_the_same_image(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
-    register_world.run(capsys, "register", str(folder))
+    register()
     configure(folder, ("memory: 2", "memory: 4"))
-    register_world.run(capsys, "register", str(folder))
+    register()
     assert len(register_world.builds) == 1
     assert [arn.rpartition(":")[2] for arn in register_world.revisions()] == ["1", "2"]
     assert register_world.project().task_definition == register_world.revisions()[1]
 
 
-def test_pages_of_more_than_a_listing_are_registered(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
-) -> None:
+def test_pages_of_more_than_a_listing_are_registered(register_world: RegisterWorld, register: Register) -> None:
     """S3 lists 1,000 keys at a time; here a page has one key."""
     for name in ("a.txt", "b.txt", "c.txt"):
         register_world.put(f"maze/steps/{name}", b"x")
@@ -247,7 +244,7 @@ def test_pages_of_more_than_a_listing_are_registered(
     assert first["IsTruncated"]
     first.pop("ResponseMetadata")
     register_world.answer("s3:ListObjectsV2", first)
-    answer = register_world.run(capsys, "register", str(folder), "--json").json
+    answer = register("--json").json
     assert answer["pages"] == {"uploaded": 3, "same": 0, "removed": 3}
     assert len(register_world.keys("maze/steps/")) == 3
 
@@ -255,37 +252,36 @@ def test_pages_of_more_than_a_listing_are_registered(
 # --- open and closed ----------------------------------------------------------------------------------------------
 
 
-def test_a_study_can_be_closed_and_opened_again(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    register_world.run(capsys, "register", str(folder))
+def test_a_study_can_be_closed_and_opened_again(register_world: RegisterWorld, register: Register) -> None:
+    register()
     known = register_world.project()
-    ran = register_world.run(capsys, "register", str(folder), "--no-live")
-    assert ran.code == Exit.DONE, ran.err
+    ran = register("--no-live", code=Exit.DONE)
     assert not register_world.project().live
     assert register_world.project().task_definition == known.task_definition
     assert "closed" in ran.out
-    assert register_world.run(capsys, "register", str(folder), "--live", "--json").json["live"] is True
+    assert register("--live", "--json").json["live"] is True
     assert register_world.project().live
     assert register_world.project().salt == known.salt != ""
     assert len(register_world.builds) == 1
 
 
 def test_register_says_what_warm_servers_of_a_live_study_cost_a_day(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     configure(folder, ("maxRuntime: 30", "maxRuntime: 30\n  warmServers: 4"))
     said = "4 servers will be kept warm while the study is open: about $2.14 a day on Spot, $5.22 on demand"
-    assert said in register_world.run(capsys, "register", str(folder)).err.replace("\n", " ")
-    assert "kept warm while" not in register_world.run(capsys, "register", str(folder), "--no-live").err
+    assert said in register().err.replace("\n", " ")
+    assert "kept warm while" not in register("--no-live").err
     project = register_world.project()
     assert project is not None
     assert (project.live, project.warm_servers) == (False, 4)
 
 
-def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    register_world.run(capsys, "register", str(folder))
+def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: Path, register: Register) -> None:
+    register()
     (folder / "agent.py").write_text("class Agent:\n    new = True\n")
     register_world.outcome, register_world.made = "FAILED", []
-    ran = register_world.run(capsys, "register", str(folder), "--no-live")
+    ran = register("--no-live")
     assert ran.code == Exit.FAILED  # because the new image could not be built
     assert not register_world.project().live  # but no participant is admitted any more
     assert register_world.made.index("lambda:Invoke") == 2
@@ -293,18 +289,17 @@ def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: P
 
 @pytest.mark.parametrize("broken", ["steps: {1: consent", "maxRuntime: never"])
 def test_a_study_is_closed_although_its_config_is_broken(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, broken: str
+    register_world: RegisterWorld, folder: Path, broken: str, register: Register
 ) -> None:
-    register_world.run(capsys, "register", str(folder))
+    register()
     where = "steps: {1: consent" if broken.startswith("steps") else "maxRuntime: 30"
     (folder / "config.yml").write_text(CONFIG.replace(where, broken.replace("consent", "nosuchpage")))
-    ran = register_world.run(capsys, "register", str(folder), "--no-live")
-    assert ran.code == Exit.FAILED
+    ran = register("--no-live", code=Exit.FAILED)
     assert "config.yml:" in ran.err
     assert not register_world.project().live
 
 
-def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, folder: Path, register: Register) -> None:
     """Values that records leave out because they are the default, such as 1 vCPU and 2 GB, stay as well."""
     write_study(folder, steps__consent_DOT_html="x")
     configure(
@@ -315,10 +310,10 @@ def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, fol
         ),
         ("trial:\n", "trial:\n  options: {a: [1, {b: null}]}\n  ui: {good: true}\n"),
     )
-    register_world.run(capsys, "register", str(folder))
+    register()
     before = register_world.project()
     (folder / "config.yml").write_text("project:\n  id: maze\n")
-    register_world.run(capsys, "register", str(folder), "--no-live")
+    register("--no-live")
     after = register_world.project()
     assert not after.live
     import msgspec
@@ -326,43 +321,41 @@ def test_closing_a_study_changes_nothing_else(register_world: RegisterWorld, fol
     assert msgspec.structs.replace(after, live=True, version=before.version) == before
 
 
-def test_a_new_study_can_be_registered_as_closed(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
-    assert register_world.run(capsys, "register", str(folder), "--no-live").code == Exit.DONE
+def test_a_new_study_can_be_registered_as_closed(register_world: RegisterWorld, register: Register) -> None:
+    register("--no-live", code=Exit.DONE)
     assert register_world.project().live is False
 
 
 def test_steps_of_a_study_with_participants_change_only_after_a_yes(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
-    register_world.run(capsys, "register", str(folder))
+    register()
     register_world.put("maze/users/ada/participant.json", b"{}")
     (folder / "steps/survey.html").write_text("<p>?</p>")
     configure(folder, ("3: thanks", "3: survey, 4: thanks"))
     before = register_world.project()
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DECLINED
+    ran = register(code=Exit.DECLINED)
     assert "step 3 is survey (was thanks), step 4 is thanks (new)" in " ".join((ran.out + ran.err).split())
     assert register_world.project() == before
     assert "maze/steps/survey.html" not in register_world.keys("maze/steps/")
-    assert register_world.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
+    register("--yes", code=Exit.DONE)
     assert [step.page for step in register_world.project().steps] == ["consent", "game", "survey", "thanks"]
 
 
 def test_a_copied_folder_replaces_a_study_with_participants_only_after_a_yes(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     """Otherwise the other study's participants would get these pages and this agent."""
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    register(code=Exit.DONE)
     configure(folder, ("A maze", "A second study"))
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE, "nobody has taken part yet"
+    assert register().code == Exit.DONE, "nobody has taken part yet"
     configure(folder, ("A maze", "A third study"))
     register_world.put("maze/users/ada/participant.json", b"{}")
     before = register_world.project()
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DECLINED
+    ran = register(code=Exit.DECLINED)
     assert "is called A second study, and this one A third study" in ran.err
     assert register_world.project() == before
-    assert register_world.run(capsys, "register", str(folder), "--yes").code == Exit.DONE
+    register("--yes", code=Exit.DONE)
     assert register_world.project().name == "A third study"
 
 
@@ -370,19 +363,18 @@ def test_a_copied_folder_replaces_a_study_with_participants_only_after_a_yes(
 
 
 def test_a_dry_run_shows_every_change_and_makes_none(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
-    steps = register_world.run(capsys, "register", str(folder), "--dry-run", "--json").json["steps"]
+    steps = register("--dry-run", "--json").json["steps"]
     assert [step.split()[0] for step in steps] == ["upload", "upload", "upload", "build", "make", "register"]
     assert register_world.keys() == []
     assert (register_world.builds, register_world.revisions()) == ([], [])
-    register_world.run(capsys, "register", str(folder))
-    ran = register_world.run(capsys, "register", str(folder), "--dry-run")
+    register()
+    ran = register("--dry-run")
     assert (ran.code, "Nothing to do" in ran.out) == (Exit.DONE, True)
     (folder / "steps/maze.png").unlink()
     before = (register_world.keys(), register_world.project())
-    ran = register_world.run(capsys, "register", str(folder), "--dry-run", "--no-live")
-    assert ran.code == Exit.CHANGES
+    ran = register("--dry-run", "--no-live", code=Exit.CHANGES)
     assert "remove maze/steps/maze.png" in ran.out
     assert "new version" in ran.out
     assert (register_world.keys(), register_world.project()) == before
@@ -392,39 +384,33 @@ def test_a_dry_run_shows_every_change_and_makes_none(
 
 
 @pytest.mark.parametrize(("name", "magic"), [("a.svg", b"<?xml"), ("a.PNG", b"\x89PNG"), ("a.pdf", b"%PDF")])
-def test_the_qr_code_can_be_written_to_a_file(
-    register_world: RegisterWorld, folder: Path, tmp_path: Path, capsys: Capsys, name: str, magic: bytes
-) -> None:
-    ran = register_world.run(capsys, "register", str(folder), "--qr", str(tmp_path / name))
-    assert ran.code == Exit.DONE, ran.err
+def test_the_qr_code_can_be_written_to_a_file(tmp_path: Path, name: str, magic: bytes, register: Register) -> None:
+    register("--qr", str(tmp_path / name), code=Exit.DONE)
     assert (tmp_path / name).read_bytes().startswith(magic)
 
 
 @pytest.mark.parametrize("name", ["poster.docx", "nowhere/poster.svg"])
 def test_a_qr_code_that_cannot_be_written_stops_register_beforehand(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, name: str
+    register_world: RegisterWorld, folder: Path, name: str, register: Register
 ) -> None:
-    ran = register_world.run(capsys, "register", str(folder), "--qr", str(folder / name))
-    assert ran.code == Exit.FAILED
+    register("--qr", str(folder / name), code=Exit.FAILED)
     assert register_world.made == []
 
 
-def test_on_a_terminal_the_qr_code_is_shown(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_on_a_terminal_the_qr_code_is_shown(monkeypatch: pytest.MonkeyPatch, register: Register) -> None:
     monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
-    ran = register_world.run(capsys, "register", str(folder))
+    ran = register()
     assert re.search("[▀▄█]{4}", ran.out)
 
 
 def test_for_signed_links_register_shows_no_link_without_a_signature(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     monkeypatch.setattr("deploy.study.register.sys.stdout.isatty", lambda: True, raising=False)
     configure(folder, ("maxRuntime: 30", "signedLinks: true"))
-    answer = register_world.run(capsys, "register", str(folder), "--json").json
+    answer = register("--json").json
     assert (answer["signedLinks"], answer["link"]) == (True, None)
-    ran = register_world.run(capsys, "register", str(folder))
+    ran = register()
     assert "/next?" not in ran.out
     assert not re.search("[▀▄█]", ran.out)
     assert "python -m deploy links --project maze --new 50" in ran.out
@@ -432,14 +418,14 @@ def test_for_signed_links_register_shows_no_link_without_a_signature(
     assert made.out.count("&signature=") == 50
 
 
-def test_a_study_with_signed_links_has_no_qr_code(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_a_study_with_signed_links_has_no_qr_code(
+    register_world: RegisterWorld, folder: Path, register: Register
+) -> None:
     configure(folder, ("maxRuntime: 30", "signedLinks: true"))
-    ran = register_world.run(capsys, "register", str(folder), "--qr", str(folder.parent / "a.svg"))
-    assert ran.code == Exit.FAILED
+    ran = register("--qr", str(folder.parent / "a.svg"), code=Exit.FAILED)
     assert "each participant has a link of their own" in ran.err
     assert register_world.made == []
-    closed = register_world.run(capsys, "register", str(folder), "--no-live", "--qr", str(folder.parent / "a.svg"))
-    assert closed.code == Exit.DONE
+    closed = register("--no-live", "--qr", str(folder.parent / "a.svg"), code=Exit.DONE)
     assert "each participant has a link of their own" in closed.err
     assert not (folder.parent / "a.svg").exists()
 

@@ -14,7 +14,7 @@ from deploy.study import pages
 from hippodrome import registry
 from hippodrome.registry import NotRegistered
 from testing.files import write_files
-from tests.deploy.registering import CONFIG, RegisterWorld, configure, write_study
+from tests.deploy.registering import CONFIG, Register, RegisterWorld, configure, write_study
 
 LINK = "https://study.example.org/next?projectId=maze"
 Capsys = pytest.CaptureFixture[str]
@@ -44,11 +44,10 @@ Capsys = pytest.CaptureFixture[str]
     ],
 )  # fmt: skip
 def test_mistakes_are_reported_before_anything_is_sent(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, changes: list[tuple[str, str]], said: str
+    register_world: RegisterWorld, folder: Path, changes: list[tuple[str, str]], said: str, register: Register
 ) -> None:
     configure(folder, *changes)
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert said in ran.err
     assert "→" in ran.err
     assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(
@@ -56,38 +55,36 @@ def test_mistakes_are_reported_before_anything_is_sent(
     )
 
 
-def test_all_mistakes_are_reported_at_once(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_all_mistakes_are_reported_at_once(folder: Path, register: Register) -> None:
     configure(
         folder,
         ("maxRuntime: 30", "subdomain: userId"),
         ("memory: 2", "memory: 2, rootDomain: other.org, region: eu-west-1"),
     )
-    ran = register_world.run(capsys, "register", str(folder))
+    ran = register()
     assert "3 mistakes" in ran.err
     assert len(re.findall(r"config\.yml:\d", ran.err)) == 3
 
 
 def test_keys_that_repeat_the_installation_are_accepted(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     same = f"memory: 2, bucket: {register_world.env['BUCKET']}, region: us-east-1, rootDomain: Example.org"
     ssl = f"ssl: {{sslBucket: {register_world.env['BUCKET']}, fullchain: SSL/fullchain.pem, privkey: SSL/privkey.pem}}"
     configure(folder, ("memory: 2", same), ("maxRuntime: 30", ssl))
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    register(code=Exit.DONE)
 
 
 def test_with_strict_a_remark_stops_register_beforehand(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     configure(folder, ("trial:", "trial:\n  rows: 6"))
-    ran = register_world.run(capsys, "register", str(folder), "--strict")
-    assert ran.code == Exit.FAILED
+    ran = register("--strict", code=Exit.FAILED)
     assert "config.yml:9: remark: trial.rows: no key of Hippodrome's" in " ".join(ran.err.split())
     assert not {"s3:PutObject", "codebuild:StartBuild", "ecs:RegisterTaskDefinition", "lambda:Invoke"} & set(
         register_world.made
     )
-    assert register_world.run(capsys, "register", str(folder)).code == Exit.DONE
+    register(code=Exit.DONE)
     assert register_world.project().trial["options"] == {"rows": 6}
 
 
@@ -161,12 +158,11 @@ def test_a_study_without_an_id_is_not_registered_by_the_name_of_its_folder(
 
 
 def test_register_says_that_another_bucket_and_certificate_have_no_effect(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     ssl = "ssl: {sslBucket: certs, fullchain: a.pem, privkey: b.pem}"
     configure(folder, ("memory: 2", "memory: 2, bucket: lab.projects"), ("maxRuntime: 30", ssl))
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    ran = register(code=Exit.DONE)
     said = " ".join((ran.out + ran.err).split())
     assert "config.yml:4: remark: project.ssl: no effect: servers get the certificate of the installation" in said
     here = register_world.env["BUCKET"]
@@ -178,11 +174,10 @@ def test_register_says_that_another_bucket_and_certificate_have_no_effect(
 
 
 def test_a_longer_runtime_than_the_installations_is_reduced_to_it(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     configure(folder, ("maxRuntime: 30", "maxRuntime: 600"))
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    ran = register(code=Exit.DONE)
     said = " ".join((ran.out + ran.err).split())
     assert (
         "config.yml:4: remark: project.maxRuntime: is 600 minutes; the installation hippodrome stops servers at 120"
@@ -191,10 +186,11 @@ def test_a_longer_runtime_than_the_installations_is_reduced_to_it(
     assert register_world.project().max_runtime == 120
 
 
-def test_an_agent_with_a_syntax_error_is_refused(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_an_agent_with_a_syntax_error_is_refused(
+    register_world: RegisterWorld, folder: Path, register: Register
+) -> None:
     (folder / "agent.py").write_text("class Agent:\n    def step(self\n        pass\n")
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert re.search(r"agent\.py:\d: Python cannot read this", ran.err)
     assert register_world.made == []
 
@@ -206,31 +202,27 @@ def test_a_missing_folder_is_reported(register_world: RegisterWorld, tmp_path: P
     assert (ran.code, "there is no such folder" in ran.err) == (Exit.FAILED, True)
 
 
-def test_register_in_another_region_says_that_there_is_no_stack(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys
-) -> None:
-    ran = register_world.run(capsys, "register", str(folder), "--region", "eu-west-1")
-    assert ran.code == Exit.FAILED
+def test_register_in_another_region_says_that_there_is_no_stack(register: Register) -> None:
+    ran = register("--region", "eu-west-1", code=Exit.FAILED)
     assert "no stack named hippodrome in eu-west-1" in ran.err
 
 
 @pytest.mark.parametrize("name", ["link", "picture"])
 def test_links_out_of_the_folder_and_large_pages_are_refused(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, name: str
+    register_world: RegisterWorld, folder: Path, name: str, register: Register
 ) -> None:
     if name == "link":
         (folder / "steps/keys.txt").symlink_to("/etc/passwd")
     else:
         (folder / "steps/film.mp4").write_bytes(b"x" * (pages.LIMIT_BYTES + 1))
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert ("link out of the project folder" if name == "link" else "larger than 4 MB") in ran.err
     assert register_world.keys() == []
 
 
-def test_hidden_files_and_folders_are_not_uploaded(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_hidden_files_and_folders_are_not_uploaded(folder: Path, register: Register) -> None:
     write_study(folder, steps___DOT_DS_Store="x", steps__drafts__a_DOT_html="x")
-    assert register_world.run(capsys, "register", str(folder), "--json").json["pages"]["uploaded"] == 3
+    assert register("--json").json["pages"]["uploaded"] == 3
 
 
 # --- failures on the way ------------------------------------------------------------------------------------------
@@ -249,28 +241,24 @@ def test_hidden_files_and_folders_are_not_uploaded(register_world: RegisterWorld
     ],
 )
 def test_a_refusal_of_aws_is_reported_in_a_sentence_and_the_next_run_finishes(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, action: str, code: str, said: str
+    register_world: RegisterWorld, action: str, code: str, said: str, register: Register
 ) -> None:
     register_world.fail(action, code)
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert said in ran.err
     assert register_world.project() is None
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    ran = register(code=Exit.DONE)
     assert len(register_world.builds) <= 1
     assert len(register_world.revisions()) == 1
 
 
-def test_mistakes_that_the_function_finds_are_reported(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_that_the_function_finds_are_reported(monkeypatch: pytest.MonkeyPatch, register: Register) -> None:
     def objects(*_: object) -> None:
         raise NotRegistered(["project.maxRuntime is too long", "project.steps.1: consent.html has not been uploaded"])
 
     with monkeypatch.context() as patch:
         patch.setattr("hippodrome.registry.register", objects)
-        ran = register_world.run(capsys, "register", str(folder))
+        ran = register()
     assert ran.code == Exit.FAILED
     assert "project.maxRuntime is too long" in ran.err
     assert "consent.html has not been uploaded" in ran.err
@@ -278,7 +266,7 @@ def test_mistakes_that_the_function_finds_are_reported(
 
 
 def test_register_advises_an_update_if_the_function_does_not_know_a_key(
-    register_world: RegisterWorld, folder: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     """Here the study has an additional key; the message of an older function would be the same."""
     known = registry.register
@@ -288,17 +276,16 @@ def test_register_advises_an_update_if_the_function_does_not_know_a_key(
 
     with monkeypatch.context() as patch:
         patch.setattr("hippodrome.registry.register", older)
-        ran = register_world.run(capsys, "register", str(folder))
+        ran = register()
     assert ran.code == Exit.FAILED
     assert "keyOfTomorrow: unknown key" in ran.err
     assert "The installation is older than this study: bring it up to date with `make deploy`" in ran.err
     assert LINK not in ran.out
 
 
-def test_a_failure_of_the_function_is_reported(register_world: RegisterWorld, folder: Path, capsys: Capsys) -> None:
+def test_a_failure_of_the_function_is_reported(register_world: RegisterWorld, register: Register) -> None:
     register_world.function_error = True
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.FAILED
+    ran = register(code=Exit.FAILED)
     assert "function that registers projects failed" in ran.err
 
 
@@ -336,12 +323,9 @@ def test_ctrl_c_at_any_change_leaves_no_half_registered_project(
 # --- what the image lacks -----------------------------------------------------------------------------------------
 
 
-def test_a_missing_package_is_reported_before_the_build(
-    register_world: RegisterWorld, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_package_is_reported_before_the_build(folder: Path, register: Register) -> None:
     write_study(folder, agent_DOT_py="import numpy\nimport psutil\n\n\nclass Agent:\n    pass\n")
-    ran = register_world.run(capsys, "register", str(folder))
-    assert ran.code == Exit.DONE, ran.err
+    ran = register(code=Exit.DONE)
     line = f"write psutil=={version('psutil')} into requirements.txt"
     told = " ".join(ran.err.split())
     assert line in told
@@ -349,4 +333,4 @@ def test_a_missing_package_is_reported_before_the_build(
     write_study(
         folder, agent_DOT_py="import psutil\n\n\nclass Agent:\n    pass\n", requirements_DOT_txt="psutil\nnumpy\n"
     )
-    assert "psutil==" not in register_world.run(capsys, "register", str(folder)).err
+    assert "psutil==" not in register().err
