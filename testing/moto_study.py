@@ -145,6 +145,11 @@ class StudyOnMoto:
         """Return the ARNs of the tasks that were not told to stop."""
         return [arn for arn in self.world.task_arns() if self.world.task(arn).desired_status == "RUNNING"]
 
+    def settle(self) -> None:
+        """Deliver all messages. Raises AssertionError if a task, a DNS record or a timer is left."""
+        self.deliver()
+        self.assert_nothing_left()
+
     def assert_nothing_left(self) -> None:
         """Raise AssertionError if a task, a DNS record or a timer is left."""
         assert self.living() == []

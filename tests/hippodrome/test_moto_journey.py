@@ -66,8 +66,7 @@ def test_a_participant_plays_from_the_link_to_the_end_and_nothing_is_left(study:
 
     alice.play(score=420)
     assert alice.at == AFTER
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     assert (study.record(alice.user)["state"], study.record(alice.user)["reason"]) == ("closed", "stopped")
     assert "was stopped" not in alice.look()
 
@@ -88,8 +87,7 @@ def test_messages_in_the_envelope_of_sns_are_also_accepted() -> None:
         study.deliver()
         assert alice.poll()["state"] == "ready"
         alice.play()
-        study.deliver()
-        study.assert_nothing_left()
+        study.settle()
     installed.use(None)
 
 
@@ -110,8 +108,7 @@ def test_two_participants_have_a_server_each(study: StudyOnMoto, alice: Person) 
     assert len(study.living()) == len(study.world.records()) == len(study.world.timers()) == 1
     assert bob.poll()["state"] == "ready"
     bob.play()
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_the_timer_is_set_before_the_task_runs_and_stops_it(study: StudyOnMoto, alice: Person) -> None:
@@ -136,8 +133,7 @@ def test_the_timer_is_set_before_the_task_runs_and_stops_it(study: StudyOnMoto, 
     study.deliver()
     assert alice.poll()["state"] == "ready"
     assert world.fire_timer(name) == message
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     assert study.record(alice.user)["reason"] == "deadline"
     ended = alice.poll()
     assert (ended["state"], ended["again"]) == ("ended", True)
@@ -155,8 +151,7 @@ def test_a_delayed_stop_over_http_sets_its_own_timer(study: StudyOnMoto, alice: 
     assert send_stop_server_message.handler(event, None)["statusCode"] == 202
     (delayed,) = [name for name in study.world.timers() if name.endswith("-delay")]
     study.world.fire_timer(delayed)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_a_server_that_spot_takes_is_replaced(study: StudyOnMoto, alice: Person) -> None:
@@ -185,16 +180,14 @@ def test_a_server_that_spot_takes_is_replaced(study: StudyOnMoto, alice: Person)
     study.deliver()
     assert alice.poll()["state"] == "ready"
     alice.play()
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_a_trial_that_ends_by_itself_leaves_nothing_and_is_not_replaced(study: StudyOnMoto, alice: Person) -> None:
     alice.to_the_game()
     study.deliver()
     study.lose(study.living()[0], "EssentialContainerExited", exit_code=0)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     assert study.record(alice.user)["reason"] == "ended"
     assert len(study.world.task_arns()) == 1
 
@@ -217,8 +210,7 @@ def test_a_participants_own_cluster_is_removed_with_the_server() -> None:
         assert alice.poll()["state"] == "ready"
         assert len(world.client("ecs").list_clusters()["clusterArns"]) == 2
         alice.play()
-        study.deliver()
-        study.assert_nothing_left()
+        study.settle()
         assert [arn.rpartition("/")[2] for arn in world.client("ecs").list_clusters()["clusterArns"]] == ["hippodrome"]
     installed.use(None)
 
@@ -238,8 +230,7 @@ def test_a_replacement_does_not_wait_until_the_old_cluster_can_be_deleted() -> N
         study.deliver()
         assert own_clusters(world) == {study.living()[0].split("/")[-2]}
         alice.play()
-        study.deliver()
-        study.assert_nothing_left()
+        study.settle()
         assert own_clusters(world) == set()
     installed.use(None)
 
@@ -318,8 +309,7 @@ def test_the_sweep_stops_a_server_whose_timer_was_lost(study: StudyOnMoto, alice
     record = {**study.record(alice.user), "deadline": "2026-01-01T00:00:00Z"}
     study.put(server.key(ids.server_label(PROJECT, alice.user)), json.dumps(record).encode())
     assert sweep.handler({}, None)["overdue"] == 1
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def add_name(world: MotoWorld, name: str, value: str, kind: str = "A", ttl: int = 60) -> None:
@@ -384,8 +374,7 @@ def test_repeated_messages_in_any_order_lead_to_the_same_end(seed: int) -> None:
                 left.remove(person)
             study.deliver_some()
         assert not left, "somebody did not come to the end"
-        study.deliver()
-        study.assert_nothing_left()
+        study.settle()
         assert len(world.task_arns()) == len(people), "one server each"
         for person in people:
             assert study.record(person.user)["state"] == "closed"
@@ -411,7 +400,6 @@ def test_an_interruption_by_spot_at_any_moment_leads_to_the_same_end(seed: int) 
             study.deliver_some()
         else:
             raise AssertionError("she did not come to the end")
-        study.deliver()
-        study.assert_nothing_left()
+        study.settle()
         assert len(world.task_arns()) <= struck + 1
     installed.use(None)

@@ -70,8 +70,7 @@ def test_a_pair_plays_from_two_links_to_the_end_and_nothing_is_left(
         member.user: member.membership["seat"] for member in pair
     }
     play_together(study, *pair)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     for member in pair:
         assert member.at == AFTER
         member.answer(fun="5")
@@ -92,8 +91,7 @@ def test_a_pair_that_is_faster_than_the_start_messages_gets_one_server(
     assert len(study.living()) == 1
     assert [member.poll()["state"] for member in pair] == ["ready", "ready"]
     play_together(study, *pair)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_the_first_member_who_finishes_leaves_the_server_to_the_other(
@@ -109,8 +107,7 @@ def test_the_first_member_who_finishes_leaves_the_server_to_the_other(
     assert len(study.living()) == 1
     assert bob.poll()["state"] == "ready"
     play_together(study, bob)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_a_lost_server_is_replaced_for_both_members(study: StudyOnMoto, pair: tuple[MotoMember, MotoMember]) -> None:
@@ -125,8 +122,7 @@ def test_a_lost_server_is_replaced_for_both_members(study: StudyOnMoto, pair: tu
     assert {state["url"] for state in after}.isdisjoint({state["url"] for state in before})
     assert environment(study, task)["SESSION"] == session_of(study, pair[0])
     play_together(study, *pair)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_four_people_are_two_pairs_on_two_servers(study: StudyOnMoto) -> None:
@@ -137,8 +133,7 @@ def test_four_people_are_two_pairs_on_two_servers(study: StudyOnMoto) -> None:
     sessions = [session_of(study, member) for member in people]
     assert sorted(sessions.count(one) for one in sessions) == [2, 2, 2, 2]
     play_together(study, *people)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_a_pair_is_handed_a_warm_server() -> None:
@@ -167,8 +162,7 @@ def test_a_server_ahead_is_stopped_if_its_participant_gives_up(study: StudyOnMot
     event = aws_events.queue_event([{"projectId": PROJECT, "userId": alice.user}])
     assert stop_server.handler(event, None) == {"batchItemFailures": []}
     sweep.handler({}, None)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def test_a_sessions_server_gets_requests_for_both_answers(

@@ -229,8 +229,7 @@ def limited(world: MotoWorld) -> None:
     assert sweep.handler({}, None)["slots"] == 1
     alice.play()
     alice.answer(fun="5")
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     assert study.stored(f"_places/{PROJECT}.json")["used"] > 0
     assert "held" not in study.stored(f"_places/{PROJECT}.json")
 
@@ -266,8 +265,7 @@ def waiting(world: MotoWorld) -> None:
     bob.answer(fun="5")
     study.deliver()
     StudyOnMoto(world, warmServers=1, live=False)
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
     assert study.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
 
 
@@ -294,8 +292,7 @@ def together(world: MotoWorld) -> None:
     study.deliver()
     assert len(study.living()) == 1
     bob.play()
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
     carol, dave = MotoMember(study, "R_carol"), MotoMember(study, "R_dave")
     come(study, carol)
@@ -308,8 +305,7 @@ def together(world: MotoWorld) -> None:
     stop_server.handler(aws_events.queue_event([{"userId": person.user} for person in (carol, dave)]), None)
     swept = sweep.handler({}, None)
     assert swept["failed"] == 0, swept
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 def matched_by_a_function(world: MotoWorld) -> None:
@@ -331,8 +327,7 @@ def matched_by_a_function(world: MotoWorld) -> None:
     assert study.stored(answer) is None
     alice.play()
     bob.play()
-    study.deliver()
-    study.assert_nothing_left()
+    study.settle()
 
 
 WALKS: dict[str, Callable[[MotoWorld], None]] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.local.conftest import Local
-from tests.local.walk import Walker
+from tests.local.walk import at_the_game
 
 Make = Callable[..., Local]
 
@@ -34,8 +34,7 @@ def open_to_others(*folders: Path) -> list[str]:
 
 def test_only_the_owner_may_read_the_files_of_a_study(local: Make) -> None:
     here = local(frames=30).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     assert walker.play(walker.until("ready"))["score"] == 30
     walker.answer(word="two")
     here.wait_for_text(r"server gone \(stopped\)")

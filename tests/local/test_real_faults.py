@@ -28,7 +28,7 @@ from testing import exploration
 from testing.waiting import until
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens
-from tests.local.walk import Walker
+from tests.local.walk import Walker, at_the_game
 from trial.recordings import recording
 
 Make = Callable[..., Local]
@@ -53,8 +53,7 @@ def limited(here: Local, what: int, to: int) -> Iterator[None]:
 
 def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
     """A participant who has played for a while, and the server's state on their page."""
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready")
     with walker.connect(state) as game:
         game.send(json.dumps({"command": "start"}))

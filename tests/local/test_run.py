@@ -24,7 +24,7 @@ from websockets.exceptions import WebSocketException
 
 from testing.waiting import until
 from tests.local.conftest import Local
-from tests.local.walk import Walker
+from tests.local.walk import Walker, at_the_game
 
 TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)
 """The number of the system call tgkill, which the C library may not have as a function."""
@@ -64,8 +64,7 @@ def test_a_participant_goes_through_the_study(local: Make) -> None:
 
 def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None:
     here = local(frames=100_000).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready")
     enough, played = threading.Event(), list[dict[str, Any]]()
 
@@ -103,8 +102,7 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
 
 def test_a_trial_that_ended_between_two_runs_is_not_replaced(local: Make) -> None:
     here = local(frames=60).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready")
     here.kill()
     walker.play(state)
@@ -117,8 +115,7 @@ def test_a_trial_that_ended_between_two_runs_is_not_replaced(local: Make) -> Non
 
 def test_a_server_that_was_lost_between_two_runs_is_replaced(local: Make) -> None:
     here = local().run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     walker.until("ready")
     here.kill()
     os.killpg(_group(here), signal.SIGKILL)
@@ -132,8 +129,7 @@ def test_a_server_that_was_lost_between_two_runs_is_replaced(local: Make) -> Non
 
 def test_ctrl_c_ends_everything_and_keeps_what_was_played(local: Make) -> None:
     here = local(frames=100_000).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     with walker.connect(walker.until("ready")) as game:
         game.send(json.dumps({"command": "start"}))
         for _ in range(60):
@@ -177,8 +173,7 @@ def test_an_agent_that_hangs_does_not_hold_up_ctrl_c(local: Make) -> None:
     agent = here.folder / "agent.py"
     agent.write_text(agent.read_text().replace("self.n += 1", "import time; time.sleep(1000)"))
     here.run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     with walker.connect(walker.until("ready")) as game:
         game.send(json.dumps({"command": "start"}))
         time.sleep(1)
@@ -274,8 +269,7 @@ def test_the_error_of_an_agent_that_cannot_start_comes_with_the_advice_of_make_c
 
 def test_fresh_moves_the_data_aside(local: Make) -> None:
     here = local().run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     walker.until("ready")
     here.kill()
     here.run("--fresh")
@@ -359,8 +353,7 @@ def test_a_broken_page_is_reported_with_its_line(local: Make) -> None:
 def test_a_participant_whose_documents_were_deleted_gets_another_server(local: Make) -> None:
     """The old server has the same name as the new one, and its end must not count as the new one's end."""
     here = local(start=1).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     before = walker.until("ready")
     shutil.rmtree(here.data / "quick" / "users" / "P1")
     for record in (here.data / "_servers").iterdir():
@@ -378,8 +371,7 @@ def test_a_participant_whose_documents_were_deleted_gets_another_server(local: M
 @pytest.mark.parametrize("what", ["data", "project_master_list.json", "_secret.json", "quick/steps"])
 def test_deleted_data_are_reported_and_the_study_goes_on(local: Make, what: str) -> None:
     here = local(start=1).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     walker.until("ready")
     kept = {name: (here.data / name).read_text() for name in ("_secret.json", "project_master_list.json")}
     time.sleep(1.2)  # it looks twice a second
@@ -408,8 +400,7 @@ def test_deleted_data_are_reported_and_the_study_goes_on(local: Make, what: str)
 def test_data_deleted_between_two_runs_cause_no_error(local: Make) -> None:
     here = local(start=1).run()
     for _ in range(2):
-        walker = Walker(here.url, "quick", "P1")
-        walker.answer(word="one")
+        walker = at_the_game(here.url)
         assert walker.play(walker.until("ready"))["score"] == 30
         assert here.end() == 0
         shutil.rmtree(here.data)
@@ -418,8 +409,7 @@ def test_data_deleted_between_two_runs_cause_no_error(local: Make) -> None:
 
 def test_after_ctrl_c_the_participant_is_told_that_the_study_was_stopped(local: Make) -> None:
     here = local(frames=100_000).run()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     walker.until("ready")
     assert here.end() == 0
     here.run()

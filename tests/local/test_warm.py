@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosedError
 from local.rehearsal.study_process import servers_of
 from testing.waiting import until
 from tests.local.conftest import Local
-from tests.local.walk import Walker
+from tests.local.walk import Walker, at_the_game
 
 Make = Callable[..., Local]
 
@@ -34,8 +34,7 @@ def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_plac
     here = local(warm=1).run()
     ready(here, 1)
     (waiting,) = here.servers()
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready", seconds=20)
     assert waiting in here.servers()
     assert [process.environ()["SERVER"] for process in servers_of(here.data, {"P1"})].count(waiting) >= 1
@@ -60,8 +59,7 @@ def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_plac
 def test_a_warm_server_admits_only_its_participant(local: Make) -> None:
     here = local(warm=1).run()
     ready(here, 1)
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready", seconds=20)
     other = Walker(here.url, "quick", "P2")
     with other.connect(state) as game, pytest.raises(ConnectionClosedError) as closed:
@@ -77,8 +75,7 @@ def test_warm_servers_are_replaced_whether_lost_while_waiting_or_in_play(local: 
     for process in servers_of(here.data):
         os.kill(process.pid, signal.SIGKILL)
     ready(here, 2)
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     state = walker.until("ready", seconds=20)
     ready(here, 3)
     with walker.connect(state) as game:
@@ -102,8 +99,7 @@ def test_a_changed_agent_replaces_the_warm_servers(local: Make) -> None:
     ready(here, 2)
     wait_for(here, 1)
     assert here.servers() != [before]
-    walker = Walker(here.url, "quick", "P1")
-    walker.answer(word="one")
+    walker = at_the_game(here.url)
     assert walker.play(walker.until("ready", seconds=20))["score"] == 40
 
 

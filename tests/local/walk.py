@@ -70,3 +70,10 @@ class Walker:
                 else:
                     last = message
         return last
+
+
+def at_the_game(url: str) -> Walker:
+    """Return the participant P1 of the study `quick`, who has answered the page before the game."""
+    walker = Walker(url, "quick", "P1")
+    walker.answer(word="one")
+    return walker

@@ -54,7 +54,5 @@ class TakesMessages:
 async def play_to_the_end(server: Any, open_client: Any) -> None:
     """Let one client start the game of this server and watch it until the trial is over."""
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.controls)
-        await client.say(command="start")
+        await client.start()
         assert await client.closed() == 1000

@@ -220,12 +220,26 @@ class Client(TakesMessages):
         seen = len(self.frames)
         await self.until(lambda: len(self.frames) >= seen + more)
 
-    async def play(self, frames: int = 5) -> None:
-        """Say hello, start, and see some frames."""
-        await self.hello()
+    async def enter(self, **change: Any) -> None:
+        """Say hello, and take messages until the first picture has come."""
+        await self.hello(**change)
+        await self.until(lambda: self.frames)
+
+    async def start(self, **change: Any) -> None:
+        """Say hello, and start as soon as the controls have come."""
+        await self.hello(**change)
         await self.until(lambda: self.controls)
         await self.say(command="start")
+
+    async def play(self, frames: int = 5) -> None:
+        """Say hello, start, and see some pictures."""
+        await self.start()
         await self.see(frames)
+
+    async def stop(self) -> None:
+        """Stop the game; the server has to close the connection with the code of a normal end."""
+        await self.say(command="stop")
+        assert await self.closed() == 1000
 
 
 @contextlib.asynccontextmanager

@@ -69,6 +69,13 @@ def launch_session(launch: Any, *, trial: dict[str, Any] | None = None, agent: s
     return launch(agent=agent or two_players(), trial={**TRIAL, **(trial or {})}, **told)
 
 
+def launch_formed(launch: Any, **options: Any) -> Any:
+    """Start the server of the session as `launch_session` does, and form the session."""
+    server = launch_session(launch, **options)
+    form(server.store)
+    return server
+
+
 def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
     """The fields of the hello that a member's page sends."""
     return {"userId": user_id, "token": member_token(TOKEN, user_id), "step": "3", **change}

@@ -108,8 +108,7 @@ async def test_a_press_reaches_the_agent_and_is_recorded(launch: Any, open_clien
     agent = grid().replace('"nan": float("nan")', '"heard": getattr(self, "word", None)')
     server = launch(agent, {"ui": UI, "startingFrameRate": 60, "actionSpace": ["noop", "up", "left"]})
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         await client.say(command="start")
         await client.say(command="reallyGood")
         await client.say(command="leftUp")

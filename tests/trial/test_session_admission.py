@@ -20,6 +20,7 @@ from tests.trial.sessions import (
     document,
     form,
     hello_of,
+    launch_formed,
     launch_session,
     member,
     put,
@@ -33,15 +34,13 @@ from trial.settings import TrialSettings
 
 
 async def test_each_member_plays_the_player_of_their_seat(launch):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     async with member(server, "bert") as bert, member(server, "anna") as anna:
         assert (anna.controls["player"], bert.controls["player"]) == ("left", "right")
 
 
 async def test_a_member_cannot_play_in_the_place_of_another(launch, open_client):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await refused(server, open_client, userId="bert", token=member_token(TOKEN, "anna"))
     await refused(server, open_client, userId="anna", token=member_token(TOKEN, "bert"))
     await refused(server, open_client, userId=None, token=member_token(TOKEN, "anna"))
@@ -50,8 +49,7 @@ async def test_a_member_cannot_play_in_the_place_of_another(launch, open_client)
 
 
 async def test_no_token_lets_in_a_participant_who_is_no_member(launch, open_client):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await refused(server, open_client, **hello_of("carl"))
     await refused(server, open_client, userId="carl", token=member_token(TOKEN, "anna"))
     await refused(server, open_client, userId="", token=member_token(TOKEN, ""))
@@ -59,14 +57,12 @@ async def test_no_token_lets_in_a_participant_who_is_no_member(launch, open_clie
 
 
 async def test_the_servers_own_token_opens_no_session(launch, open_client):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await refused(server, open_client, userId="anna", token=TOKEN)
 
 
 async def test_a_token_of_another_session_opens_nothing(launch, open_client):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await refused(server, open_client, userId="anna", token=member_token("another-server", "anna"))
 
 
@@ -133,8 +129,7 @@ def test_whatever_a_client_says_only_a_member_with_their_own_token_gets_in(user_
 
 
 async def test_a_second_tab_replaces_the_members_own_and_no_other(launch):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     async with member(server, "anna") as first, member(server, "bert") as bert, member(server, "anna") as second:
         assert await first.closed() == 4409
         assert "another tab" in first.errors[-1]
@@ -145,8 +140,7 @@ async def test_a_second_tab_replaces_the_members_own_and_no_other(launch):
 
 async def test_two_browsers_with_one_members_link_are_one_member(launch):
     """The browser that opened it last plays; the other place stays the other member's."""
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     async with contextlib.AsyncExitStack() as stack:
         clients = [await stack.enter_async_context(member(server, "anna")) for _ in range(3)]
         assert {client.controls["player"] for client in clients} == {"left"}
@@ -154,8 +148,7 @@ async def test_two_browsers_with_one_members_link_are_one_member(launch):
 
 
 async def test_a_members_token_opens_nothing_for_programs(launch):
-    server = launch_session(launch, trial={"gym": "watch"})
-    form(server.store)
+    server = launch_formed(launch, trial={"gym": "watch"})
     async with connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None) as program:
         await program.wait_closed()
         assert program.close_code == 4401
@@ -188,8 +181,7 @@ async def test_a_members_token_makes_no_environments(launch):
 
 async def test_a_page_without_a_token_never_gets_into_a_session(launch, open_client):
     page = "https://front.example"
-    server = launch_session(launch, PLAIN_ORIGINS=page)
-    form(server.store)
+    server = launch_formed(launch, PLAIN_ORIGINS=page)
     async with open_client(server.address, subprotocols=None, origin=page) as client:
         await client.hello(userId="anna", token=None)
         assert await client.closed() == 4401
@@ -197,8 +189,7 @@ async def test_a_page_without_a_token_never_gets_into_a_session(launch, open_cli
 
 async def test_a_client_without_a_subprotocol_never_gets_into_a_session(launch, open_client):
     """What such a client sends along is recorded: it could write another participant's id into the recording."""
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     async with open_client(server.address, subprotocols=None) as client:
         await client.hello(**hello_of("anna"))
         assert await client.closed() == 4401

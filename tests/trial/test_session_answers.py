@@ -17,6 +17,7 @@ from tests.trial.sessions import (
     document,
     form,
     hello_of,
+    launch_formed,
     launch_session,
     member,
     put,
@@ -36,8 +37,7 @@ from trial.settings import TrialSettings
 
 
 async def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_client):
-    server = launch_session(launch, GAME_STEPS="3,5")
-    form(server.store)
+    server = launch_formed(launch, GAME_STEPS="3,5")
     await both_play(server)
     async with member(server, "anna", step="5") as anna, member(server, "bert", step="5") as bert:
         assert "another step's game" in await refused(server, open_client, 4404, **hello_of("bert", step="3"))
@@ -50,8 +50,7 @@ async def test_a_session_plays_its_game_steps_one_after_the_other(launch, open_c
 
 async def test_a_member_cannot_open_a_later_game_step_before_their_answer_to_the_one_before(launch, open_client):
     """Else a member whose client names another step could keep the others out of their own."""
-    server = launch_session(launch, GAME_STEPS="3,5")
-    form(server.store)
+    server = launch_formed(launch, GAME_STEPS="3,5")
     early = hello_of("bert", step="5")
     assert "an earlier game step" in await refused(server, open_client, 4404, **early)
     await both_play(server)
@@ -60,8 +59,7 @@ async def test_a_member_cannot_open_a_later_game_step_before_their_answer_to_the
 
 
 async def test_the_next_server_knows_which_members_have_answered_an_earlier_game_step(launch, open_client):
-    server = launch_session(launch, GAME_STEPS="3,5", SERVER="pair-2")
-    form(server.store)
+    server = launch_formed(launch, GAME_STEPS="3,5", SERVER="pair-2")
     put(server.store, "study/users/anna/answers/3.json", b'{"answers": {}}')
     assert "an earlier game step" in await refused(server, open_client, 4404, **hello_of("bert", step="5"))
     async with member(server, "anna", step="5"):
@@ -118,8 +116,7 @@ async def test_recordings_and_log_hold_no_members_id(launch):
 
 
 async def test_a_members_folder_holds_only_their_answer(launch):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await both_play(server)
     server.wait()
     found = {path.relative_to(server.store).as_posix() for path in server.store.rglob("*") if path.is_file()}
@@ -132,8 +129,7 @@ async def test_a_members_folder_holds_only_their_answer(launch):
 
 
 async def test_a_game_step_that_all_members_have_answered_is_not_played_again(launch):
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await both_play(server)
     assert server.wait() == 0
     kept = {each: answer(server.store, each) for each in MEMBERS}
@@ -150,8 +146,7 @@ async def test_a_game_step_that_all_members_have_answered_is_not_played_again(la
 
 async def test_an_answer_that_an_interrupted_server_did_not_store_is_stored_by_the_next_one(launch):
     """The server was lost between two answers: the stored answer stays, the missing one is stored."""
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await both_play(server)
     assert server.wait() == 0
     anna, bert = (answer(server.store, each) for each in MEMBERS)

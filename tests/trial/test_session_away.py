@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.trial.sessions import answer, form, launch_session, member, recordings
+from tests.trial.sessions import answer, launch_formed, member, recordings
 
 pytestmark = pytest.mark.timeout(90)
 
@@ -23,8 +23,7 @@ def people_seen_by(client: Any) -> dict[str, str]:
 
 
 async def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledgement_alone(launch):
-    server = launch_session(launch, trial={"startingFrameRate": 20})
-    form(server.store)
+    server = launch_formed(launch, trial={"startingFrameRate": 20})
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await until_both_play(anna, bert)
         await anna.until(lambda: len(anna.frames) > 5)
@@ -41,8 +40,7 @@ async def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledg
 
 async def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back(launch):
     trial = {"startingFrameRate": 20, "substitute": "agent:Partner", "afterAbsent": "policy", "absent": 1}
-    server = launch_session(launch, trial=trial)
-    form(server.store)
+    server = launch_formed(launch, trial=trial)
     async with member(server, "bert") as bert:
         async with member(server, "anna") as anna:
             await until_both_play(anna, bert)
@@ -80,8 +78,7 @@ async def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back
 @pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
 async def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
     """Acknowledgements control the pace of a member's own pictures alone."""
-    server = launch_session(launch, trial={"startingFrameRate": 20})
-    form(server.store)
+    server = launch_formed(launch, trial={"startingFrameRate": 20})
 
     async def forge(bert):
         while forged != "none":

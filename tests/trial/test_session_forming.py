@@ -23,6 +23,7 @@ from tests.trial.sessions import (
     document,
     form,
     hello_of,
+    launch_formed,
     launch_session,
     member,
     put,
@@ -58,8 +59,7 @@ async def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_fo
 
 
 def test_the_server_looks_for_the_session_by_itself(launch):
-    server = launch_session(launch, SPARE_SECONDS="0.1")
-    form(server.store)
+    server = launch_formed(launch, SPARE_SECONDS="0.1")
     until(lambda: "the members of the session are known now: 2 of 2" in server.log_text(), 15)
 
 
@@ -71,8 +71,7 @@ def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
 
 
 def test_a_session_whose_members_never_come_ends_the_server(launch):
-    server = launch_session(launch, SPARE_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
-    form(server.store)
+    server = launch_formed(launch, SPARE_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 

@@ -6,7 +6,7 @@ import time
 
 from websockets.exceptions import ConnectionClosed
 
-from tests.trial.sessions import form, hello_of, launch_session, member, recordings
+from tests.trial.sessions import hello_of, launch_formed, member, recordings
 from trial.wire.reconnects import AT_ONCE, SECONDS_EACH
 
 ON = {"afterAbsent": "policy", "substitute": "random"}
@@ -24,8 +24,7 @@ async def connects(server, open_client, user_id):
 
 
 async def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_others_play(launch, open_client):
-    server = launch_session(launch, trial=ON)
-    form(server.store)
+    server = launch_formed(launch, trial=ON)
     async with member(server, "bert") as bert:
         async with bert.reading():
             codes, began = [], time.monotonic()
@@ -46,8 +45,7 @@ async def test_a_member_who_connects_hundreds_of_times_is_told_to_wait_and_the_o
 
 
 async def test_one_members_connections_are_not_counted_against_another(launch, open_client):
-    server = launch_session(launch, trial=ON)
-    form(server.store)
+    server = launch_formed(launch, trial=ON)
     async with member(server, "anna") as anna, anna.reading():
         while (code := await connects(server, open_client, "bert")) is None:
             pass
@@ -56,8 +54,7 @@ async def test_one_members_connections_are_not_counted_against_another(launch, o
 
 
 async def test_a_refused_connection_does_not_replace_the_one_that_plays(launch, open_client):
-    server = launch_session(launch, trial=ON)
-    form(server.store)
+    server = launch_formed(launch, trial=ON)
     async with contextlib.AsyncExitStack() as stack:
         newest, refused = None, None
         while refused is None:

@@ -14,9 +14,8 @@ from tests.trial.sessions import (
     SID,
     TOKEN,
     answer,
-    form,
     hello_of,
-    launch_session,
+    launch_formed,
     member,
     recordings,
 )
@@ -34,8 +33,7 @@ async def near_and_far(server, seconds):
 
 
 async def test_the_recording_holds_each_members_round_trips(launch):
-    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 5000})
-    form(server.store)
+    server = launch_formed(launch, trial={"pingSamples": 3, "maxPing": 5000})
     async with near_and_far(server, 0.3) as (anna, bert):
         await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
         await anna.say(command="stop")
@@ -52,8 +50,7 @@ async def test_the_recording_holds_each_members_round_trips(launch):
 
 
 async def test_a_member_who_is_too_far_away_and_the_others_are_told_so(launch):
-    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700})
-    form(server.store)
+    server = launch_formed(launch, trial={"pingSamples": 3, "maxPing": 700})
     async with near_and_far(server, 0.4) as (anna, bert):
         assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
         assert (anna.done["outcome"], bert.done["outcome"]) == ("partnerLeft", "ping")
@@ -67,15 +64,13 @@ async def test_a_member_who_is_too_far_away_and_the_others_are_told_so(launch):
 
 async def test_the_others_play_on_without_a_member_who_is_too_far_away(launch):
     instead = {"substitute": "idle", "afterAbsent": "policy"}
-    server = launch_session(launch, trial={"pingSamples": 3, "maxPing": 700, **instead})
-    form(server.store)
+    server = launch_formed(launch, trial={"pingSamples": 3, "maxPing": 700, **instead})
     async with near_and_far(server, 0.4) as (anna, bert):
         assert await bert.closed() == 1000
         assert answer(server.store, "bert")["answers"]["outcome"] == "ping"
         await anna.until(lambda: len(anna.frames) > 20)
         assert not (server.store / "study/users/anna/answers/3.json").exists()
-        await anna.say(command="stop")
-        assert await anna.closed() == 1000
+        await anna.stop()
     assert server.wait() == 0
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 
@@ -84,15 +79,13 @@ async def test_a_member_who_is_too_far_away_is_refused_in_the_later_games_too(la
     """They come to the next game before the others, who still play, and would be sent away again and again."""
     instead = {"substitute": "idle", "afterAbsent": "policy"}
     trial = {"pingSamples": 3, "maxPing": 150, "countdown": 0, **instead}
-    server = launch_session(launch, trial=trial, GAME_STEPS="3,5,7")
-    form(server.store)
+    server = launch_formed(launch, trial=trial, GAME_STEPS="3,5,7")
     later = {"outcome": "ping", "player": "right", "session": SID}
     async with near_and_far(server, 0.15) as (anna, bert):
         assert await bert.closed() == 1000
         assert [answer(server.store, "bert", step)["answers"] for step in "57"] == [later, later]
         await anna.until(lambda: len(anna.frames) > 5)
-        await anna.say(command="stop")
-        assert await anna.closed() == 1000
+        await anna.stop()
     async with member(server, "anna", step="5") as anna:
         await anna.until(lambda: anna.state.get("state") == "playing")
         assert anna.state["people"]["right"] == "policy"
@@ -122,6 +115,5 @@ async def test_only_a_session_sends_pings_of_its_own(launch):
 
     alone = launch()
     assert await pings(alone, {"userId": "P1", "token": TOKEN, "step": "3"}) == 0
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     assert await pings(server, hello_of("anna"), 5, 20) == 5

@@ -109,8 +109,7 @@ def kinds(lines):
 
 async def play_until_the_break(client):
     """Play until the first break; return when the start was sent (monotonic seconds)."""
-    await client.hello()
-    await client.until(lambda: client.frames)
+    await client.enter()
     began = time.monotonic()
     await client.say(command="start")
     await client.until(lambda: client.state["state"] == "break")
@@ -194,8 +193,7 @@ async def test_after_leaving_in_a_break_the_next_episode_waits(launch, open_clie
             await client.until(lambda: client.state["state"] == "paused")
             assert client.state["episode"] == 2
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         if client.state["state"] != "paused" or client.state["episode"] != 2:
             await client.until(lambda: client.state["state"] == "paused" and client.state["episode"] == 2)
         await client.say(command="start")
@@ -227,8 +225,7 @@ async def test_a_game_whose_server_is_lost_in_a_break_goes_on_with_the_next_epis
         assert any(message.get("command") == "good" for message in lines[-1]["messages"])
     second = launch(grid(8), LONG, SERVER="a-2")
     async with open_client(second.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert (client.state["state"], client.state["episode"], client.state["score"]) == ("ready", 2, 12)
         await client.say(command="start")
         await client.until(lambda: client.done)

@@ -78,8 +78,7 @@ async def test_a_killed_server_loses_a_second_at_most(launch, open_client):
     again = launch(trial={"startingFrameRate": 50, "ui": UI})
     async with open_client(again.address) as client:
         await client.play(5)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     assert again.wait() == 0
     kept = again.recordings()
     assert len(kept) == 2
@@ -101,8 +100,7 @@ async def test_a_server_waits_for_a_participant_who_leaves(launch, open_client):
     left = time.monotonic()
     await asyncio.sleep(1.5)
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert client.controls["state"] == "paused"
         assert time.monotonic() - left < 6, "this machine is too slow for the test"
         left = time.monotonic()

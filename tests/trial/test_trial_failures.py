@@ -237,8 +237,7 @@ async def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_p
             await client.say(command="requestUI")
             await client.until(lambda: client.controls)
         go_on.touch()
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
 
 
 async def steps_by(launch, open_client, source):

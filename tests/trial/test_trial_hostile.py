@@ -46,8 +46,7 @@ async def test_a_wrong_hello_closes_the_connection(launch, open_client):
     async with open_client(server.address) as client:  # the participant is still let in
         await client.play()
     async with open_client(server.address + "?token=the-secret-token") as client:
-        await client.hello(token=None, step=3)
-        await client.until(lambda: client.frames)
+        await client.enter(token=None, step=3)
     log = server.log_text()
     assert "Traceback" not in log
     assert "wrong" not in log
@@ -113,8 +112,7 @@ async def test_a_flood_closes_with_4429(launch, open_client):
                 await client.say(action="left")
         assert await client.closed() == 4429
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert client.controls["state"] == "paused"
 
 

@@ -27,9 +27,7 @@ async def test_a_game_in_turns_against_a_file_with_legal_actions_alone(
     file = onnx_files.constant(agent / "policies/p.onnx", np.arange(9, dtype=np.float32)[None], size=18)
     server = launch(None, trial=TICTACTOE, SDL_VIDEODRIVER="dummy", AGENT_DIR=str(agent))
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.controls)
-        await client.say(command="start")
+        await client.start()
         for press in ("0", "8", "1", "2"):  # the file has taken square 8 by then
             await client.until(lambda: client.state.get("toAct"))
             await client.say(action=press)

@@ -25,8 +25,7 @@ UI = {"left": True, "start": True, "pause": True, "reset": True, "stop": True, "
 async def test_a_participant_plays_from_the_hello_to_the_answer(launch, open_client, grid):
     server = launch(grid(20), {"maxEpisodes": 2, "startingFrameRate": 60, "ui": UI}, GROUP="1")
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert client.controls["state"] == "ready"
         assert client.controls["actionSpace"] == ["noop", "up", "right", "left", "down", "upright"]
         assert client.controls["UI"] == [key.name for key in keys(Ui) if key.name in UI]
@@ -69,8 +68,7 @@ async def test_the_recording_says_what_happened(launch, open_client, grid, tmp_p
         await client.say(action="left", held=False)
         await client.say(command="reset")
         await client.until(lambda: client.state.get("episode") == 2)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     assert server.wait() == 0
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     header, reset, *steps, end = lines
@@ -156,8 +154,7 @@ async def test_the_frame_rate_stays_within_its_limits(launch, open_client):
 async def test_changing_a_fixed_frame_rate_is_refused_with_a_sentence(launch, open_client):
     server = launch()
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         await client.say(changeFrameRate="faster")
         await client.say(command="stop")
         await client.say(command="good")
@@ -214,16 +211,14 @@ async def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client,
         score = client.state["score"]
     await asyncio.sleep(0.3)
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert client.controls["state"] == "paused"
         assert client.controls["score"] >= score > 0
         await client.watch(0.3)
         assert len(client.frames) == 1
         await client.say(command="start")
         await client.until(lambda: len(client.frames) > 5)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     assert server.wait() == 0
     (lines,) = server.recordings().values()
     events = [said.get("event") for line in lines for said in line.get("messages", [])]
@@ -237,8 +232,7 @@ async def test_a_second_tab_takes_over(launch, open_client):
     server = launch()
     async with open_client(server.address) as first, open_client(server.address) as second:
         await first.play()
-        await second.hello()
-        await second.until(lambda: second.frames)
+        await second.enter()
         assert second.controls["state"] == "paused"
         assert await first.closed() == 4409
         assert "another tab" in first.errors[-1]
@@ -288,8 +282,7 @@ async def test_a_client_without_a_subprotocol_gets_jpegs_in_json(launch, open_cl
         await client.wait_until_heard()
         seen = len(client.jpegs)
         await client.until(lambda: len(client.jpegs) >= seen + 15)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     import base64
     import io
 
@@ -323,8 +316,7 @@ async def test_ms_pacman_with_the_example_agent(launch, open_client):
             await client.say(action=key, held=True)
             await client.wait_until_heard()
             await client.see(5)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "stopped"
     # The recording is enough to play the episode again.

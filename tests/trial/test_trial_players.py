@@ -16,9 +16,7 @@ from tests.trial.two_players import TRIAL, two_players
 async def play_and_end(server, open_client, *, frames=8, keys=(), stop=False):
     """Play until `frames` pictures have come, with these keys held; end the server; return the client."""
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.controls)
-        await client.say(command="start")
+        await client.start()
         for key in keys:
             await client.say(action=key, held=True)
         seen = len(client.frames)
@@ -184,9 +182,7 @@ async def test_the_next_game_step_of_the_study_has_policies_of_its_own(launch, o
 
     async def run(step):
         async with open_client(server.address) as client:
-            await client.hello(step=step)
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
+            await client.start(step=step)
             await client.until(lambda: client.done)
 
     for step in ("2", "3"):

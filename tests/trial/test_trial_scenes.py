@@ -73,8 +73,7 @@ async def test_a_client_that_comes_back_gets_the_whole_scene(launch: Any, open_c
     async with open_client(server.address) as client:
         await client.play(frames=3)
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.frames)
+        await client.enter()
         assert set(client.scene.objects) == {"wall", "dot", "cook"}
 
 

@@ -54,8 +54,7 @@ async def test_a_participant_plays_over_tls(launch, open_client, grid, tmp_path)
         await client.hello()
         await client.say(command="start")
         await client.until(lambda: len(client.frames) > 10 and client.state["episode"] > 1)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
         assert client.done["episodes"] >= 1
     assert server.wait() == 0
 

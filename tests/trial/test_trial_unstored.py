@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.trial.conftest import client_of
 from tests.trial.far_away import far_away
-from tests.trial.sessions import MEMBERS, SID, TRIAL, answer, form, launch_session, member, recordings
+from tests.trial.sessions import MEMBERS, SID, TRIAL, answer, launch_formed, member, recordings
 from trial.recordings import recording
 
 SECONDS = "RECORDINGS_FIRST_SECONDS"
@@ -36,8 +36,7 @@ def outcomes(store):
 
 async def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_while(launch, tmp_path):
     """The members go on, and the server stays until the store takes the recording."""
-    server = launch_session(launch, SPOOL=str(tmp_path / "spool"), **{SECONDS: "1.5"})
-    form(server.store)
+    server = launch_formed(launch, SPOOL=str(tmp_path / "spool"), **{SECONDS: "1.5"})
     in_the_way = refuse_recordings(server.store)
     codes, waited = await play_to_the_end(server)
     assert codes == [1000, 1000], server.log_text()
@@ -52,8 +51,7 @@ async def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_whi
 
 
 async def test_a_server_that_is_told_to_end_keeps_the_answers_without_the_recording(launch, tmp_path):
-    server = launch_session(launch, SPOOL=str(tmp_path / "spool"), STOP_SECONDS="15")
-    form(server.store)
+    server = launch_formed(launch, SPOOL=str(tmp_path / "spool"), STOP_SECONDS="15")
     refuse_recordings(server.store)
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await asyncio.gather(*(each.until(lambda each=each: len(each.frames) > 5) for each in (anna, bert)))
@@ -74,8 +72,7 @@ async def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
     in_the_way.touch()
     async with client_of(server.address) as client:
         await client.play()
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
     assert server.answer()["answers"]["outcome"] == "stopped"
     in_the_way.unlink()
     assert server.wait(25) == 0
@@ -84,8 +81,7 @@ async def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
 
 async def test_answers_are_stored_after_the_recording_if_that_can_be_stored(launch):
     """The usual order: a program that reads the answer finds the recording."""
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     await play_to_the_end(server)
     assert server.wait() == 0
     (recorded,) = (server.store / f"study/sessions/{SID}/trials/pair-1").glob("*.gz")
@@ -110,8 +106,7 @@ async def seen_by_both(anna, bert):
 
 async def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
     """The answer of one member is refused: they wait as a participant who plays alone does, until the store takes it."""
-    server = launch_session(launch)
-    form(server.store)
+    server = launch_formed(launch)
     in_the_way = refuse_answers_of(server.store, "bert")
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await seen_by_both(anna, bert)
@@ -130,13 +125,11 @@ async def test_each_member_goes_on_when_their_own_answer_is_stored(launch):
 
 
 async def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyond_its_deadline(launch):
-    server = launch_session(launch, DEADLINE=str(time.time() + 8), STOP_SECONDS="15")
-    form(server.store)
+    server = launch_formed(launch, DEADLINE=str(time.time() + 8), STOP_SECONDS="15")
     refuse_answers_of(server.store, "bert")
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await seen_by_both(anna, bert)
-        await anna.say(command="stop")
-        assert await anna.closed() == 1000
+        await anna.stop()
         assert await bert.closed() == 1001
     assert server.wait(25) == 0
     assert "ending: deadline" in server.log_text()
@@ -145,8 +138,7 @@ async def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyon
 
 async def test_the_next_game_step_is_played_while_a_members_answer_to_the_one_before_is_refused(launch):
     section = {"gather": 4, "absent": 1, "afterAbsent": "policy", "substitute": "idle"}
-    server = launch_session(launch, trial=section, GAME_STEPS="3,5", LINGER_SECONDS="4")
-    form(server.store)
+    server = launch_formed(launch, trial=section, GAME_STEPS="3,5", LINGER_SECONDS="4")
     in_the_way = refuse_answers_of(server.store, "bert")
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await seen_by_both(anna, bert)
@@ -169,8 +161,7 @@ async def test_the_next_game_step_is_played_while_a_members_answer_to_the_one_be
 async def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_before_the_game(launch):
     """Their answer is given to the store while the others still play, and may be stored long after their game."""
     section = {"maxPing": 1000, "pingSamples": 3, "afterAbsent": "policy", "substitute": "idle"}
-    server = launch_session(launch, trial=section)
-    form(server.store)
+    server = launch_formed(launch, trial=section)
     in_the_way = refuse_answers_of(server.store, "bert")
     async with (
         far_away(server.port, 0.6) as port,
@@ -179,8 +170,7 @@ async def test_the_server_stays_for_the_answer_of_a_member_whom_it_has_refused_b
     ):
         reading = asyncio.create_task(bert.watch(60))
         await anna.until(lambda: len(anna.frames) > 5)
-        await anna.say(command="stop")
-        assert await anna.closed() == 1000
+        await anna.stop()
         reading.cancel()
     await asyncio.sleep(1)  # well after LINGER_SECONDS
     assert server.process.poll() is None, "an answer is not stored yet"

@@ -78,8 +78,7 @@ async def refused(server, open_client, code, **hello):
 async def play_to_the_end(server, open_client, frames=5):
     async with open_client(server.address) as client:
         await client.play(frames)
-        await client.say(command="stop")
-        assert await client.closed() == 1000
+        await client.stop()
         return client
 
 

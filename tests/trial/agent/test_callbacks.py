@@ -359,9 +359,7 @@ async def test_a_real_recording_holds_the_values_that_callbacks_recorded(launch,
     agent = grid(30) + CALLBACKS + WAITS
     server = launch(agent, {**TRIAL, "callbackSeconds": 10})  # the game waits, however busy the machine
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.controls)
-        await client.say(command="start")
+        await client.start()
         await client.say(command="good")
         await client.until(lambda: client.frames and client.state.get("episode") == 1 and len(client.frames) > 5)
     server.log.with_name("go_on").touch()
@@ -417,9 +415,7 @@ async def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_ag
             await client.hello()
             await client.until(lambda: client.controls)
     async with open_client(server.address) as client:
-        await client.hello()
-        await client.until(lambda: client.controls)
-        await client.say(command="start")
+        await client.start()
         began = time.monotonic()
         await client.until(lambda: client.done)
         assert time.monotonic() - began < 10, "81 calls would take half a minute"
@@ -445,9 +441,7 @@ async def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch
 
     async def play_a_little(server):
         async with open_client(server.address) as client:
-            await client.hello()
-            await client.until(lambda: client.controls)
-            await client.say(command="start")
+            await client.start()
             await client.until(lambda: len(client.frames) > 10)
 
     trial = {**TRIAL, "maxEpisodes": 1}
