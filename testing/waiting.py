@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -15,4 +16,13 @@ def until(look: Callable[[], T], seconds: float = 20) -> T:
     while not (found := look()):
         assert time.monotonic() < end, f"waited in vain; the last look: {found!r}"
         time.sleep(0.02)
+    return found
+
+
+async def until_async(look: Callable[[], T], seconds: float = 20) -> T:
+    """Do as `until` does, while the event loop goes on."""
+    end = time.monotonic() + seconds
+    while not (found := look()):
+        assert time.monotonic() < end, f"waited in vain; the last look: {found!r}"
+        await asyncio.sleep(0.01)
     return found

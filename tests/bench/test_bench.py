@@ -51,6 +51,7 @@ from testing.simulation import aws_bound, cloud, hippo, world
 from testing.simulation import tasks as ecs
 from testing.simulation.conditions import Conditions
 from testing.tasks import Life
+from testing.waiting import until_async
 from trial.pictures.encoder import Encoder
 
 COLUMNS = {"name", "value", "unit", "yardstick", "ratio", "goal", "met", "kind"}
@@ -720,9 +721,7 @@ def test_clients_of_the_bench_acknowledge_as_the_page_does(monkeypatch: pytest.M
             monkeypatch.setattr(loop, "time", lambda now=now: now)
             await acknowledging.drawn(picture)
         monkeypatch.setattr(loop, "time", plain)
-        async with asyncio.timeout(10):
-            while not told or json.loads(told[-1])["ack"] < len(times):
-                await asyncio.sleep(0.01)
+        await until_async(lambda: told and json.loads(told[-1])["ack"] >= len(times))
         return [json.loads(text)["ack"] for text in told]
 
     assert asyncio.run(acknowledged([5.0, 5.03, 5.06, 5.09, 5.12, 5.3, 5.33, 5.36])) == [1, 3, 5, 6, 8]

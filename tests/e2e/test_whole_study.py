@@ -18,16 +18,11 @@ from bots.links import with_user
 from bots.report import BotReport
 from local.rehearsal.logs import Verification, verify
 from local.rehearsal.study_process import StudyNotStarted, StudyProcess, servers_of, wait_until_gone
+from testing.waiting import until_async
 
 
 def bot(study: StudyProcess, name: str, *, play: float = 0, patience: float = 60) -> Bot:
     return Bot(study.link, name, Random(name), play=play, patience=patience)
-
-
-async def until(true: Callable[[], Any], seconds: float = 60) -> None:
-    async with asyncio.timeout(seconds):
-        while not true():
-            await asyncio.sleep(0.05)
 
 
 async def with_bots(bots: list[Bot], meanwhile: Awaitable[Any] | None = None) -> list[BotReport]:
@@ -59,7 +54,7 @@ def test_two_play_at_once_on_servers_of_their_own(project: Any, hold: Any) -> No
     together = []
 
     async def watch() -> None:
-        await until(plays(*bots))
+        await until_async(plays(*bots), 60)
         together.append({process.environ()["USER_ID"] for process in servers_of(study.data)})
 
     reports = asyncio.run(with_bots(bots, watch()))
@@ -82,7 +77,7 @@ def test_local_mode_is_killed_and_started_again(project: Any, hold: Any, free_po
     async def crash() -> None:
         page = await reader.open()
         page = await reader.answer(page, page.form)  # has consented, and looks at the next page
-        await until(plays(player))
+        await until_async(plays(player), 60)
         before = {process.pid for process in servers_of(study.data)}
         study.kill()
         sends = asyncio.create_task(reader.do(page))  # while nobody is there
@@ -108,13 +103,13 @@ def test_the_machine_goes_down_in_the_middle(project: Any, hold: Any, free_port:
 
     async def crash() -> int:
         """Kill everything in mid-game, and start the study again. Return how many steps were recorded by then."""
-        await until(plays(player, frames=60))
+        await until_async(plays(player, frames=60), 60)
         seen = player.report.plays[0]
-        await until(lambda: study.steps_written() > seen.frames - 30)  # a busy machine may write it late
+        await until_async(lambda: study.steps_written() > seen.frames - 30, 60)  # a busy machine may write it late
         study.kill()
         for process in servers_of(study.data):
             process.kill()
-        await until(lambda: not servers_of(study.data))
+        await until_async(lambda: not servers_of(study.data), 60)
         written = study.steps_written()
         await asyncio.to_thread(hold, folder, port=free_port)
         return written
@@ -144,7 +139,7 @@ def test_ctrl_c_ends_everything_and_the_study_can_go_on(project: Any, hold: Any,
     lasted = []
 
     async def interrupt() -> None:
-        await until(plays(*bots))
+        await until_async(plays(*bots), 60)
         began = time.monotonic()
         assert await asyncio.to_thread(study.interrupt)
         lasted.append(time.monotonic() - began)

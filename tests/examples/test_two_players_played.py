@@ -21,6 +21,7 @@ from local.rehearsal.logs import verify
 from local.rehearsal.study_process import ROOT, servers_of, sessions_not_open, sessions_of, wait_until_gone
 from testing import ports
 from testing.held_study import HeldStudy
+from testing.waiting import until_async
 from trial.recordings.recording import read
 
 EXAMPLE = ROOT / "examples" / "two-players"
@@ -147,8 +148,7 @@ def test_if_one_participant_leaves_for_good_the_game_ends_and_the_other_goes_on(
     async def leave() -> BotReport:
         bots = bots_of(study, "ada", "bo")
         ada, bo = (asyncio.ensure_future(bot.run()) for bot in bots)
-        while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in bots):
-            await asyncio.sleep(0.05)
+        await until_async(lambda: all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in bots), PATIENCE)
         bo.cancel()
         return await ada
 
@@ -165,13 +165,13 @@ def test_make_run_may_be_killed_while_a_participant_waits_and_while_two_play(run
     async def kill_twice() -> list[BotReport]:
         ada, bo = bots_of(study, "ada", "bo")
         first = asyncio.ensure_future(ada.run())
-        while ada.report.stage != "waits for others":
-            await asyncio.sleep(0.05)
+        await until_async(lambda: ada.report.stage == "waits for others", PATIENCE)
         study.kill()
         await asyncio.to_thread(study.start)
         second = asyncio.ensure_future(bo.run())
-        while not all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in (ada, bo)):
-            await asyncio.sleep(0.05)
+        await until_async(
+            lambda: all(bot.report.plays and bot.report.plays[0].frames > 6 for bot in (ada, bo)), PATIENCE
+        )
         study.kill()
         await asyncio.to_thread(study.start)
         return [await first, await second]

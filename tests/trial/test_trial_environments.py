@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from testing.gym_server import SECONDS, TextClient
-from testing.waiting import until
+from testing.waiting import until, until_async
 from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
@@ -317,8 +317,6 @@ async def test_a_program_that_does_not_read_its_answers_is_cut_off(
         writer.write(framed({"method": "reset", "params": {"instance_id": instance}}))
         for _ in range(10):  # each with an answer of 2 MB
             writer.write(framed({"method": "step_many", "params": {"instance_id": instance, "actions": [1] * 20000}}))
-        async with asyncio.timeout(SECONDS):
-            while made.connections:
-                await asyncio.sleep(0.02)
+        await until_async(lambda: not made.connections, SECONDS)
         writer.close()
     await made.close()

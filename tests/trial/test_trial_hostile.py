@@ -9,6 +9,8 @@ import urllib.request
 import pytest
 from websockets.exceptions import ConnectionClosed
 
+from testing.waiting import until_async
+
 
 async def test_a_wrong_hello_closes_the_connection(launch, open_client):
     server = launch()
@@ -122,9 +124,7 @@ async def test_many_strangers_do_not_keep_the_participant_out(launch, open_clien
         strangers = [await stack.enter_async_context(open_client(server.address)) for _ in range(90)]
         async with open_client(server.address) as client:
             await client.play()
-        async with asyncio.timeout(15):
-            while sum(stranger.websocket.close_code is not None for stranger in strangers) < 20:
-                await asyncio.sleep(0.02)
+        await until_async(lambda: sum(each.websocket.close_code is not None for each in strangers) >= 20)
         for stranger in strangers:
             stranger.websocket.transport.abort()
     assert "Traceback" not in server.log_text()

@@ -19,6 +19,7 @@ from onnx import TensorProto, helper
 
 from protocol.players import ONNXRUNTIME
 from testing import onnx_files
+from testing.waiting import until_async
 from trial.core.seeds import policy_seed
 from trial.policies.load import load
 from trial.policies.policy import PolicyError
@@ -446,11 +447,6 @@ async def policy_thread() -> AsyncIterator[tuple[PolicyByObservation, PolicyThre
         await asyncio.sleep(0)  # the event loop makes the calls that wait
 
 
-async def until(condition: Any) -> None:
-    while not condition():
-        await asyncio.sleep(0.001)
-
-
 async def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() -> None:
     loops = []
     async with policy_thread() as (policy, thread, answers):
@@ -459,7 +455,7 @@ async def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() ->
         thread.reset(5)
         for number in range(3):
             thread.ask(number, number, {}, None)
-        await until(lambda: len(answers) == 3)
+        await until_async(lambda: len(answers) == 3)
     assert answers == [(0, 0, None), (1, 1, None), (2, 2, None)]
     assert (policy.seeds, policy.threads, len(loops)) == ([5], {"policy player_1"}, 3)
     assert policy.closed.wait(10)
@@ -479,7 +475,7 @@ async def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() ->
     async with policy_thread() as (policy, thread, answers):
         thread._loop = Ended()  # type: ignore[assignment]
         thread.ask(1, 1, {}, None)
-        await until(lambda: told)
+        await until_async(lambda: told)
     assert policy.closed.wait(10)
     assert answers == []
 
@@ -492,7 +488,7 @@ async def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
         thread.ask(1, lambda: 1 / 0, {}, None)
         thread.ask(2, end, {}, None)
         thread.ask(3, 7, {}, None)
-        await until(lambda: len(answers) == 3)
+        await until_async(lambda: len(answers) == 3)
     assert [(ask, action, repr(error)) for ask, action, error in answers] == [
         (1, None, "ZeroDivisionError('division by zero')"),
         (2, None, "RuntimeError('SystemExit(3)')"),
@@ -506,7 +502,7 @@ async def test_a_failed_reset_is_the_answer_until_the_next_reset() -> None:
         thread.ask(1, 1, {}, None)
         thread.reset(2)
         thread.ask(2, 1, {}, None)
-        await until(lambda: len(answers) == 2)
+        await until_async(lambda: len(answers) == 2)
     assert [(ask, action, str(error)) for ask, action, error in answers] == [(1, None, "no such seed"), (2, 1, "None")]
 
 

@@ -1,6 +1,5 @@
 """Round trips are measured by the WebSocket's own pings, which any client answers without its page."""
 
-import asyncio
 import contextlib
 import time
 
@@ -9,6 +8,7 @@ from websockets.asyncio.client import connect
 from websockets.asyncio.server import serve
 from websockets.frames import Opcode
 
+from testing.waiting import until_async
 from tests.trial.far_away import far_away
 from trial.wire import round_trips
 from trial.wire.player_socket import PlayerSocket
@@ -42,20 +42,12 @@ async def measured_connection(samples, *, delay=None):
         if delay is not None:
             port = await stack.enter_async_context(far_away(port, delay))
         async with connect(f"ws://127.0.0.1:{port}", proxy=None, ping_interval=None, compression=None) as client:
-            while not ends:
-                await asyncio.sleep(0.01)
-            yield client, ends[0], reports
-
-
-async def until(true, seconds=10):
-    async with asyncio.timeout(seconds):
-        while not true():
-            await asyncio.sleep(0.01)
+            yield client, (await until_async(lambda: ends))[0], reports
 
 
 async def test_a_round_trip_is_the_time_there_and_back():
     async with measured_connection(3, delay=0.1) as (_, _, reports):
-        await until(lambda: len(reports) == 3)
+        await until_async(lambda: len(reports) == 3)
     assert all(seconds >= 0.2 for _, seconds in reports)
     assert min(seconds for _, seconds in reports) < 2
 
@@ -63,7 +55,7 @@ async def test_a_round_trip_is_the_time_there_and_back():
 async def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeypatch):
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 3.0)
     async with measured_connection(4) as (_, end, reports):
-        await until(lambda: len(reports) == 5)
+        await until_async(lambda: len(reports) == 5)
         assert end.most == 1
     times = [when for when, _ in reports]
     assert times[3] - times[0] < 2.9, "four samples"
@@ -74,13 +66,13 @@ async def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_fur
     monkeypatch.setattr(round_trips, "LONGEST_SECONDS", 0.3)
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
     async with measured_connection(1) as (client, end, reports):
-        await until(lambda: len(reports) >= 1)
+        await until_async(lambda: len(reports) >= 1)
         client.transport.pause_reading()
-        await until(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
+        await until_async(lambda: [seconds for _, seconds in reports].count(0.3) == 3)
         assert len(end.pending_pings) == 1
         known = len(reports)
         client.transport.resume_reading()
-        await until(lambda: len(reports) > known)
+        await until_async(lambda: len(reports) > known)
         assert all(seconds < 0.3 for _, seconds in reports[known:]), "the ping that was late counts once"
         assert end.most == 1
 
@@ -91,14 +83,14 @@ async def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
     async with measured_connection(1, delay=0.1) as (client, _, reports):
         for _ in range(200):
             await client.pong(b"1234")
-        await until(lambda: len(reports) == 3)
+        await until_async(lambda: len(reports) == 3)
     assert all(seconds >= 0.2 for _, seconds in reports)
 
 
 @pytest.mark.parametrize("answers", [True, False])
 async def test_measuring_ends_with_the_connection(answers):
     async with measured_connection(1) as (client, _, reports):
-        await until(lambda: reports)
+        await until_async(lambda: reports)
         if not answers:
             client.transport.pause_reading()
         client.transport.abort()
