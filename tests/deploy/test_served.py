@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -31,17 +32,15 @@ def restless_threads() -> Iterator[None]:
 
 
 def at_once(act: Callable[[int], object]) -> None:
+    """Let `AT_ONCE` threads call it with their numbers."""
     ready = threading.Barrier(AT_ONCE)
 
     def one(number: int) -> None:
         ready.wait()
         act(number)
 
-    threads = [threading.Thread(target=one, args=[number]) for number in range(AT_ONCE)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        list(pool.map(one, range(AT_ONCE)))
 
 
 @pytest.mark.usefixtures("restless_threads")

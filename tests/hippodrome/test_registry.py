@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -93,11 +94,8 @@ def test_many_researchers_at_once_are_all_registered(platform: FakePlatform) -> 
         return call
 
     platform.documents.replace, platform.documents.create = locked(replace), locked(create)  # type: ignore[method-assign]
-    threads = [threading.Thread(target=register, args=(registration(f"p{n}"),)) for n in range(12)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(12) as pool:
+        list(pool.map(lambda n: register(registration(f"p{n}")), range(12)))
     assert {p.id for p in listed(platform).projects} == {f"p{n}" for n in range(12)}
 
 

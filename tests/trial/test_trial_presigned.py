@@ -7,6 +7,7 @@ import socket
 import ssl
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from cryptography import x509
@@ -295,10 +296,9 @@ def test_an_error_without_an_answer_contains_no_address(town):
 
 
 def test_of_two_servers_that_store_the_same_answer_one_wins(town):
-    store, won = town.store(town.start()), []
-    threads = [threading.Thread(target=lambda n=n: won.append(store.create(ANSWER, b"%d" % n))) for n in range(6)]
-    [thread.start() for thread in threads]
-    [thread.join() for thread in threads]
+    store = town.store(town.start())
+    with ThreadPoolExecutor(6) as pool:
+        won = list(pool.map(lambda n: store.create(ANSWER, b"%d" % n), range(6)))
     assert sorted(won) == [False] * 5 + [True]
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -383,15 +383,9 @@ def test_without_limits_no_document_of_slots_is_read_or_written() -> None:
 
 
 def at_once(acts: list[Callable[[], bool]]) -> list[bool]:
-    """What each function returns; all of them run at the same time, each in a thread."""
-    results: list[bool] = []
-    threads = [threading.Thread(target=lambda act=act: results.append(act())) for act in acts]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(results) == len(acts)
-    return results
+    """Return what each function returns; all of them run at the same time, each in a thread."""
+    with ThreadPoolExecutor(len(acts)) as pool:
+        return [each.result() for each in [pool.submit(act) for act in acts]]
 
 
 @pytest.fixture(params=["S3", "folder"])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -84,11 +85,8 @@ def test_only_one_of_a_trial_and_a_function_creates_a_document(documents: Folder
             if store.create(key, b"trial"):
                 won.append(b"trial")
 
-        threads = [threading.Thread(target=target) for target in (by_function, by_trial)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(lambda create: create(), (by_function, by_trial)))
         assert [documents.get(key).body] == won  # type: ignore[union-attr]
 
 
@@ -179,10 +177,7 @@ def test_two_hundred_participants_at_once(documents: FolderDocuments) -> None:
             assert len(list(documents.list(folder))) == step
             documents.create(f"{folder}answers/{step}.json", json.dumps({"user": user}).encode())
 
-    threads = [threading.Thread(target=one, args=[user]) for user in range(200)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(200) as pool:
+        list(pool.map(one, range(200)))
     assert len(list(documents.list("study/users/"))) == 1000
     assert not os.listdir(documents.folder.parent / "state" / "scratch")

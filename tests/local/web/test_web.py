@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -204,14 +205,9 @@ def test_slow_functions_do_not_hold_up_each_other(site: Site) -> None:
         return {"statusCode": 200}
 
     site.answer = slow
-    answers: list[int] = []
-    ask = lambda: answers.append(httpx.get(f"{site.server.url}/next", timeout=30).status_code)  # noqa: E731
-    threads = [threading.Thread(target=ask) for _ in range(10)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert answers == [200] * 10
+    with ThreadPoolExecutor(10) as pool:
+        answers = list(pool.map(lambda _: httpx.get(f"{site.server.url}/next", timeout=30), range(10)))
+    assert [answer.status_code for answer in answers] == [200] * 10
 
 
 def test_only_this_machine_can_connect(site: Site) -> None:

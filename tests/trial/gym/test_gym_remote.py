@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import gymnasium
@@ -498,9 +499,6 @@ def test_threads_take_turns(url: str) -> None:
             for _ in range(50):
                 results.append(env.reset())
 
-        threads = [threading.Thread(target=play) for _ in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda _: play(), range(4)))
     assert len(results) == 200
