@@ -41,7 +41,7 @@ def erase(world: Installed) -> None:
         (
             sweep,
             {"ListTasks": 1, "DescribeTasks": 1, "ListClusters": 2, "ListResourceRecordSets": 1}
-            | {"ListSchedules": 1, "ListObjectsV2": 3, "GetObject": 7}
+            | {"ListSchedules": 1, "ListObjectsV2": 3, "GetObject": 5}
             | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1},
         ),
         (
