@@ -46,9 +46,8 @@ while True:
 def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
     """Start the module above; `new` has a variable that only a new Python heeds."""
     (tmp_path / "tells.py").write_text(TELLS)
-    before = signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell's background jobs ignore it, and hand that on
+    # A shell's background jobs ignore it, and hand that on.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     began = []
 
     def start(*arguments: str, **how: Any) -> Any:

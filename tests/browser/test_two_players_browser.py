@@ -95,9 +95,8 @@ def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProce
     for page in (wide, phone):
         page.wait_for_selector("#play:not([hidden])")
         page.wait_for_function(PLAYS)
-    colours = (
-        ["red", "blue"] if "You are red" in wide.inner_text(".hud") else ["blue", "red"]
-    )  # places are drawn by lot
+    # Places are drawn by lot.
+    colours = ["red", "blue"] if "You are red" in wide.inner_text(".hud") else ["blue", "red"]
     for page, colour in zip((wide, phone), colours, strict=True):
         wait_for_text(page, ".hud", f"You are {colour}")
     SHOTS.mkdir(exist_ok=True)

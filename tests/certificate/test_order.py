@@ -419,9 +419,8 @@ def test_a_renewal_that_read_the_state_before_another_ordered_does_not_order_aga
 
     def another_orders():
         assert place.obtain().ordered
-        place.ahead = (
-            timedelta()
-        )  # Pebble has issued it now and not in 61 days: by the clock of the test it would be due for renewal at once
+        # Pebble has issued it now and not in 61 days: by the clock of the test it would be due for renewal at once.
+        place.ahead = timedelta()
 
     late = Renewal(Paused(place.documents, another_orders), place.challenges, place.now, PLACE).obtain(place.wish())
     assert late.decision.verdict is Verdict.FRESH

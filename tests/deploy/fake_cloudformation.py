@@ -51,9 +51,8 @@ class FakeCloudFormation:
         self.resources: list[dict[str, Any]] = []
         self.changes: list[dict[str, Any]] | None = None  # of the next change set; None: what the template adds
         self.change_set: dict[str, Any] | None = None
-        self.change_sets: dict[
-            str, str
-        ] = {}  # change sets of ours that were neither executed nor deleted: names by ids
+        # Change sets of ours that were neither executed nor deleted: names by ids.
+        self.change_sets: dict[str, str] = {}
         self.failing = ""  # the reason for which the next change set fails
         self.validation: Callable[[], list[dict[str, str]]] = (
             list  # the findings of validation when a change set is made

@@ -54,16 +54,14 @@ class Clock:
 class RealStack:
     """Makes the stack's resources in moto, and decides which of their creations and deletions AWS refuses."""
 
-    in_use = (
-        4 * 60
-    )  # seconds that the certificate stays in use after the domain is gone; on AWS ten times that, or more
+    # Seconds that the certificate stays in use after the domain is gone; on AWS ten times that, or more.
+    in_use = 4 * 60
 
     def __init__(self, world: World, clock: Clock) -> None:
         self.world, self.clock = world, clock
         self.deleted: dict[str, datetime] = {}  # queues
-        self.refused_until = (
-            clock.time
-        )  # until then the certificate's deletion is refused, whatever ACM lists as its users
+        # Until then the certificate's deletion is refused, whatever ACM lists as its users.
+        self.refused_until = clock.time
         self.client = world.account.client
         self.cloud = world.cloud
         self.cloud.clock = lambda: clock.time

@@ -87,9 +87,8 @@ def played(running: RunningInstallation) -> None:
     (project,) = registered_projects(running.platform.documents)
     running.participant("me", answered=5, project=project)
     now = datetime.now(UTC)
-    then = max(
-        now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0)
-    )  # today, as the page shows
+    # Today, as the page shows.
+    then = max(now - timedelta(minutes=5), now.replace(hour=0, minute=0, second=0, microsecond=0))
     running.record("me", ServerState.CLOSED, project, closed=then, reason=Reason.STOPPED)
     lines = [{"kind": "header", "v": 1}, {"kind": "reset"}, {"kind": "step", "reward": 10.0}]
     name = ids.server_name(ids.server_label(STUDY, "me"), 1)

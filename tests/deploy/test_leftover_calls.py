@@ -69,9 +69,8 @@ def test_finding_and_removing_leftovers_takes_these_calls(
     installed.register(msgspec.structs.replace(study(), task_definition="hippodrome"))
     start(installed, "maze", "alice", "bob")
     repository = Repository(installed.platform.documents)
-    stored = repository.server(
-        ids.server_label("maze", "alice")
-    )  # its record is closed, and everything else still exists
+    # Its record is closed, and everything else still exists.
+    stored = repository.server(ids.server_label("maze", "alice"))
     assert stored
     repository.save(server.close(stored.server, Reason.STOPPED, installed.platform.now()), stored.etag)
     with installed.recording() as calls:

@@ -161,9 +161,8 @@ def test_alarms_and_dashboard_read_exactly_the_metrics_that_are_written(capsys: 
     shown: set[str] = set()
     for widget in body["widgets"]:
         space = ""
-        for metric in (
-            m for m in widget["properties"].get("metrics", []) if m[0] != "..."
-        ):  # the same as the metric before it
+        # "..." stands for the metric before it.
+        for metric in (m for m in widget["properties"].get("metrics", []) if m[0] != "..."):
             space = metric[0] if metric[0] != "." else space
             shown |= {metric[1]} if space == metrics.NAMESPACE else set()
     assert shown == names | {"ServersFailed"}

@@ -144,9 +144,8 @@ def test_a_warm_server_must_be_able_to_wait_an_hour_before_it_is_played_on(platf
     (problem,) = register(registration(warmServers=2, maxRuntime=61))["problems"]
     assert problem.startswith("project.warmServers is 2")
     assert "may need 121 minutes, and this installation allows 120" in problem
-    assert "registered" in register(
-        registration(warmServers=2, maxRuntime=61, live=False)
-    )  # closing a project is always allowed
+    # Closing a project is always allowed.
+    assert "registered" in register(registration(warmServers=2, maxRuntime=61, live=False))
 
 
 def test_servers_are_named_after_ids_only_where_that_is_allowed(platform: FakePlatform) -> None:

@@ -43,9 +43,8 @@ def test_a_journey_without_faults_ends_as_expected(journey):
     _, outcome = faults.run(journey, SEED)
     assert outcome.well, outcome
     everybody = (outcome.visit, *outcome.others)
-    room = min(
-        len(everybody), journey.limits.get("max_servers", len(everybody))
-    )  # chance decides which of them get a slot
+    # Chance decides which of them get a slot.
+    room = min(len(everybody), journey.limits.get("max_servers", len(everybody)))
     finished = sum(visit.finished is not None for visit in everybody)
     assert finished == (room if journey.finishes else 0), outcome
 

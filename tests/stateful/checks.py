@@ -119,9 +119,8 @@ def owned(world: World, record: Server) -> None:
             assert to_come or over, f"{name} is ready, its task is gone, and nobody will tell"
     if living and not over:
         assert record.name in account.due, f"{name} runs without a timer"
-        if (
-            record.counted and not record.warm_server_name
-        ):  # one of two deliveries is refused while the other gets a warm server
+        # One of two deliveries is refused while the other gets a warm server.
+        if record.counted and not record.warm_server_name:
             held = from_json(account.kept[server_slots_key(record.project_id)][0], ServerSlots).slots
             assert record.label in held, f"{name} runs without a place"
 

@@ -103,15 +103,13 @@ class World:
         self.dead: list[Message] = []
         self.kept: dict[str, bytes] = {}  # answers that participants have seen as stored
         self.given: dict[str, str] = {}  # warm servers by name, and the label of the participant who has or had it
-        self.erased: set[str] = (
-            set()
-        )  # labels of erased participants, whose next servers have the names of the erased ones
+        # Labels of erased participants, whose next servers have the names of the erased ones.
+        self.erased: set[str] = set()
         self.unheard: set[str] = set()  # labels of servers about which a message was lost
         self.lost = 0  # the number of lost messages
         self.calm = True  # whether no fault has occurred so far
-        self.excused: set[str] = (
-            set()
-        )  # labels of servers that an interrupted command of the administrator's has stopped only partly
+        # Labels of servers that an interrupted command of the administrator's has stopped only partly.
+        self.excused: set[str] = set()
         self._numbers = itertools.count(1)
         self._labels = {ids.server_label(project.id, user): user for user in users}
         self.people = {user: Person(user) for user in users}

@@ -417,9 +417,8 @@ def test_without_a_live_project_capacity_is_checked_for_servers_of_the_usual_siz
     assert only(images.projects(context(account))).text == "None is live."
     fresh(world)
     quotas(world, spot=6, on_demand=60)
-    spot, on_demand = capacity.fargate(
-        context(account, at_once=20)
-    )  # an administrator may run doctor before a study is registered
+    # An administrator may run doctor before a study is registered.
+    spot, on_demand = capacity.fargate(context(account, at_once=20))
     assert (spot.mark, on_demand.mark) == (Mark.LOOK, Mark.GOOD)
     assert "6 vCPU: 6 servers of 1 vCPU at once" in spot.text
 
@@ -732,9 +731,8 @@ def test_as_a_process(world: Installed) -> None:
         plain = process(env, "doctor", "--only-aws")
         nowhere = process({**env, "AWS_REGION": "eu-west-1"}, "doctor", "--json")
     found = {one["check"]: one for one in ran.json["checks"]}
-    assert (
-        ran.code == plain.code == nowhere.code == Exit.FAILED
-    )  # moto has neither quotas nor a policy that asks for TLS
+    # Moto has neither quotas nor a policy that asks for TLS.
+    assert ran.code == plain.code == nowhere.code == Exit.FAILED
     assert found["certificate"]["mark"] == "good"
     assert found["project maze"]["mark"] == "bad"
     assert found["bucket"]["text"].endswith("can be read without TLS.")

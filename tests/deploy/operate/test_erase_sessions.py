@@ -139,9 +139,8 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
         assert hidden not in json.dumps(receipt) + ran.err
     (project,) = receipt["projects"]
     assert (receipt["complete"], project["rewritten"], set(project["remains"].values())) == (True, 2, {0})
-    assert (
-        project["deleted"]["sessions"]["versions"] == 4
-    )  # two versions of the recording, two of the session's document
+    # Two versions of the recording, two of the session's document.
+    assert project["deleted"]["sessions"]["versions"] == 4
 
 
 def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path, capsys: Any) -> None:

@@ -254,9 +254,8 @@ JOURNEYS = (
     Journey("the trial ends by itself", ends_by_itself, finishes=False),
     Journey("the stop comes before the start", stop_overtakes_start),
     Journey("the stop comes while it starts", stopped_while_it_starts),
-    Journey(
-        "no event tells of its end", no_event_tells, alarms=True
-    ),  # the message that the task runs cannot be handled any more
+    # The message that the task runs cannot be handled any more.
+    Journey("no event tells of its end", no_event_tells, alarms=True),
     Journey("programs use the relays", by_the_relays, finishes=False),
     Journey("the sweep finds leftovers", leftovers, {"maxServers": 3}),
     Journey("a study is registered anew", registering, check=registered),

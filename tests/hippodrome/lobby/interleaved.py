@@ -82,12 +82,10 @@ class InterleavedPlatform(FakePlatform):
         self.bus = S3Bus(self)
         self.hub = greenlet.getcurrent()
         self.made: list[str] = []  # the calls, in order
-        self.askers: dict[
-            greenlet.greenlet, str
-        ] = {}  # for each function that runs: the participant whose page sent the request
-        self.read: defaultdict[str, list[decisions.Proposal]] = defaultdict(
-            list
-        )  # the proposals that each participant's requests have read
+        # For each function that runs: the participant whose page sent the request.
+        self.askers: dict[greenlet.greenlet, str] = {}
+        # The proposals that each participant's requests have read.
+        self.read: defaultdict[str, list[decisions.Proposal]] = defaultdict(list)
 
     def call(self, name: str, effect: Callable[[], Any]) -> Any:
         fault = self.hub.switch() if greenlet.getcurrent() is not self.hub else None

@@ -67,9 +67,8 @@ def test_templates_show_only_texts_of_the_table() -> None:
 
 @pytest.mark.parametrize(("name", "also"), [("game/main.js", ALL_MODULES), ("step.js", ())])
 def test_each_text_gets_values_for_its_placeholders(name: str, also: tuple[str, ...]) -> None:
-    assert not NAMED.search(
-        in_script(scripts.join(WEB / name, also), IN_ENGLISH)
-    )  # raises ValueError if a value is missing
+    # Raises ValueError if a value is missing.
+    assert not NAMED.search(in_script(scripts.join(WEB / name, also), IN_ENGLISH))
 
 
 def test_messages_of_servers_are_in_the_table() -> None:

@@ -326,9 +326,8 @@ def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[in
     sequence = scrolling(10)
 
     async def talk(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-        monkeypatch.setattr(
-            connections, "REST_SECONDS", 3600.0
-        )  # so that all pictures follow each other, however slow the machine is
+        # So that all pictures follow each other, however slow the machine is.
+        monkeypatch.setattr(connections, "REST_SECONDS", 3600.0)
         websocket = SentMessages(subprotocol)
         connection = Connection(websocket, lossless=lossless)  # type: ignore[arg-type]
         running = asyncio.create_task(connection.run())

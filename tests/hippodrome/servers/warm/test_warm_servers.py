@@ -125,9 +125,8 @@ def test_a_project_without_warm_servers_makes_no_calls_for_them() -> None:
     Servers(platform).start(START)
     platform.documents.calls.clear()
     Servers(platform).start(START)  # again: the record is there
-    assert (
-        platform.documents.calls.count("get") == 3
-    )  # the master list, the record, and the installation's secret, once for each container
+    # The master list, the record, and the installation's secret, once for each container.
+    assert platform.documents.calls.count("get") == 3
 
 
 def test_no_link_can_name_a_warm_server() -> None:
@@ -633,7 +632,6 @@ def test_a_participant_who_is_stopped_while_a_warm_server_refuses_gets_no_server
     waiting_writes(platform, None, None, None, leave, lambda: Servers(platform).stop([STOP]))
     Servers(platform).start(START)
     assert record(platform).is_closed
-    assert (
-        not platform.tasks.running
-    )  # neither the warm server's, which her record named when it was stopped, nor another
+    # Neither the warm server's, which her record named when it was stopped, nor another.
+    assert not platform.tasks.running
     assert not platform.timers.due.keys() - {ids.server_name(ids.server_label("maze", warm_id), 1)}
