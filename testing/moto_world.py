@@ -79,12 +79,7 @@ class MotoWorld:
     judged.
     """
 
-    def __init__(
-        self,
-        region: str = "us-east-1",
-        raw_delivery: bool = True,
-        enforce: bool = True,
-    ) -> None:
+    def __init__(self, region: str = "us-east-1", raw_delivery: bool = True, enforce: bool = True) -> None:
         self.region = region
         self.root_domain = "example.org"
         self.raw_delivery = raw_delivery

@@ -98,11 +98,7 @@ def counter(
         helper.make_node("Add", ["near", "nothing"], ["output"]),
     ]
     inputs: list[tuple[str, Shape]] = [("obs", ("batch", 2)), (state[0], ("batch", 1))]
-    values = {
-        "one": np.ones((1, 1), np.float32),
-        "centers": np.array([[0, 1, 2]], np.float32),
-        "zero": np.float32(0),
-    }
+    values = {"one": np.ones((1, 1), np.float32), "centers": np.array([[0, 1, 2]], np.float32), "zero": np.float32(0)}
     if seq_lens is not None:
         inputs.append(("seq_lens", seq_lens))
     return save(file, nodes, inputs, [("output", ("batch", 3)), (state[1], ("batch", 1))], values)

@@ -41,13 +41,8 @@ WIRES = {  # the event source mappings of the template; tests/simulation/test_si
     "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
     "task_changed": Wire(batch=100, window=1, concurrency=2, visibility=90),
 }
-TIMEOUTS = {
-    "next_step": 29,
-    "start_server": 60,
-    "task_changed": 60,
-    "stop_server": 60,
-    "sweep": 240,
-}  # seconds, as in the template
+# Seconds, as in the template.
+TIMEOUTS = {"next_step": 29, "start_server": 60, "task_changed": 60, "stop_server": 60, "sweep": 240}
 _NAMED, _MADE = template.functions(), template.resources("AWS::Lambda::Function")
 LOOPS = frozenset(name for name, logical in _NAMED.items() if _MADE[logical].get("RecursiveLoop") == "Allow")
 WATCH_EVERY = 10.0  # seconds

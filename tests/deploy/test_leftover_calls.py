@@ -61,10 +61,7 @@ def erase(world: Installed) -> None:
     ],
 )
 def test_finding_and_removing_leftovers_takes_these_calls(
-    installed: Installed,
-    remove: Callable[[Installed], None],
-    expected: dict[str, int],
-    access_keys: None,
+    installed: Installed, remove: Callable[[Installed], None], expected: dict[str, int], access_keys: None
 ) -> None:
     installed.register(msgspec.structs.replace(study(), task_definition="hippodrome"))
     start(installed, "maze", "alice", "bob")

@@ -27,12 +27,7 @@ CONFIG: dict[str, Any] = {
         "steps": {1: "consent", 2: "about", 3: "game", 4: "after", "finalStep": "end"},
         "events": {"startServerStep": 2, "stopServerStep": 4},
     },
-    "trial": {
-        "game": "tiny",
-        "maxEpisodes": 1,
-        "actionSpace": ["noop", "right"],
-        "ui": {"right": True},
-    },
+    "trial": {"game": "tiny", "maxEpisodes": 1, "actionSpace": ["noop", "right"], "ui": {"right": True}},
 }
 PAGES = {
     "consent": '<h1>Consent</h1><button name="consent" value="yes">I agree</button>',

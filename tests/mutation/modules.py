@@ -67,22 +67,10 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/limits/test_limits",
         "hippodrome/servers/warm/test_warm_servers",
     ),
-    "hippodrome/lobby/decisions.py": (
-        "hippodrome/lobby/test_rules",
-        "hippodrome/lobby/test_rules_machine",
-    ),
-    "hippodrome/lobby/rules.py": (
-        "hippodrome/lobby/test_rules",
-        "hippodrome/lobby/test_rules_machine",
-    ),
-    "hippodrome/lobby/matchmaking.py": (
-        "hippodrome/lobby/test_rules",
-        "hippodrome/lobby/test_rules_machine",
-    ),
-    "hippodrome/lobby/servers_ahead.py": (
-        "hippodrome/lobby/test_rules",
-        "hippodrome/lobby/test_rules_machine",
-    ),
+    "hippodrome/lobby/decisions.py": ("hippodrome/lobby/test_rules", "hippodrome/lobby/test_rules_machine"),
+    "hippodrome/lobby/rules.py": ("hippodrome/lobby/test_rules", "hippodrome/lobby/test_rules_machine"),
+    "hippodrome/lobby/matchmaking.py": ("hippodrome/lobby/test_rules", "hippodrome/lobby/test_rules_machine"),
+    "hippodrome/lobby/servers_ahead.py": ("hippodrome/lobby/test_rules", "hippodrome/lobby/test_rules_machine"),
     "hippodrome/model/messages.py": ("hippodrome/model/test_messages", "hippodrome/participants/test_relays"),
     "hippodrome/servers/dns.py": ("hippodrome/servers/test_dns", *SERVICES),
     "hippodrome/participants/frame.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_scripts"),

@@ -28,10 +28,7 @@ def written_unread(documents: FakeDocuments, key: str, body: bytes, etag: str = 
 
 
 def assert_noticed(
-    mutation: Mutation,
-    machine: type[RuleBasedStateMachine],
-    profile: settings,
-    monkeypatch: pytest.MonkeyPatch,
+    mutation: Mutation, machine: type[RuleBasedStateMachine], profile: settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Run the machine with this fault; it must fail with the mutation's message."""
     monkeypatch.setattr(mutation.owner, mutation.name, mutation.mutant)  # type: ignore[arg-type]

@@ -59,10 +59,7 @@ def test_the_section_with_its_defaults_is_accepted_again() -> None:
             {"a\nb": True},
             "ui.a\nb: must be the name of a control; take out its tabs, line ends and invisible characters",
         ),
-        (
-            {f"word{number}": True for number in range(33)},
-            "ui: must have at most 32 controls of your own, not 33",
-        ),
+        ({f"word{number}": True for number in range(33)}, "ui: must have at most 32 controls of your own, not 33"),
     ],
 )
 def test_wrong_controls_are_refused(ui: dict[str, Any], said: str) -> None:

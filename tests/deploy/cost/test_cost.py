@@ -322,9 +322,7 @@ trial: {game: Maze-v0}
 
 
 def test_the_estimate_says_what_warm_servers_cost_an_hour_and_a_day(
-    installed: Installed,
-    capsys: Any,
-    tmp_path: Path,
+    installed: Installed, capsys: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "steps").mkdir()
     for page in ("consent", "thanks"):
@@ -344,8 +342,7 @@ def test_the_estimate_says_what_warm_servers_cost_an_hour_and_a_day(
 
 
 def test_spending_has_a_line_for_waiting_and_the_present_cost_of_live_projects(
-    installed: Installed,
-    capsys: Any,
+    installed: Installed, capsys: Any
 ) -> None:
     live = study(warm_servers=4)
     closed = msgspec.structs.replace(study(warm_servers=2), id="closed", live=False)
@@ -463,10 +460,7 @@ def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> No
     ],
 )
 def test_without_cost_explorer_only_the_bill_is_missing(
-    installed: Installed,
-    capsys: Any,
-    code: str,
-    says: str,
+    installed: Installed, capsys: Any, code: str, says: str
 ) -> None:
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)

@@ -108,11 +108,7 @@ def test_a_certificate_that_a_foreign_resource_uses_is_not_waited_for(
     ("domain", "region"), [(SITE, "us-east-1"), (f"*.{SITE}", REGION)], ids=["another region", "a wildcard"]
 )
 def test_a_validation_record_that_another_certificate_needs_stays_and_is_reported(
-    stack: RealStack,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    domain: str,
-    region: str,
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], domain: str, region: str
 ) -> None:
     other = request_certificate(stack.world, domain, region)
     same_record(stack.world, other, stack.certificate, region)
@@ -199,11 +195,7 @@ def test_an_edited_policy_and_a_role_with_more_policies_do_not_stop_destroy(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     iam = stack.client("iam")
-    iam.create_policy_version(
-        PolicyArn=stack.policy,
-        PolicyDocument=POLICY,
-        SetAsDefault=True,
-    )
+    iam.create_policy_version(PolicyArn=stack.policy, PolicyDocument=POLICY, SetAsDefault=True)
     foreign = iam.create_policy(PolicyName="audit", PolicyDocument=POLICY)["Policy"]["Arn"]
     iam.attach_role_policy(RoleName=stack.role, PolicyArn=foreign)
     iam.put_role_policy(RoleName=stack.role, PolicyName="more", PolicyDocument=POLICY)
@@ -420,11 +412,7 @@ GOES_ON = (
 @pytest.mark.explores
 @pytest.mark.parametrize(("status", "then"), sample(GOES_ON, 3))
 def test_destroy_first_waits_for_an_operation_in_progress(
-    stack: RealStack,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    status: str,
-    then: str,
+    stack: RealStack, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], status: str, then: str
 ) -> None:
     assert stack.cloud.stack
     stack.in_use = 0

@@ -154,10 +154,7 @@ def test_problems_can_be_overruled(world: World, capsys: Capsys) -> None:
     assert "✗ domain" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("operation", "check"),
-    [("GetAccountSettings", "Lambda"), ("GetServiceQuota", "Fargate")],
-)
+@pytest.mark.parametrize(("operation", "check"), [("GetAccountSettings", "Lambda"), ("GetServiceQuota", "Fargate")])
 def test_a_check_without_permission_is_a_remark(world: World, capsys: Capsys, operation: str, check: str) -> None:
     world.limits.denied.add(operation)
     assert apply(world.account, "hippodrome", FIRST).created

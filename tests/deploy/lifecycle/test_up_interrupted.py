@@ -143,11 +143,7 @@ def empty_account(world: World) -> None:
 @pytest.mark.explores
 @pytest.mark.parametrize("afterwards", [False, True], ids=["before the call", "after it"])
 def test_ctrl_c_at_any_call_and_the_same_command_again(
-    world: World,
-    ctrl_c: CtrlC,
-    deploy_study: Callable[[], int],
-    afterwards: bool,
-    capsys: pytest.CaptureFixture[str],
+    world: World, ctrl_c: CtrlC, deploy_study: Callable[[], int], afterwards: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     check_every_interruption(world, ctrl_c, deploy_study, afterwards, lambda: None)
     assert "Traceback" not in capsys.readouterr().err

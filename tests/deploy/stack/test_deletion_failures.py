@@ -35,11 +35,7 @@ REPORTED = [  # the type, the message, the remedy; the source is beside each
         "before detaching the gateway.",
         Recovery.NETWORK,
     ),
-    (
-        "EC2::InternetGateway",
-        "The internetGateway 'igw-1' has dependencies and cannot be deleted.",
-        Recovery.NETWORK,
-    ),
+    ("EC2::InternetGateway", "The internetGateway 'igw-1' has dependencies and cannot be deleted.", Recovery.NETWORK),
     (
         "CertificateManager::Certificate",  # aws-cdk 36265
         "Certificate arn:aws:acm:ca-central-1:123456789012:certificate/1 in account 123456789012 is in use. "

@@ -50,10 +50,7 @@ def test_only_the_first_cause_of_a_failure_is_reported(world: World) -> None:
     assert stack.follow("Making", stack_id, 3, after) == "ROLLBACK_COMPLETE"
     problem = stack.problem("It could not be made", stack_id, "ROLLBACK_COMPLETE")
     assert str(problem) == "It could not be made (now ROLLBACK_COMPLETE)."
-    assert problem.details == (
-        "Vpc (AWS::EC2::VPC, physical-Vpc):",
-        "  The maximum number of VPCs has been reached.",
-    )
+    assert problem.details == ("Vpc (AWS::EC2::VPC, physical-Vpc):", "  The maximum number of VPCs has been reached.")
     assert "--vpc" in problem.advice
 
 

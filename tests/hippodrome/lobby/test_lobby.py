@@ -600,11 +600,8 @@ def test_a_request_in_the_lobby_makes_four_calls(room: WaitingRoom) -> None:
     calls(room)
     room.wait(2)
     room.visit("ann")
-    assert calls(room) == {
-        "get": 2,
-        "list": 1,
-        "put": 1,
-    }  # get: the membership and the document; list: the folder; put: ann's entry
+    # Get: the membership and the document; list: the folder; put: ann's entry.
+    assert calls(room) == {"get": 2, "list": 1, "put": 1}
 
 
 def test_the_calls_that_a_pair_makes_from_the_lobby_to_its_memberships(room: WaitingRoom) -> None:

@@ -294,10 +294,8 @@ def test_a_member_who_has_confirmed_need_not_ask_again() -> None:
 def test_members_of_a_fallen_proposal_keep_their_turn() -> None:
     document = Decisions(proposed=(proposal("ab", 10),))
     entries = lobby(one("a", 40, 11), one("b", 39), one("c", 8), one("d", 7), yes={"p": "b"})
-    assert groups(decide(entries, document, known=Decisions())) == [
-        "ab",
-        "cd",
-    ]  # the proposal was made after the listing: it stays
+    # The proposal was made after the listing: it stays.
+    assert groups(decide(entries, document, known=Decisions())) == ["ab", "cd"]
     fallen = decide(entries, document)
     assert groups(fallen) == ["cd"]  # a and b are proposed by the next run, which lists again
     assert groups(decide(entries, Decisions())) == ["bc"]

@@ -97,12 +97,7 @@ def ended(stop_code: str | None = "SpotInterruption", **container: object) -> di
 
 @pytest.mark.parametrize(
     "event",
-    [
-        ended(exitCode=143),
-        ended(),
-        ended("TaskFailedToStart"),
-        ended("EssentialContainerExited", exitCode=0),
-    ],
+    [ended(exitCode=143), ended(), ended("TaskFailedToStart"), ended("EssentialContainerExited", exitCode=0)],
 )
 def test_a_task_has_ended_when_its_containers_have_and_the_event_says_why(event: dict[str, Any]) -> None:
     assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]

@@ -421,9 +421,7 @@ def test_participants_keep_their_own_game_while_it_has_a_server_or_a_next_one(fo
         assert ann.data["state"]["state"] == "lobby"
 
 
-def test_a_participant_whose_own_server_has_not_started_gets_the_lobby(
-    for_one: FakePlatform,
-) -> None:
+def test_a_participant_whose_own_server_has_not_started_gets_the_lobby(for_one: FakePlatform) -> None:
     ann = Player(for_one, "ann").to_game()
     address = ann.data["poll"]
     register_two(for_one)
@@ -453,9 +451,7 @@ def test_a_missing_page_that_only_the_registration_for_one_player_named_is_left_
     assert 'id="text-instructions"' not in page
 
 
-def test_a_member_plays_with_the_others_even_if_a_server_of_their_own_was_started(
-    for_one: FakePlatform,
-) -> None:
+def test_a_member_plays_with_the_others_even_if_a_server_of_their_own_was_started(for_one: FakePlatform) -> None:
     """A function that had not read the new registration has started that server. A page that was made for one player is loaded again."""
     ann = Player(for_one, "ann").to_game()
     address = ann.data["poll"]
@@ -478,9 +474,7 @@ def start_for_one(platform: FakePlatform, user: str) -> None:
     place.use(platform)
 
 
-def test_a_function_with_an_old_registration_reads_the_new_one_for_a_poll_of_the_lobby(
-    for_one: FakePlatform,
-) -> None:
+def test_a_function_with_an_old_registration_reads_the_new_one_for_a_poll_of_the_lobby(for_one: FakePlatform) -> None:
     """Otherwise the page would treat the participant as matched."""
     ann = Player(for_one, "ann").to_game()
     assert ann.data["state"]["state"] == "queued"

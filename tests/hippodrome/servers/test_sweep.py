@@ -371,9 +371,7 @@ def test_a_task_that_has_not_run_after_twenty_minutes_is_given_up_and_replaced(p
     assert [request.name for request in platform.tasks.running.values()] == [ids.server_name(LABEL, 2)]
 
 
-def test_the_record_of_a_server_without_resources_is_closed_after_its_deadline(
-    platform: FakePlatform,
-) -> None:
+def test_the_record_of_a_server_without_resources_is_closed_after_its_deadline(platform: FakePlatform) -> None:
     ready(platform)
     for things in (platform.tasks.running, platform.dns.records, platform.timers.due):
         things.clear()

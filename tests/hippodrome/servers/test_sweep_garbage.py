@@ -21,17 +21,7 @@ from testing.servers import Servers
 from testing.studies import installed, study
 
 MANY = 16_000
-GARBAGE = [
-    b"",
-    b"{",
-    b"[]",
-    b"3",
-    b"\xff",
-    b'{"held": 3}',
-    b'{"spares": []}',
-    b'{"held": {"x": {}}}',
-    b"[" * 100_000,
-]
+GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
 SLOTS = limits.server_slots_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 

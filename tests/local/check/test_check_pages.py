@@ -44,10 +44,7 @@ def test_mistakes_in_jinja_are_reported(folder: Path, text: str, said: str) -> N
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            "{{ completion_cod }}",
-            "nothing is shown: there is no value completion_cod; did you mean completion_code?",
-        ),
+        ("{{ completion_cod }}", "nothing is shown: there is no value completion_cod; did you mean completion_code?"),
         ("{{ answers['1'].n * 2 }}", "a participant without the answer gets an error page here (UndefinedError: "),
     ],
 )

@@ -68,11 +68,7 @@ PEOPLE = [
     {"id": name, "waited": 5, "group": group, "answers": {"skill": skill, "role": role}}
     for name, (skill, role, group) in zip("abcd", WHO, strict=True)
 ]
-CHOSEN = {
-    "skill": [["a", "c"], ["b", "d"]],
-    "group": [["a", "c"], ["b", "d"]],
-    "role": [["c", "a"], ["d", "b"]],
-}
+CHOSEN = {"skill": [["a", "c"], ["b", "d"]], "group": [["a", "c"], ["b", "d"]], "role": [["c", "a"], ["d", "b"]]}
 
 
 def test_the_docs_show_three_functions() -> None:

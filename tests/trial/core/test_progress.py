@@ -178,14 +178,7 @@ def test_a_break_lets_go_of_the_keys_and_ignores_those_that_are_tapped_in_it():
 
 @pytest.mark.parametrize(
     ("wish", "rate"),
-    [
-        ("faster", 35),
-        ("slower", 25),
-        (45, 45),
-        (20.6, 21),
-        (1000, 60),
-        (-1000, 10),
-    ],
+    [("faster", 35), ("slower", 25), (45, 45), (20.6, 21), (1000, 60), (-1000, 10)],
 )
 def test_the_frame_rate_stays_within_the_projects_limits(wish, rate):
     game = new_game(minFrameRate=10, maxFrameRate=60, startingFrameRate=30, frameRateStepSize=5)

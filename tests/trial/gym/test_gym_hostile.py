@@ -419,13 +419,8 @@ def serves(server: GymServerProcess) -> bool:
     try:
         with TextClient(server.url) as client:
             return len(client.make("CartPole-v1")) == 32
-    except (
-        InvalidStatus,
-        OSError,
-        EOFError,
-        InvalidMessage,
-        ConnectionClosed,
-    ):  # the error depends on when the server refused
+    # The error depends on when the server refused.
+    except (InvalidStatus, OSError, EOFError, InvalidMessage, ConnectionClosed):
         return False
 
 

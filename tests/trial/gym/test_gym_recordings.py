@@ -106,9 +106,7 @@ def test_a_reward_may_be_an_array_of_one_number(tmp_path: Path) -> None:
     assert (step["reward"], end["score"]) == (2.5, 2.5)
 
 
-def test_a_recording_is_whole_after_the_client_leaves_and_lacks_a_second_after_a_kill(
-    tmp_path: Path,
-) -> None:
+def test_a_recording_is_whole_after_the_client_leaves_and_lacks_a_second_after_a_kill(tmp_path: Path) -> None:
     with gym_server("--record", str(tmp_path)) as server:
         with TextClient(server.url) as client:
             made = client.make("CartPole-v1")

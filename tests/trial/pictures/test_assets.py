@@ -92,10 +92,7 @@ def test_frames_of_one_size_are_counted_row_by_row(tmp_path: Path) -> None:
         ({"cook_png": image(form="GIF")}, "assets/cook.png is no PNG, JPEG or WebP image, or is broken"),
         ({"cook_png": image(5000, 1)}, "assets/cook.png has 5000 x 1 pixels; at most 4096 x 4096 are shown"),
         ({"cook_png": bytes(5 * 2**20)}, "assets/cook.png has 5 MB; a file has at most 4 MB"),
-        (
-            {"cook_png": image(), "cook_json": "{"},
-            "assets/cook.png cannot be shown: cook.json beside it is no JSON",
-        ),
+        ({"cook_png": image(), "cook_json": "{"}, "assets/cook.png cannot be shown: cook.json beside it is no JSON"),
         (
             {"cook_png": image(), "cook_json": {"frames": {"a": {"frame": {"x": 3, "y": 0, "w": 2, "h": 2}}}}},
             "assets/cook.png cannot be shown: cook.json beside it has the frame 'a' outside of the image",
