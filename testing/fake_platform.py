@@ -95,6 +95,7 @@ class FakeTasks:
         self.own_clusters: set[str] = set()
         self.pending: set[str] = set()  # tasks that do not run yet
         self.fail: list[Exception] = []  # the next calls of `run` raise these
+        self.fail_stops: list[Exception] = []  # the next calls of `stop` raise these
 
     def run(self, request: TaskRequest) -> str:
         if self.fail:
@@ -106,6 +107,8 @@ class FakeTasks:
         return self.by_name[request.name, request.spot]
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
+        if self.fail_stops:
+            raise self.fail_stops.pop(0)
         if self.running.pop(task, None):
             self.stopped[task] = reason
 

@@ -20,6 +20,9 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from hippodrome.aws.challenges import Route53Challenges
 from testing.certificates import authority
 
 MISSING = "pebble and pebble-challtestsrv are not installed (Debian packages of these names)"
@@ -62,6 +65,19 @@ class Pebble:
     def accounts(self) -> int:
         """The number of accounts that were made."""
         return self.log.read_text().count("accounts in memory")
+
+
+def answer_as_route_53(pebble: Pebble, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Publish in Pebble's DNS, too, what is put into Route 53."""
+    put = Route53Challenges.put
+
+    def put_there_too(self: Route53Challenges, name: str, values: Sequence[str], seconds: float) -> None:
+        put(self, name, values, seconds)
+        pebble.tell_dns("clear-txt", host=f"{name}.")
+        for value in values:
+            pebble.tell_dns("set-txt", host=f"{name}.", value=value)
+
+    monkeypatch.setattr(Route53Challenges, "put", put_there_too)
 
 
 class TestChallenges:

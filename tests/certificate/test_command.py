@@ -17,7 +17,7 @@ from hippodrome.certificates.rules import PRODUCTION, STAGING, CertificateRecord
 from hippodrome.model.records import from_json, to_json
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
-from tests.certificate.pebble import make_ca
+from tests.certificate.pebble import answer_as_route_53, make_ca
 from tests.deploy.installation import Installed
 
 DOMAIN = "example.org"
@@ -73,15 +73,7 @@ def delegated(internet, zone):
 @pytest.fixture
 def own(pebble, world, tmp_path, monkeypatch):
     """The options for Pebble as the authority; Pebble's DNS gets the records that Route 53 gets."""
-    put = Route53Challenges.put
-
-    def put_there_too(self, name, values, seconds):
-        put(self, name, values, seconds)
-        pebble.tell_dns("clear-txt", host=f"{name}.")
-        for value in values:
-            pebble.tell_dns("set-txt", host=f"{name}.", value=value)
-
-    monkeypatch.setattr(Route53Challenges, "put", put_there_too)
+    answer_as_route_53(pebble, monkeypatch)
     roots = tmp_path / "roots.pem"
     roots.write_text(pebble.trusted)
     return ["--directory", pebble.directory, "--ca-file", str(roots)]

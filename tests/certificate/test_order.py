@@ -249,6 +249,15 @@ class Mortal:
         return call
 
 
+def killed_at(place, writes):
+    """Order a certificate in a process that is killed after so many writes. Return False if it ended before."""
+    try:
+        place.renewal(Mortal(place.documents, writes)).obtain(place.wish())
+    except Killed:
+        return True
+    return False
+
+
 def test_after_a_kill_at_any_write_the_next_run_goes_on(place):
     """The run replaces a certificate that is in use: at any moment a server that starts finds a pair that fits."""
     place.obtain()
@@ -256,12 +265,7 @@ def test_after_a_kill_at_any_write_the_next_run_goes_on(place):
         serial = place.state.serial
         place.ahead += timedelta(days=61)
         challenges = place.challenges
-        mortal = Mortal(place.documents, writes)
-        try:
-            place.renewal(mortal).obtain(place.wish())
-        except Killed:
-            pass
-        else:
+        if not killed_at(place, writes):
             break
         assert served(place)
         stored = place.renewal().read()[1]
@@ -286,12 +290,7 @@ def test_after_a_kill_at_any_write_the_next_run_goes_on(place):
 def test_after_a_kill_at_any_write_of_the_first_order_servers_have_a_whole_pair(place):
     """As soon as there is a key, a server can start."""
     for writes in range(20):
-        mortal = Mortal(place.documents, writes)
-        try:
-            place.renewal(mortal).obtain(place.wish())
-        except Killed:
-            pass
-        else:
+        if not killed_at(place, writes):
             break
         if (place.folder / PRIVKEY).exists():
             assert served(place)

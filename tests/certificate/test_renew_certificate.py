@@ -10,6 +10,7 @@ from hippodrome.ports import Settings
 from lambdas import installed
 from lambdas.renew_certificate import MARGIN, handler
 from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY, ROOT_DOMAIN
+from tests.certificate.pebble import answer_as_route_53
 
 
 class Context:
@@ -97,21 +98,12 @@ def test_a_certificate_that_was_put_there_by_hand_is_not_renewed(function, place
 
 def test_the_functions_role_allows_its_calls_and_no_other_role_allows_its_writes(moto_world, pebble, monkeypatch):
     """Route 53 and S3 on moto; the roles in infra/template.yml must allow each call (see testing/iam/enforcement.py)."""
-    from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.certificates.renewal import Renewal, RenewalRequest
     from testing.iam.actions import asks
 
     if moto_world.iam is None:
         pytest.skip("the evaluator of roles is not installed (tests/infra/test_enforcement.py)")
-    put = Route53Challenges.put
-
-    def put_there_too(self, name, values, seconds):
-        put(self, name, values, seconds)
-        pebble.tell_dns("clear-txt", host=f"{name}.")
-        for value in values:
-            pebble.tell_dns("set-txt", host=f"{name}.", value=value)
-
-    monkeypatch.setattr(Route53Challenges, "put", put_there_too)
+    answer_as_route_53(pebble, monkeypatch)
     platform = moto_world.platform
     Renewal(platform.documents, platform.challenges, platform.now, PLACE).obtain(
         RenewalRequest(DOMAIN, pebble.directory, trusted=pebble.trusted)

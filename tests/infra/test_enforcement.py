@@ -10,7 +10,7 @@ import copy
 import functools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from typing import Any
 from unittest import mock
@@ -55,21 +55,8 @@ def test_ministack_is_installed_where_it_is_required() -> None:
 
 
 @pytest.fixture
-def judged() -> None:
-    if evaluator() is None:
-        pytest.skip(MISSING)
-
-
-@pytest.fixture
 def judge(judged: None) -> Judge:
     return Judge(cfn.ReferenceValues(parameters=TEXTS, known={"Bucket": "the-bucket"}))
-
-
-@pytest.fixture
-def world(judged: None) -> Iterator[MotoWorld]:
-    with MotoWorld() as made:
-        yield made
-    installed.use(None)
 
 
 def relay(handler: Callable[..., Any], user: str, body: dict[str, Any]) -> int:

@@ -14,12 +14,12 @@ import pytest
 
 from hippodrome.model import ids
 from hippodrome.storage.secret import KEY
-from lambdas import installed, update_project_master_list
+from lambdas import update_project_master_list
 from testing import derived
 from testing import template as cfn
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
-from testing.iam.judge import MISSING, Judge, evaluator
+from testing.iam.judge import Judge
 from testing.moto_study import PROJECT, Person, StudyOnMoto
 from testing.moto_world import MotoWorld
 
@@ -63,19 +63,6 @@ SHOWN = {  # every action of the policy: what it shows or does. Who adds one say
     "logs:FilterLogEvents": "logs, which hold no secrets: test_handlers.py, ministack/test_installation.py",
     "logs:GetLogEvents": "logs",
 }
-
-
-@pytest.fixture
-def judged() -> None:
-    if evaluator() is None:
-        pytest.skip(MISSING)
-
-
-@pytest.fixture
-def world(judged: None) -> Iterator[MotoWorld]:
-    with MotoWorld() as made:
-        yield made
-    installed.use(None)
 
 
 def statements(of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:

@@ -387,13 +387,7 @@ def test_only_the_start_that_failed_comes_again(platform: FakePlatform) -> None:
 def test_only_the_stop_that_failed_comes_again(platform: FakePlatform) -> None:
     bodies = [{"projectId": PROJECT, "userId": user} for user in ("a", "b", "c")]
     start_server.handler(batch(*bodies), None)
-    stop = platform.tasks.stop
-
-    def fails_once(task: str, cluster: str, reason: str) -> None:
-        platform.tasks.stop = stop  # type: ignore[method-assign]
-        raise ConnectionError
-
-    platform.tasks.stop = fails_once  # type: ignore[method-assign]
+    platform.tasks.fail_stops = [ConnectionError()]
     event = batch(*bodies)
     failed = stop_server.handler(event, None)
     assert failed == {"batchItemFailures": [{"itemIdentifier": event["Records"][0]["messageId"]}]}

@@ -162,7 +162,8 @@ def test_a_failed_try_is_repeated_if_the_remedy_helped() -> None:
     assert (len(tries), len(helped)) == (3, 2)
 
 
-def test_a_failed_try_is_not_repeated_without_a_remedy() -> None:
+@pytest.mark.parametrize(("remedy", "expected"), [(False, 1), (True, 3)])
+def test_a_failed_try_is_repeated_after_a_remedy_and_the_last_failure_is_raised(remedy: bool, expected: int) -> None:
     tries: list[int] = []
 
     def act() -> None:
@@ -170,17 +171,5 @@ def test_a_failed_try_is_not_repeated_without_a_remedy() -> None:
         raise ConnectionError
 
     with pytest.raises(ConnectionError):
-        Executor().retry(act, lambda _: False, 5)
-    assert len(tries) == 1
-
-
-def test_the_failure_of_the_last_try_is_raised() -> None:
-    tries: list[int] = []
-
-    def act() -> None:
-        tries.append(1)
-        raise ConnectionError
-
-    with pytest.raises(ConnectionError):
-        Executor().retry(act, lambda _: True, 3)
-    assert len(tries) == 3
+        Executor().retry(act, lambda _: remedy, 3)
+    assert len(tries) == expected

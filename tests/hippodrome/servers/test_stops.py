@@ -103,13 +103,7 @@ def test_a_closed_server_is_not_changed(platform: FakePlatform) -> None:
 
 def test_a_message_whose_server_could_not_be_stopped_comes_again(platform: FakePlatform) -> None:
     servers = started(platform, ("maze", "alice"), ("atari", "bob"))
-    stop = platform.tasks.stop
-
-    def fails_once(task: str, cluster: str, reason: str) -> None:
-        platform.tasks.stop = stop  # type: ignore[method-assign]
-        raise ConnectionError
-
-    platform.tasks.stop = fails_once  # type: ignore[method-assign]
+    platform.tasks.fail_stops = [ConnectionError()]
     again = servers.stop([StopUser("alice"), StopUser("bob")])
     assert again == [StopUser("alice")]
     assert servers.stop(again) == []
