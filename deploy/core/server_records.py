@@ -40,11 +40,9 @@ class Records:
 
         `advance` gets two numbers: how many records have been read, and how many have to be read.
         """
-        wanted = [
-            entry
-            for entry in self._documents.list(RECORDS)
-            if _is_record(entry.key) and (moment is None or entry.modified >= moment)
-        ]
+        listed = {entry.key: entry for entry in self._documents.list(RECORDS) if _is_record(entry.key)}
+        self._kept = {key: kept for key, kept in self._kept.items() if key in listed}  # others have been deleted
+        wanted = [entry for entry in listed.values() if moment is None or entry.modified >= moment]
         stale = [entry for entry in wanted if self._is_stale(entry)]
         stale_keys = [entry.key for entry in stale]
         with ThreadPoolExecutor(READERS) as pool:

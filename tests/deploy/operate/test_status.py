@@ -307,6 +307,17 @@ def test_a_second_look_reads_only_changed_records(world: Installed, monkeypatch:
     assert [call.operation for call in calls] == ["ListObjectsV2"]
 
 
+def test_an_unreadable_record_counts_until_it_is_deleted(world: Installed) -> None:
+    key = "_servers/sbbbbbbbbbbbbbbbbbbbb.json"
+    world.put(key, b"not a record")
+    records = Records(world.platform.documents)
+    records.since()
+    assert records.unreadable == 1
+    world.platform.documents.delete(key)
+    records.since()
+    assert records.unreadable == 0
+
+
 def test_watching_ends_at_ctrl_c(world: Installed, capsys: Any, monkeypatch: Any) -> None:
     world.participant("alice")
     slept: list[float] = []
