@@ -337,7 +337,7 @@ def _signatures(
 
 
 def _env_methods(missing: Sequence[str], returned: Any) -> dict[str, Callable[..., Any]]:
-    """Return the environment's methods for those that the agent lacks. Raises AgentError if both lack a method."""
+    """Return the environment's methods of the names in `missing`. Raises AgentError if the environment lacks one."""
     lacking = [name for name in missing if not callable(getattr(returned, name, None))]
     if lacking:
         why = "" if returned is None else f", and neither has what start() returned ({type(returned).__name__})"

@@ -118,8 +118,8 @@ class JointAdapter:
     def step(self, actions: Mapping[str, int]) -> Joint:
         """Take one step with the numbers of the actions by player. Raises AgentError if the result cannot be read.
 
-        The environment takes an action of each player in the game, also of those who are not to act. So a player who
-        is not in `actions` takes their first legal action.
+        The environment takes an action of each player in the game, also of a player who is not to act. So a player
+        without an entry in `actions` takes their first legal action.
         """
         keys, starts, first_legal = self._players.keys, self._players.starts, self._first_legal
         given = {

@@ -210,7 +210,7 @@ class _Observations:
 
 
 def snapshot(observation: Any) -> Any:
-    """Copy an observation, so that the environment cannot change it. Return one that contains itself as it is."""
+    """Copy an observation, so that the environment cannot change it. If it contains itself, return it uncopied."""
     try:
         return _copied(observation)
     except RecursionError:

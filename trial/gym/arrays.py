@@ -68,7 +68,7 @@ class ArrayLayout:
         raise NotImplementedError
 
     def put_batch(self, batch: Any, row: int, part: Any, count: int) -> None:
-        """Set `count` values of a batch, from `row` on, to those of the batch `part`."""
+        """Copy the `count` values of the batch `part` into a batch, from `row` on."""
         for at, value in enumerate(self.rows(part, count)):
             self.put(batch, row + at, value)
 

@@ -115,7 +115,7 @@ class GymClient:
             except ConnectionClosed as error:
                 self._end(_reason(error))
             except BaseException:
-                self._end("a request was interrupted")  # its answer would be taken for that of the next request
+                self._end("a request was interrupted")  # the next request would get its answer
                 raise
             raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 

@@ -1,4 +1,4 @@
-"""The forms of answers: those of Gymie 0.5.4, those of its documentation, Gymnasium's, and raw arrays. Pure.
+"""The forms of answers: as Gymie 0.5.4 sends them, as its documentation has them, Gymnasium's, and arrays. Pure.
 
 | form | chosen by | `make` | `step` | an error |
 |---|---|---|---|---|
@@ -7,8 +7,8 @@
 | gymnasium | `/gym?form=gymnasium` | `{"instance_id"}` | five values | the same |
 | arrays | subprotocol `hippodrome.gym.1` | an object with the spaces | five values, or arrays | the same |
 
-Gymie's client cannot read an error: it takes every message for a result. So an error closes the connection of such a
-client. All other clients keep their connection.
+Gymie's client cannot read an error: it takes every message for a result. So in its form an error closes the
+connection. All other clients keep their connection.
 """
 
 from __future__ import annotations

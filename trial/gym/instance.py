@@ -216,7 +216,7 @@ def make(
     *,
     recorder: ConnectionRecorder | None = None,
 ) -> Instance:
-    """Make an environment, or with `num_envs` a vector of so many. `recorder` records them all. Raises GymError."""
+    """Make an environment, or a vector if `num_envs` is not 0. `recorder` records each environment. Raises GymError."""
     own = overrides.replaced("get_env")
     get_env = overrides.get_env if own is None else own
 

@@ -120,7 +120,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     connection has ended: then the environment is closed, and a new RemoteEnv makes a new one.
     """
 
-    # `gymnasium.make` reads the modes of the class, so it has those of most environments. An instance has its own.
+    # `gymnasium.make` reads the modes of the class: the usual ones. An instance has those of its environment.
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"]}  # noqa: RUF012
 
     def __init__(
@@ -227,7 +227,7 @@ class RemoteVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in each environment, or in those of `options["reset_mask"]`, as `SyncVectorEnv` does."""
+        """Begin an episode in each environment, or as `options["reset_mask"]` selects (see `SyncVectorEnv`)."""
         seeds = [None if one is None else int(one) for one in seed] if isinstance(seed, list | tuple) else seed
         return self._remote.reset(seeds if seeds is None or isinstance(seeds, list) else int(seeds), options)
 

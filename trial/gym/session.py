@@ -226,7 +226,7 @@ class GymSession:
         return values.to_text(columns)
 
     def reset(self, instance_id: str, seed: Any = None, options: Any = None) -> str:
-        """Begin an episode. Answer with its first observation; if `form.five`, with that and its info."""
+        """Begin an episode. Answer with its first observation; if `form.five`, with the observation and its info."""
         held = self._find(instance_id)
         _check(
             _is_seed(seed) or (isinstance(seed, list) and held.instance.num_envs > 0 and all(map(_is_seed, seed))),
@@ -244,11 +244,11 @@ class GymSession:
         return values.to_text(True)
 
     def observation_space(self, instance_id: str) -> str:
-        """Answer with the description of the observation space; of a vector, that of all its environments together."""
+        """Answer with the description of the observation space; for a vector, of the space of all its environments."""
         return values.to_text(spaces.describe(self._find(instance_id).instance.env.observation_space))
 
     def action_space(self, instance_id: str) -> str:
-        """Answer with the description of the action space; of a vector, that of all its environments together."""
+        """Answer with the description of the action space; for a vector, of the space of all its environments."""
         return values.to_text(spaces.describe(self._find(instance_id).instance.env.action_space))
 
     def action_sample(self, instance_id: str) -> str:

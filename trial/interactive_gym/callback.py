@@ -66,7 +66,7 @@ class MultiCallback(GameCallback):
     """Calls several callbacks in turn; `callbacks` are their classes.
 
     Each method returns a map of the values that the callbacks return, by the names of their classes (`Score`, `Score 2`
-    …), without None. If a callback raises, the others are called all the same. Then the first exception is raised.
+    …), without None. If a callback raises, the others are still called. Then the first exception is raised.
     """
 
     def __init__(self, callbacks: Iterable[type[GameCallback]], **_options: Any) -> None:
@@ -79,7 +79,7 @@ class MultiCallback(GameCallback):
         for name, each in zip(_names(self.callbacks), self.callbacks, strict=True):
             try:
                 value = getattr(each, event)(remote_game)
-            except Exception as error:  # noqa: BLE001 - the others are called all the same
+            except Exception as error:  # noqa: BLE001 - the others are still called
                 raised.append(error)
             else:
                 if value is not None:

@@ -28,7 +28,7 @@ def load_onnx_policy_fn(onnx_model_path: str) -> str:
 
 
 def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
-    """Run the model, and return its outputs. Inputs that `input_dict` lacks, such as recurrent states, get zeros."""
+    """Run the model, and return its outputs. Inputs that `input_dict` lacks, such as recurrent states, are zeros."""
     session = ORT_SESSIONS[model_path]
     feeds = {
         each.name: input_dict[each.name] if each.name in input_dict else _zeros(each) for each in session.get_inputs()

@@ -190,7 +190,7 @@ class ListeningAgent(ExperimentAgent):
     def _tell(self, session: Any, *events: str) -> None:
         """Call these methods of the callback, and record what each returns.
 
-        If methods raise, the others are called all the same. Then the first exception is raised.
+        If a method raises, the others are still called. Then the first exception is raised.
         """
         game, raised = self._game, []
         game.record = session.record
@@ -199,7 +199,7 @@ class ListeningAgent(ExperimentAgent):
             if callable(method):
                 try:
                     value = method(game)
-                except Exception as error:  # noqa: BLE001 - the callback's other methods are called all the same
+                except Exception as error:  # noqa: BLE001 - the callback's other methods are still called
                     raised.append(error)
                 else:
                     if value is not None:
@@ -224,7 +224,7 @@ def agent_class(config: RemoteConfig) -> type:
 def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]) -> type:
     """Make a class for agent.py that plays this player by the experiment's functions.
 
-    `locate` returns the path of a policy's file, if its name is that of a file; else it returns the name.
+    `locate` gets the value in `policy_mapping`. If this names a file, it returns the file's path, else the value.
     """
 
     class Policy:

@@ -37,7 +37,7 @@ LARGEST_REPLY = 8 * 2**20
 REQUESTS_A_SECOND = 500
 """The most requests of all programs together that are passed on in a second. The others wait: the game comes first."""
 _LARGEST_ANSWER = 8 * LARGEST_REPLY  # bytes of a message: JSON takes several for each byte of an observation
-_AHEAD_SECONDS = 0.02  # a request may be passed on so much sooner than an even rate would allow
+_AHEAD_SECONDS = 0.02  # a request may be passed on this much sooner than an even rate allows
 _START_SECONDS = 60.0
 _CLOSE_SECONDS = 2.0
 _SEND_SECONDS = 30.0  # the time in which a program must read an answer

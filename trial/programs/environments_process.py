@@ -19,7 +19,7 @@ from trial.gym.processes import serve_from
 from trial.programs.environments import LARGEST_REPLY, LARGEST_REQUEST, MAX_PROGRAMS
 
 LIMITS = Limits(
-    connections=2 * MAX_PROGRAMS,  # one that is closing may still be counted here
+    connections=2 * MAX_PROGRAMS,  # a connection that is closing may still be counted here
     workers=MAX_PROGRAMS,
     environments=16,
     seconds=30.0,
