@@ -106,8 +106,7 @@ def verify(
     for report in reports:
         folder = data / project_id / "users" / report.user_id
         membership = document(folder / "session.json")
-        session_id = membership.get("session") and str(membership["session"])
-        session = data / project_id / "sessions" / session_id if session_id else None
+        session = data / project_id / "sessions" / str(membership["session"]) if membership.get("session") else None
         if session is not None:
             found.sessions[session.name] = found.sessions.get(session.name, 0) + 1
         _look_at_answers(found, report, folder)

@@ -47,9 +47,10 @@ def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Ite
             dtype, shape = _observed(rows, "")
             yield Spec(step, actions, dtype, shape, players, human), _highest(file, "action")
             return
-        known = [human for human in humans if people.get(human)] or humans
-        for human in known if any(people.values()) or not people else ():
-            own = (header["players"][human] or {}).get("actionSpace")
+        if people and not any(people.values()):
+            return  # all participants were erased
+        for human in [human for human in humans if people.get(human)] or humans:
+            own = header["players"][human].get("actionSpace")
             own_actions = tuple(map(str, own)) if isinstance(own, list) else actions
             dtype, shape = _observed(rows, "" if human == humans[0] else human)
             highest = _highest(file, f"action.{human}")

@@ -176,10 +176,11 @@ class Fetcher:
                     self._document(item, owner, file)
             except FileGone:
                 continue  # the next run lists its new version, if there is one
-            if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.PARTICIPANT:
-                owner = owner._replace(document=file.document or {})
-            if isinstance(owner, ExportedParticipant) and item.kind is KeyKind.MEMBERSHIP:
-                owner = owner._replace(membership=file.document or {})
+            if isinstance(owner, ExportedParticipant):  # the files after these are read with their content
+                if item.kind is KeyKind.PARTICIPANT:
+                    owner = owner._replace(document=file.document or {})
+                elif item.kind is KeyKind.MEMBERSHIP:
+                    owner = owner._replace(membership=file.document or {})
             made.append(file)
         return made
 

@@ -156,5 +156,5 @@ def _of(part: int, whole: int) -> str:
 def _spread(values: Sequence[float]) -> str:
     """The median, the 95th percentile and the maximum of seconds."""
     ordered = sorted(values)
-    p95 = ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1) + 0.49))]
+    p95 = ordered[round(0.95 * (len(ordered) - 1) + 0.49)]
     return f"p50 {median(ordered):.1f} s, p95 {p95:.1f} s, max {ordered[-1]:.1f} s"
