@@ -10,7 +10,6 @@ Each server has a thread that follows it. If this machine refuses something, the
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import threading
 import time
@@ -28,12 +27,11 @@ from local.backend.health import is_healthy, port_in
 from local.backend.processes import child_of, kill_group, mark_of, process_of, spawn
 from local.backend.retry import Retry, start_thread
 from local.backend.task_record import HOST, KILLED, TaskFolder, TaskRecord, event, folder_of, now
+from local.inherited import inherited_environment
 from protocol import disk, environment, handover
 
 START_TIMEOUT = 120.0  # seconds in which a server must listen
 RESCUE_TIMEOUT = 10.0  # seconds for which the event of a server's end waits for its recordings to be moved
-
-_AWS = ("AWS_", "ECS_")  # variables that a server must not inherit: it needs no credentials
 
 T = TypeVar("T")
 Emit = Callable[[Mapping[str, Any]], None]
@@ -69,12 +67,8 @@ class Shared:
 
     def environment(self, request: TaskRequest) -> dict[str, str]:
         """Return the environment variables of a server's process."""
-        # SESSION is a common name: a desktop may have set it for its own purposes.
-        inherited = {k: v for k, v in os.environ.items() if not k.startswith(_AWS) and k != environment.SESSION}
-        ours = str(Path(__file__).resolve().parents[2])
-        paths = [ours, *filter(None, [inherited.get("PYTHONPATH")])]
         return {
-            **inherited,
+            **inherited_environment(),
             **request.environment,
             environment.STORE: str(self.data),
             environment.SPOOL: str(self.spool),
@@ -82,7 +76,6 @@ class Shared:
             environment.PORT: "0",
             environment.TLS: "off",
             environment.AGENT_DIR: str(self.agent_folder),
-            "PYTHONPATH": os.pathsep.join(paths),
             "PYTHONUNBUFFERED": "1",
         }
 

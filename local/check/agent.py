@@ -8,7 +8,6 @@ participant becomes known only before the first `reset`, and code that reads the
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.model.matching import MATCH
 from local.check.agent_report import AgentReport
 from local.check.earlier_answers import EarlierAnswers
+from local.inherited import inherited_environment
 from protocol import environment as variables
 from protocol.handover import Handover
 from trial.server import process_group
@@ -29,9 +29,6 @@ SECONDS = 120.0  # seconds in which all calls of the agent must return, in each 
 PLAY_SECONDS = 20.0  # seconds of playing, in all groups together; the start is not counted
 
 _STACK_SECONDS = 10.0  # seconds more, in which the agent's process must have written down where it hangs
-_ROOT = Path(__file__).resolve().parents[2]
-_AWS = ("AWS_", "ECS_")  # beginnings of variables that a server does not have
-_OWNERS = (*variables.PARTICIPANT, variables.SESSION)
 _SESSION = f"s.{'0' * 20}"
 
 
@@ -61,7 +58,6 @@ def try_agent(
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
     """Environment variables as a trial server has them (`local/backend/task_process.py`, `trial/settings.py`)."""
-    inherited = {key: value for key, value in os.environ.items() if not key.startswith(_AWS) and key not in _OWNERS}
     several = config.project.has_sessions
     if config.project.warm_servers or several:  # a session's members are not known when its server starts
         owner = {
@@ -72,7 +68,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         owner = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
     question = {"MATCH": json.dumps(_question(folder, config))} if config.project.matching == MATCH and several else {}
     return {
-        **inherited,
+        **inherited_environment(),
         **owner,
         **question,
         variables.PROJECT_ID: config.project.id,
@@ -82,7 +78,6 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
         "SECONDS": str(seconds),
-        "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, [inherited.get("PYTHONPATH")])]),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
 

@@ -377,6 +377,13 @@ def test_the_desktops_variable_SESSION_makes_no_session(here: Here, monkeypatch:
     assert tasks._shared.environment(request(SESSION=SESSION))["SESSION"] == SESSION
 
 
+def test_a_shells_variable_GROUP_is_no_participants_group(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GROUP", "users")
+    tasks = here.tasks()
+    assert "GROUP" not in tasks._shared.environment(request(WARM_SERVER="on"))
+    assert tasks._shared.environment(request(GROUP="1"))["GROUP"] == "1"
+
+
 def test_a_recording_is_not_kept_if_the_study_keeps_none(here: Here) -> None:
     folder = f"study/users/P1/trials/{NAME}"
     tasks = here.tasks(stop_timeout=0.2)
