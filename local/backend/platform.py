@@ -34,7 +34,7 @@ from local.publish import NotPublished, publish
 from protocol import disk
 
 DOMAIN = "localhost"
-_OURS = ("queue", "tasks", "timers")  # folders in which only this process writes
+_OURS = ("queue", "tasks", "timers")  # folders in which no other process has unfinished files
 _KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 LOOK = 0.5  # seconds between looks whether the data still exist

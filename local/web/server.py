@@ -20,7 +20,7 @@ HOST = "127.0.0.1"
 PORTS_TRIED = 20
 _NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # errors of accept(2) that pass
 
-Refused = Callable[[BaseException], None]
+Report = Callable[[BaseException], None]
 HIGHEST_PORT = 65535
 
 
@@ -60,11 +60,11 @@ def _answers(port: int) -> bool:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server. `refused` gets the error if this machine refuses a connection; asyncio accepts it later."""
+    """uvicorn's server. `report` gets the error if this machine refuses a connection; asyncio accepts it later."""
 
-    def __init__(self, config: uvicorn.Config, refused: Refused | None) -> None:
+    def __init__(self, config: uvicorn.Config, report: Report | None) -> None:
         super().__init__(config)
-        self._refused = refused
+        self._report = report
 
     async def serve(self, sockets: list[socket.socket] | None = None) -> None:
         asyncio.get_running_loop().set_exception_handler(self._tell)
@@ -72,8 +72,8 @@ class _Server(uvicorn.Server):
 
     def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        if self._refused is not None and isinstance(error, OSError) and error.errno in _NO_ROOM:
-            self._refused(error)
+        if self._report is not None and isinstance(error, OSError) and error.errno in _NO_ROOM:
+            self._report(error)
         else:
             loop.default_exception_handler(context)
 
@@ -82,7 +82,7 @@ class WebServer:
     """uvicorn in a thread of its own, so that the main thread can wait for signals. `url` is its address."""
 
     def __init__(
-        self, app: App, listener: socket.socket, refused: Refused | None = None, tls: ssl.SSLContext | None = None
+        self, app: App, listener: socket.socket, report: Report | None = None, tls: ssl.SSLContext | None = None
     ) -> None:
         self._app = app
         self._listener = listener
@@ -100,7 +100,7 @@ class WebServer:
             timeout_keep_alive=5,
             ssl_context_factory=(lambda *_: tls) if tls else None,
         )
-        self._server = _Server(config, refused)
+        self._server = _Server(config, report)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
 
     @property
