@@ -201,7 +201,7 @@ class Callbacks:
     def take(self, recorded: int | None = None) -> list[bytes]:
         """Return the lines for the recording that were not returned before. For the event loop's thread.
 
-        With `recorded`, return only lines among the first `recorded` ones of the session.
+        With `recorded`, leave out each line after the first `recorded` lines. Lines that were returned before count.
         """
         return self._notes.take(recorded)
 
