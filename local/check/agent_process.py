@@ -1,6 +1,7 @@
 """`python -m local.check.agent_process REPORT`: lets the agent play, and writes to REPORT how far it got.
 
-Runs in a process of its own, since the agent may hang or end Python. `agent.py` starts it and reads the report.
+Runs in a process of its own, since the agent may hang or end Python. `local/check/agent.py` starts it, and
+`agent_report.py` reads the report.
 """
 
 from __future__ import annotations
@@ -165,7 +166,7 @@ def _reader(config: TrialSection, folder: Path, progress: AgentProgress) -> Pict
 
 
 def _handover() -> Handover | None:
-    """The handover of the server, which gets it before the first `reset`; None if the server is for one participant."""
+    """The handover that the agent gets before the first `reset`; None if its participant is known from the start."""
     document = os.environ.pop("GIVEN", "")
     return handover.parse(document.encode()) if document else None
 
@@ -202,7 +203,8 @@ def _note_idle(
 ) -> None:
     """Note whether the idle action, which is taken while no key is pressed, changes the picture.
 
-    It does nothing if config.yml names that action or all actions. Errors are ignored: the agent has played already.
+    It does nothing turn by turn, or if config.yml names that action or all actions. Errors are ignored: the agent has
+    played already.
     """
     human = next(one for one in players if one.human)
     if config.pace == "turns" or config.action_space or config.idle_action is not None:

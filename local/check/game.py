@@ -150,7 +150,7 @@ class CheckedGame:
         return len(self._acted) > 1 and all(len(together) == 1 for together in self._acted)
 
     def _press(self, allowed: Sequence[int]) -> int:
-        """A human's action: each once, in turn; then random ones."""
+        """A human's action: first each action once, in turn; then random actions. Only legal ones are taken."""
         self._pressed += 1
         return self._pressed - 1 if self._pressed - 1 in allowed else self._random.choice(allowed)
 
