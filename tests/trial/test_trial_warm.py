@@ -467,6 +467,6 @@ def test_the_watchdog_of_a_warm_server_counts_from_the_handover():
     assert dog.expires() == 1000
     assert dog.verdict(999) is None
     assert dog.verdict(1000) == "deadline"
-    dog.expected(500)
+    dog.wait(500)
     assert dog.expires() == 510
     assert dog.verdict(510) == "idle"

@@ -8,7 +8,7 @@ from typing import Any
 
 from protocol.trial import TrialSection
 from trial.core import messages
-from trial.core.effects import Close, Effect, Pictures, SendDone, SendMessage, SendPicture, SendState
+from trial.core.effects import Close, Effect, Pictures, SendMessage, SendPicture, SendState
 from trial.core.flow_control import Window
 from trial.core.participants import Participants
 from trial.core.progress import TrialProgress
@@ -139,10 +139,6 @@ class Clients:
         picture = self.pictures.get(client.player) if isinstance(self.pictures, dict) else self.pictures
         if picture is not None:
             self._emit(SendPicture(client.connection, picture, self.frame_id))
-
-    def send_done(self, client: Client, episodes: int, score: float, outcome: str | None = None) -> None:
-        """Tell a client that the trial is over and stored. `outcome`: in a session, how it has ended for the member."""
-        self._emit(SendDone(client.connection, episodes, score, outcome))
 
 
 def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) -> dict[str, Any]:

@@ -56,6 +56,7 @@ from trial.core.effects import (
     FeedbackCall,
     ReplayCall,
     Replayed,
+    SendDone,
     StepCall,
     TellMoved,
     WriteLog,
@@ -523,7 +524,7 @@ class Trial:
         elif self.settings.session:
             answers = answers.get(human)
         result = records.result(self.progress, client.player, answers, in_session=bool(self.settings.session))
-        self._clients.send_done(client, *result)
+        self._emit(SendDone(client.connection, *result))
 
     def _take_effects(self) -> list[Effect]:
         effects = self._effects.copy()

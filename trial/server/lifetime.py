@@ -49,19 +49,14 @@ class Lifetime:
             self._timer.cancel()
         return reason
 
-    def expect_participant(self) -> None:
-        """Begin to wait for a participant."""
-        self._watchdog.expected(self._loop.time())
+    def wait_for_participant(self) -> None:
+        """Begin to wait for a participant, who has not come yet or has left."""
+        self._watchdog.wait(self._loop.time())
         self.watch()
 
     def connected(self) -> None:
         """Note that a participant is connected."""
         self._watchdog.came()
-        self.watch()
-
-    def disconnected(self) -> None:
-        """Note that no participant is connected any more."""
-        self._watchdog.left(self._loop.time())
         self.watch()
 
     def watch(self) -> None:

@@ -191,7 +191,7 @@ class TrialServer:
         if settings.session and settings.assigned:
             log.info("the members of the session are known now: %d of %d", len(settings.seats), settings.players)
         if settings.assigned:
-            self._lifetime.expect_participant()
+            self._lifetime.wait_for_participant()
 
     async def _leftovers(self, settings: TrialSettings) -> list[tuple[str, Path]]:
         """Return the recordings, with their keys, that an earlier process of this server has not stored.
@@ -261,7 +261,7 @@ class TrialServer:
             sender.cancel()
             del self._connections[connection]
             if not self._connections:
-                self._lifetime.disconnected()
+                self._lifetime.wait_for_participant()
 
     async def _serve_watching(self, websocket: ServerConnection) -> None:
         """Serve a program that watches, if its address has the token. Raises CloseConnection and ConnectionClosed."""

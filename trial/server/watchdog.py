@@ -10,7 +10,7 @@ class Watchdog:
 
     `idle` is how long the server waits for a participant; `grace` is the least time for which it waits for one who was
     connected before; `deadline` is the time at which it ends in any case. The wait begins at `now`; if that is None, at
-    the call of `expected`.
+    the call of `wait`.
     """
 
     def __init__(self, *, now: float | None, idle: float, grace: float, deadline: float | None) -> None:
@@ -20,18 +20,14 @@ class Watchdog:
         self._alone_since = now
         self._visited = False
 
-    def expected(self, now: float) -> None:
-        """Begin to wait for a participant."""
+    def wait(self, now: float) -> None:
+        """Begin to wait for a participant, who has not come yet or has left."""
         self._alone_since = now
 
     def came(self) -> None:
         """Note that a participant is connected."""
         self._alone_since = None
         self._visited = True
-
-    def left(self, now: float) -> None:
-        """Note that no participant is connected any more."""
-        self._alone_since = now
 
     def expires(self) -> float:
         """Return the time at which the server must end if nothing else happens; infinity if there is none."""

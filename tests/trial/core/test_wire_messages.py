@@ -321,7 +321,7 @@ def test_the_watchdog_of_a_server_without_a_participant_waits_up_to_the_deadline
     dog = Watchdog(now=None, idle=10, grace=0, deadline=1000)
     assert dog.expires() == 1000
     assert dog.verdict(999) is None
-    dog.expected(50)
+    dog.wait(50)
     assert (dog.expires(), dog.verdict(59), dog.verdict(60)) == (60, None, "idle")
 
 
@@ -329,7 +329,7 @@ def test_the_watchdog_waits_for_a_participant_who_left_for_the_longer_of_idle_an
     for idle, grace, until in ((10, 60, 160), (60, 10, 160), (0, 0, 100)):
         dog = Watchdog(now=0, idle=idle, grace=grace, deadline=None)
         dog.came()
-        dog.left(100)
+        dog.wait(100)
         assert dog.expires() == until
     dog = Watchdog(now=5, idle=0, grace=60, deadline=None)
     assert dog.verdict(5) == "idle", "nobody was here"

@@ -10,7 +10,7 @@ def test_the_watchdog_ends_a_server_by_idle_time_grace_or_deadline():
     dog.came()
     assert dog.verdict(999) is None
     assert dog.verdict(1000) == "deadline"
-    dog.left(500)
+    dog.wait(500)
     assert dog.verdict(559) is None
     assert dog.verdict(560) == "idle"
     assert Watchdog(now=0, idle=10, grace=0, deadline=None).expires() == 10
