@@ -77,8 +77,7 @@ class TrialServer:
         )
         self._agent_ready: asyncio.Task[StartedAgent | None]
         self._failure = 1  # the exit status if an error ends the server
-        self._trial: TrialLoop | None = None  # the last trial that has begun
-        self._trials: list[TrialLoop] = []  # all; after the end of a trial, its policies or callbacks may still run
+        self._trials: list[TrialLoop] = []  # in their order; policies or callbacks may still run after a trial's end
         self._finished_steps: set[str] = set()
         self._search: Search
         self._admission: Admission
@@ -298,9 +297,9 @@ class TrialServer:
         self._current().advise(action, player)
 
     def _current(self) -> TrialLoop:
-        if self._trial is None:
+        if not self._trials:
             raise CommandRefused("no game is going on")
-        return self._trial
+        return self._trials[-1]
 
     async def _connect(self, trial: TrialLoop, human: str, connection: Connection) -> None:
         """Connect a client to the trial once that is ready. Raises CloseConnection if the game cannot begin."""
@@ -351,7 +350,7 @@ class TrialServer:
         In a session, a member whose answer of an earlier step is not stored waits there, while the others play the next
         step: so there may be several trials that are not done.
         """
-        trial = self._trial
+        trial = self._trials[-1] if self._trials else None
         if trial is not None and trial.core.broken:
             return trial
         if step is None:
@@ -363,7 +362,7 @@ class TrialServer:
             return unstored
         if trial is not None and not trial.core.played:
             raise CloseConnection(4404, "another step's game is still going on")
-        trial = self._trial = TrialLoop(
+        trial = TrialLoop(
             self.settings,
             step,
             worker=self._worker,
