@@ -35,19 +35,19 @@ def shown() -> dict[str, tuple[str, ...]]:
 
 
 def inline() -> set[str]:
-    """The commands that stand in sentences."""
+    """Return the commands that stand in sentences."""
     sentences = re.sub(r"```.*?```", "", text(), flags=re.DOTALL)
     return set(re.findall(r"`((?:make|python) [^`]+)`", sentences))
 
 
 def failures() -> list[str]:
-    """The first column of the table of failures: what the program says."""
+    """Return the first column of the table of failures: what the program says."""
     table = text().partition("| it says |")[2].partition("\n\n")[0]
     return re.findall(r"(?m)^\| (.+?) \|", table.partition("\n|---")[2])
 
 
 def masked(line: str) -> str:
-    """The line without what differs from account to account."""
+    """Return the line without what differs from account to account."""
     line = re.sub(r"\b[a-z]{2}-[a-z]+-\d\b", "REGION", line)
     line = re.sub(r"\b(?=[A-Za-z]*\d)[0-9A-Za-z]{8,}\b", "#", line)
     line = re.sub(r"(?<![\w.])-?\d[\d.,]*\b", "#", line)
@@ -56,7 +56,7 @@ def masked(line: str) -> str:
 
 
 def differs(expected: Sequence[str], printed: str, domain: str = DOMAIN) -> str:
-    """The first line of the page that was not printed there; "" if the output is as shown."""
+    """Return the first line of the page that was not printed there; "" if the output is as shown."""
     lines = [masked(line.replace(domain, DOMAIN)) for line in printed.splitlines() if line.strip()]
     anywhere, at = False, 0
     for line in expected:

@@ -62,7 +62,7 @@ ROOMS = {
 
 
 def packages(package: str) -> dict[str, str]:
-    """The packages of ours that this one imports, each with a file that does."""
+    """Return the packages of ours that this one imports, each with a file that does."""
     files = (ROOT / package).rglob("*.py")
     found = {name.partition(".")[0]: path.name for path in files for name in imported(path)}
     return {name: file for name, file in found.items() if name in {*MAY, "tests"} - {package}}
@@ -121,7 +121,7 @@ def test_no_files_import_each_other_in_a_circle(package: str) -> None:
 
 
 def loaded(module: str) -> dict[str, str]:
-    """Every module that is loaded with one of ours, each with the one of ours that imports it."""
+    """Return every module that is loaded with one of ours, each with the one of ours that imports it."""
     found, todo = {module: ""}, [module]
     while todo:
         path = ROOT / todo[-1].replace(".", "/")

@@ -31,7 +31,7 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 def headings(page: Path) -> list[str]:
-    """What links to a page's headings say, as GitHub makes them."""
+    """Return what links to a page's headings say, as GitHub makes them."""
     titles = re.findall(r"^#+ (.*)", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), re.MULTILINE)
     return [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
 
@@ -54,7 +54,7 @@ OF_A_STUDY = re.compile(r"steps/|(forget|protocol)\.py|App/|src/hippogym|updateP
 
 
 def files_named(text: str) -> set[str]:
-    """What is in backticks and looks like a file or folder of this repository."""
+    """Return what is in backticks and looks like a file or folder of this repository."""
     sentences = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     named = {name.partition("::")[0] for name in re.findall(r"`([\w./-]+(?:::\w+)?)`", sentences)}
     folders = {path.partition("/")[0] for path in SOURCES if "/" in path}

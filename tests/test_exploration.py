@@ -14,7 +14,7 @@ from testing import exploration
 
 
 def played() -> list[str]:
-    """The examples of one property."""
+    """Return the examples of one property."""
     found: list[str] = []
 
     @given(st.lists(st.text()))

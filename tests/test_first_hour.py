@@ -112,7 +112,10 @@ def sentences() -> list[str]:
 
 
 def says(message: str) -> bool:
-    """Whether the program can say these words: they stand in one of its texts, in order, or are put together from several."""
+    """Return whether the program can say these words.
+
+    They stand in one of its texts, in order, or are put together from several.
+    """
     parts = [part.strip() for part in message.split(first_hour.GAP)]
     in_order = re.compile(".*".join(map(re.escape, parts)), re.DOTALL)
     return any(in_order.search(text) for text in sentences()) or all(map(_put_together, parts))

@@ -44,7 +44,7 @@ def environment() -> dict[str, str]:
 
 
 def run(folder: Path, workers: int = 2) -> tuple[int, str]:
-    """The exit code, and what is printed."""
+    """Return the exit code, and what is printed."""
     ran = subprocess.run(
         command(folder, workers),
         check=False,

@@ -38,7 +38,10 @@ class SharedBrowser:
         self._path = ""
 
     def browser(self, path: str | None = None) -> Any:
-        """The browser in this file, or the one that runs, or else `headless_path`. Started if it does not run. Raises NoChromium."""
+        """Return the browser in this file, or the one that runs, or else `headless_path`.
+
+        Started if it does not run. Raises NoChromium.
+        """
         path = path or self._path or headless_path()
         if self._browser is None or not self._browser.is_connected() or path != self._path:
             from playwright.sync_api import sync_playwright
@@ -329,7 +332,7 @@ class Visitor:
         return answers
 
     def steps_played(self) -> list[dict[str, Any]]:
-        """The steps in all recordings, in the order of their files."""
+        """Return the steps in all recordings, in the order of their files."""
         folder = self.study.data / "ms-pacman" / "users" / self.name / "trials"
         lines = [line for path in sorted(folder.glob("*/*.gz")) for line in read(path.read_bytes())]
         return [line for line in lines if line["kind"] == "step"]

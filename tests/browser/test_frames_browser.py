@@ -63,7 +63,7 @@ def pixels(tab: Any, width: int, height: int) -> Frame:
 
 
 def step_of(picture: Frame) -> int:
-    """The number of the step that the agent has written into the picture."""
+    """Return the number of the step that the agent has written into the picture."""
     return 256 * int(picture[0, 0, 0]) + int(picture[1, 0, 0])
 
 
@@ -238,7 +238,7 @@ def test_a_small_message_cannot_fill_the_memory(newer_world: World, tab: Any) ->
 
 
 def peak_memory(tab: Any) -> float:
-    """The most memory that a page of the browser has ever had, in megabytes."""
+    """Return the most memory that a page of the browser has ever had, in megabytes."""
     asked = tab.context.browser.new_browser_cdp_session()
     processes = asked.send("SystemInfo.getProcessInfo")["processInfo"]
     asked.detach()

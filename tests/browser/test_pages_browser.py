@@ -42,7 +42,7 @@ LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as web/game/o
 
 
 def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:
-    """A frame of 2 by 2 pixels."""
+    """Return a frame of 2 by 2 pixels."""
     body = pixels if last is None else bytes(a ^ b for a, b in zip(pixels, last, strict=True))
     deflate = zlib.compressobj(6, zlib.DEFLATED, -15)
     return struct.pack("!BIHHB", last is not None, frame_id, 2, 2, 3) + deflate.compress(body) + deflate.flush()
@@ -106,7 +106,7 @@ class World:
         return [each[name] for each in list(self.received) if name in each]
 
     def player_commands(self) -> list[str]:
-        """The participant's commands, without `requestUI`: a page sends that by itself when it receives nothing for some time."""
+        """Return the participant's commands, without `requestUI`, which a page sends by itself when it receives nothing."""
         return [command for command in self.commands("command") if command != "requestUI"]
 
     def wait_for(self, message: dict[str, Any]) -> None:

@@ -206,7 +206,7 @@ def test_images_are_not_loaded_again_when_the_connection_comes_back(game: Any, w
 
 
 def png_of_size(number: int) -> bytes:
-    """A PNG of a few bytes that says it has so many pixels on each side."""
+    """Return a PNG of a few bytes that says it has so many pixels on each side."""
     head = b"IHDR" + struct.pack("!IIBBBBB", number, number, 1, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + struct.pack("!I", 13) + head + struct.pack("!I", zlib.crc32(head))
 

@@ -48,7 +48,7 @@ def come_to_the_game(page: Any, link: str) -> None:
 
 
 def words(step: dict[str, Any]) -> list[str]:
-    """The words that the car received before this step."""
+    """Return the words that the car received before this step."""
     return [said["command"] for said in step.get("messages", ()) if said.get("command") in WORDS]
 
 

@@ -33,7 +33,7 @@ WORDS = st.lists(
 
 
 def with_place_names(texts: Texts, name: str) -> str:
-    """The text with each placeholder replaced by its name."""
+    """Return the text with each placeholder replaced by its name."""
     known = places(ENGLISH[name])
     return PLACE.sub(lambda place: place[1] if place[1] in known else place[0], texts[name])
 

@@ -41,7 +41,7 @@ def group(world: World) -> World:
 
 
 def presence(**others: str) -> dict[str, Any]:
-    """The fields `you` and `people` of a message to the blue player."""
+    """Return the fields `you` and `people` of a message to the blue player."""
     return {"you": "blue", "people": {"blue": "here", **others}}
 
 

@@ -46,7 +46,7 @@ class Pebble:
     log: Path
 
     def root(self) -> str:
-        """The root of the certificates that it issues."""
+        """Return the root of the certificates that it issues."""
         return self.ask(f"{self.management}/roots/0").decode()
 
     def ask(self, url: str) -> bytes:
@@ -59,11 +59,11 @@ class Pebble:
             return answer.read()
 
     def orders(self) -> int:
-        """The number of orders that it has accepted."""
+        """Return the number of orders that it has accepted."""
         return self.log.read_text().count(" Added order ")
 
     def accounts(self) -> int:
-        """The number of accounts that were made."""
+        """Return the number of accounts that were made."""
         return self.log.read_text().count("accounts in memory")
 
 

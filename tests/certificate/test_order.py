@@ -55,7 +55,7 @@ def handshake(server: ssl.SSLContext, root: str, host: str) -> x509.Certificate:
 
 
 def served(place: Place) -> Certificate:
-    """The TLS context that a trial server makes of the bucket."""
+    """Return the TLS context that a trial server makes of the bucket."""
     env = {
         "PROJECT_ID": "a",
         "USER_ID": "b",

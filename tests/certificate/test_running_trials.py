@@ -71,7 +71,7 @@ def trial(place, tmp_path):
 
 
 def shown(port, root):
-    """The serial number of the certificate that the server shows to a client that checks it."""
+    """Return the serial number of the certificate that the server shows to a client that checks it."""
     context = ssl.create_default_context(cadata=root)
     with (
         socket.create_connection(("127.0.0.1", port), 10) as plain,

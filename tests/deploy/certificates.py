@@ -11,9 +11,9 @@ from cryptography.x509.oid import NameOID
 
 
 def chain(*names: str, days: float = 60, issuer: str = "R12", lifetime: float = 90) -> bytes:
-    """A certificate (PEM) for these names that is valid for `days` days from now; a negative number makes an expired one.
+    """Return a certificate (PEM) for these names that is valid for `days` days from now.
 
-    `lifetime` is how many days it was valid for when it was made.
+    A negative number makes an expired one. `lifetime` is how many days it was valid for when it was made.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     end = datetime.now(UTC) + timedelta(days=days, hours=1)

@@ -265,7 +265,7 @@ class FakeCloudFormation:
             self._event(logical, kind, state, reason)
 
     def _making(self) -> Step:
-        """The steps of a creation: everything is made or, once something is refused, rolled back."""
+        """Return the steps of a creation: everything is made or, once something is refused, rolled back."""
         assert self.making
         events: list[Event] = []
         for one in self.resources:
@@ -278,7 +278,7 @@ class FakeCloudFormation:
         return "CREATE_COMPLETE", events
 
     def _deleting(self) -> Step:
-        """The steps of a deletion: everything that can be deleted is deleted, in the reverse order of its creation."""
+        """Return the steps of a deletion: what can be deleted is deleted, in the reverse order of its creation."""
         assert self.deleting
         events: list[Event] = []
         for one in reversed(self.resources):
@@ -321,7 +321,7 @@ def happy(kind: str) -> list[Step]:
 
 
 def invalid(name: str, reason: str, mode: str = "FAIL", status: str = "FAILED") -> dict[str, str]:
-    """A finding of validation before deployment on a resource (API Reference, OperationEvent)."""
+    """Return a finding of validation before deployment on a resource (API Reference, OperationEvent)."""
     return {
         "EventType": "VALIDATION_ERROR",
         "LogicalResourceId": name,

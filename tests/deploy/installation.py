@@ -138,7 +138,7 @@ class Installed(MotoWorld):
         }
 
     def template(self) -> dict[str, Any]:
-        """The tiny template: outputs, and a queue with its dead letters."""
+        """Return the tiny template: outputs, and a queue with its dead letters."""
         queue = {"maxReceiveCount": 5, "deadLetterTargetArn": {"Fn::GetAtt": ["StartServerDeadLetters", "Arn"]}}
         return {
             "AWSTemplateFormatVersion": "2010-09-09",
@@ -273,7 +273,7 @@ class Installed(MotoWorld):
 
 
 def environment(endpoint: str = "") -> dict[str, str]:
-    """The environment of a command's process, without settings of the person who runs the tests."""
+    """Return the environment of a command's process, without settings of the person who runs the tests."""
     kept = {name: os.environ[name] for name in ("PATH", "LANG", "LC_ALL", "TMPDIR") if name in os.environ}
     more = {"AWS_ENDPOINT_URL": endpoint} if endpoint else {}
     quiet = {

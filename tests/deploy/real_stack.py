@@ -111,7 +111,7 @@ class RealStack:
         return ""
 
     def certificate_users(self) -> list[str]:
-        """The users of the certificate that ACM lists: moto's own list."""
+        """Return the users of the certificate that ACM lists: moto's own list."""
         return acm_backends[ACCOUNT][REGION]._certificates[self.certificate].in_use_by
 
     def _delete_SiteDomain(self) -> str:
@@ -204,7 +204,7 @@ POLICY = '{"Version":"2012-10-17","Statement":[{"Effect":"Allow","Action":"s3:Li
 
 
 def passed_on(sentence: str, service: str) -> str:
-    """The message of a service in the form in which CloudFormation passes it on."""
+    """Return the message of a service in the form in which CloudFormation passes it on."""
     return (
         f'Resource handler returned message: "{sentence} (Service: {service}, Status Code: 400, Request ID: 0a1b)" '
         "(RequestToken: 9fd5, HandlerErrorCode: GeneralServiceException)"
@@ -257,7 +257,7 @@ def same_record(world: World, arn: str, like: str, region: str) -> None:
 
 
 def zone_records(world: World) -> set[tuple[str, str]]:
-    """The zone's records without NS and SOA: names and types."""
+    """Return the zone's records without NS and SOA: names and types."""
     found = world.account.client("route53").list_resource_record_sets(HostedZoneId=world.zone)["ResourceRecordSets"]
     return {(one["Name"], one["Type"]) for one in found if one["Type"] not in {"NS", "SOA"}}
 

@@ -43,7 +43,7 @@ class Recipe:
 
 
 def stages() -> list[Recipe]:
-    """The stages of the Dockerfile, each from its FROM; lines before the first FROM belong to the first stage."""
+    """Return the stages of the Dockerfile, each from its FROM; what is before the first FROM belongs to the first."""
     first, *others = re.split(r"(?m)^(?=FROM )", (ROOT / "infra/Dockerfile").read_text())
     return [Recipe.of(first + others[0]), *map(Recipe.of, others[1:])]
 

@@ -101,7 +101,7 @@ class RegisterWorld(Installed):
     # -- looking ------------------------------------------------------------------------------------------------------
 
     def project(self, project_id: str = "maze") -> Project | None:
-        """The project as it is registered; None without a registration."""
+        """Return the project as it is registered; None without a registration."""
         if MASTER_LIST not in self.keys():
             return None
         return from_json(self.get(MASTER_LIST), MasterList).find(project_id)
@@ -221,7 +221,7 @@ def _stream(body: bytes) -> StreamingBody:
 def fake_docker(
     folder: Path, *, engine: bool = True, buildx: bool = True, build: int = 0, says: str = "#1 DONE"
 ) -> Path:
-    """A `docker` for PATH: it records its calls with the files of the context, and its pushes."""
+    """Return a `docker` for PATH: it records its calls with the files of the context, and its pushes."""
     folder.mkdir(parents=True, exist_ok=True)
     script = folder / "docker"
     script.write_text(
@@ -257,7 +257,7 @@ def docker_calls(folder: Path) -> list[dict[str, Any]]:
 
 
 def write_study(folder: Path, config: str = CONFIG, **files: str) -> Path:
-    """A small study for AWS. `files` are below the folder, `__` for a slash and `_DOT_` for a dot."""
+    """Write a small study for AWS. `files` are below the folder, `__` for a slash and `_DOT_` for a dot."""
     (folder / "steps").mkdir(parents=True, exist_ok=True)
     (folder / "config.yml").write_text(config)
     (folder / "steps/consent.html").write_text("<p>Do you agree?</p>")
@@ -319,5 +319,5 @@ def configure(folder: Path, *changes: tuple[str, str]) -> None:
 
 
 def bodies(register_world: RegisterWorld) -> dict[str, bytes]:
-    """The contents of the study `maze` in the bucket, by key."""
+    """Return the contents of the study `maze` in the bucket, by key."""
     return {key: register_world.get(key) for key in register_world.keys("maze/")}

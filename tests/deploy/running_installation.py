@@ -130,7 +130,7 @@ class RunningInstallation(Installed):
     # -- where bots go
 
     def where(self, project_id: str) -> OneSite:
-        """The installation's addresses, which lead to loopback, and whom to believe there."""
+        """Return the installation's addresses, which lead to loopback, and whom to believe there."""
 
         def connect(host: str, port: int) -> tuple[str, int]:
             if host == f"study.{self.root_domain}":
@@ -278,7 +278,7 @@ class RunningInstallation(Installed):
 
 
 def _signer(world: RunningInstallation) -> http.server.ThreadingHTTPServer:
-    """The site's `/sign`, as API Gateway hands it to `sign_requests`; without TLS, for servers alone."""
+    """Return the site's `/sign`, as API Gateway hands it to `sign_requests`; without TLS, for servers alone."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_POST(self) -> None:
@@ -304,7 +304,7 @@ def _signer(world: RunningInstallation) -> http.server.ThreadingHTTPServer:
 
 
 def _site(world: RunningInstallation, folder: Path, pem: bytes) -> http.server.ThreadingHTTPServer:
-    """The participants' site over TLS, as API Gateway hands it to `next_step`."""
+    """Return the participants' site over TLS, as API Gateway hands it to `next_step`."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         timeout = 60  # seconds; a client that stops in the midst of its handshake keeps nothing from ending

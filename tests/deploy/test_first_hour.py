@@ -48,7 +48,7 @@ def running() -> Iterator[RunningInstallation]:
 
 
 def arguments(command: str) -> list[str]:
-    """The arguments that make passes to `python -m deploy`."""
+    """Return the arguments that make passes to `python -m deploy`."""
     line = subprocess.run(
         ["make", "-n", *shlex.split(command)[1:]], cwd=ROOT, capture_output=True, text=True, check=True
     )

@@ -30,7 +30,7 @@ def run_make(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def make(*arguments: str) -> str:
-    """The last command that `make -n` would run."""
+    """Return the last command that `make -n` would run."""
     return run_make("-n", *arguments).stdout.splitlines()[-1]
 
 

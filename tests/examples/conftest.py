@@ -38,7 +38,7 @@ class Played:
     result: Mapping[str, Any]
 
     def steps(self) -> list[dict[str, Any]]:
-        """The steps of all episodes."""
+        """Return the steps of all episodes."""
         return [line for lines in self.recordings for line in lines if line["kind"] == "step"]
 
 

@@ -87,7 +87,7 @@ def play_episodes(agent: Any, garden: Any, seed: int, teacher: Teacher | None) -
 
 
 def last_three(load_module: Any, *, with_teacher: bool) -> tuple[float, float]:
-    """The mean score of the last three episodes of ten robots, and the share of these episodes in which a robot came home."""
+    """Return the mean score of ten robots' last three episodes, and the share of these in which a robot came home."""
     garden, module = load_module("coach", "garden"), load_module("coach", "agent")
     found = []
     for seed in range(1, 11):

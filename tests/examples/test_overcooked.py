@@ -121,7 +121,10 @@ def idle(*_: Any) -> int:
 
 
 def leaves_all_reachable(env: Any, seed: int, number: int) -> bool:
-    """Whether pot, plates and hatch stay reachable: each is reached from one place, and the chef begins on none of them."""
+    """Return whether pot, plates and hatch stay reachable.
+
+    Each is reached from one place, and the chef begins on none of them.
+    """
     env.reset(seed=seed)
     return env.kitchen().chefs[number].cell not in {(1, 2), (2, 1), (2, 3)}
 

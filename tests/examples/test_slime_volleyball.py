@@ -88,7 +88,7 @@ def test_both_see_the_game_from_their_own_side(volleyball: Any) -> None:
 
 
 def share_of_points(train: Any, file: str, opponent: Any) -> float:
-    """The share of all points that the policy on the right wins, in 200 games at once."""
+    """Return the share of all points that the policy on the right wins, in 200 games at once."""
     session = onnx_files.session(EXAMPLE / "policies" / file)
     games, won, lost = train.Games(200, np.random.default_rng(1)), 0, 0
     for _ in range(500):

@@ -27,7 +27,7 @@ PATIENCE = 150.0  # seconds within which both bots must finish the study
 
 
 def lines_of_readme(folder: Path) -> dict[str, Any]:
-    """The lines of config.yml that its README shows under "Two people"."""
+    """Return the lines of config.yml that its README shows under "Two people"."""
     section = (folder / "README.md").read_text(encoding="utf-8").partition("## Two people\n")[2].partition("\n## ")[0]
     (block,) = re.findall(r"(?:^ {4}.*\n)+", section, re.MULTILINE)
     found: dict[str, Any] = yaml.safe_load(textwrap.dedent(block))

@@ -32,7 +32,7 @@ def world() -> Iterator[MotoWorld]:
 
 
 def ask(body: dict[str, str] | None = None) -> dict[str, Any]:
-    """A request of HIPPO's front end."""
+    """Return the answer to a request of HIPPO's front end."""
     headers = {
         "accept": "application/json, text/plain, */*",
         "content-type": JSON,

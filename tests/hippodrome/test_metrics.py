@@ -29,14 +29,14 @@ USERS = ("R_alice", "R_bob")
 
 
 def metrics_line(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """The one line of metrics on stdout, among the log's lines."""
+    """Return the one line of metrics on stdout, among the log's lines."""
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith("{")]
     (found,) = [line for line in lines if "_aws" in line]
     return found
 
 
 def ours(kind: str) -> list[dict[str, Any]]:
-    """The template's resources of this type that watch Hippodrome's own metrics."""
+    """Return the template's resources of this type that watch Hippodrome's own metrics."""
     return [one for one in cfn.resources(kind).values() if one["Namespace"] == metrics.NAMESPACE]
 
 

@@ -36,7 +36,7 @@ BROKEN = {
 
 
 def page(platform: FakePlatform, user: str, project: str = "maze") -> tuple[int, str]:
-    """The status and body of the answer to a participant's link."""
+    """Return the status and body of the answer to a participant's link."""
     answer = Browser(platform, f"projectId={project}&userId={user}").send()
     return answer["statusCode"], str(answer["body"])
 

@@ -52,7 +52,7 @@ def listed(platform: FakePlatform) -> MasterList:
 
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
-    """The secret that signs the project's tickets, as functions read it."""
+    """Return the secret that signs the project's tickets, as functions read it."""
     project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret

@@ -64,7 +64,7 @@ def test_a_new_type_is_shown_and_answered_like_any_other() -> None:
 
 
 def write_study(folder: Path) -> Path:
-    """A break, a page that mentions an earlier answer, and the end."""
+    """Write a break, a page that mentions an earlier answer, and the end."""
     (folder / "steps").mkdir()
     (folder / "steps" / "more.html").write_text('<label>Why? <input name="why"></label>{{ answers["1"] }}')
     (folder / "steps" / "thanks.html").write_text("<p>Thank you.</p>")

@@ -13,7 +13,7 @@ LINTED = "us-east-1"
 
 
 def _folder(kind: str) -> Path:
-    """A folder of cfn-lint's schemas. cfn-lint itself is not imported: that takes a second."""
+    """Return a folder of cfn-lint's schemas. cfn-lint itself is not imported: that takes a second."""
     package = find_spec("cfnlint")
     assert package
     assert package.origin
@@ -21,7 +21,7 @@ def _folder(kind: str) -> Path:
 
 
 def of_region(region: str) -> dict[str, str]:
-    """The resource types of a region, each with the hash of its schema there."""
+    """Return the resource types of a region, each with the hash of its schema there."""
     found: dict[str, str] = json.loads((_folder("providers") / f"{region}.json").read_text())
     return found
 

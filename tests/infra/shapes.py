@@ -125,7 +125,7 @@ def _inner(where: str, shape: Shape, value: Any) -> Iterator[tuple[str, Shape, A
 
 
 def wrong(shape: Shape, value: Any) -> str:
-    """What the model has against a value; "" for nothing."""
+    """Return what the model has against a value; "" for nothing."""
     limits = shape.metadata
     if isinstance(shape, (ListShape, MapShape)):
         return _outside(limits, len(value)) if isinstance(value, (list, dict)) else ""

@@ -30,7 +30,7 @@ _MADE = {  # what `Ref` of a resource is that gets no name from us
 
 
 def _domains() -> tuple[tuple[str, str], ...]:
-    """The site's first part and the domain: one as long as it may be, then the other, then both short."""
+    """Return the site's first part and the domain: one as long as it may be, then the other, then both short."""
     rest = settings.SITE_LENGTH - len(".")
     host = "h" * int(cfn.template()["Parameters"]["SiteHost"]["MaxLength"])
     return (
@@ -49,7 +49,7 @@ class Account(cfn.ReferenceValues):
 
 
 def account(stack: str, parameters: Mapping[str, str], of: Mapping[str, Any]) -> Account:
-    """An account with that installation, and what its references become there."""
+    """Return an account with that installation, and what its references become there."""
     place = f"{REGION}:{ACCOUNT}"
     known: dict[str, str] = {}
     for name, one in of["Resources"].items():
@@ -124,11 +124,11 @@ class Installation:
         }
 
     def of(self, kind: str) -> list[Resource]:
-        """Those of a type."""
+        """Return those of a type."""
         return [one for one in self.everything.values() if one.kind == kind]
 
     def waits_for(self, name: str) -> set[str]:
-        """The logical ids that are made before a resource, directly or by way of others."""
+        """Return the logical ids that are made before a resource, directly or by way of others."""
         found: set[str] = set()
         ahead = [name]
         while ahead:
@@ -148,7 +148,7 @@ _CHOICES = (  # what turns each condition of the template on and off
 
 
 def _extremes(template: Mapping[str, Any], limit: str) -> dict[str, str]:
-    """The least (`MinValue`) or the largest (`MaxValue`) number that each parameter takes."""
+    """Return the least (`MinValue`) or the largest (`MaxValue`) number that each parameter takes."""
     return {name: str(one[limit]) for name, one in template["Parameters"].items() if limit in one}
 
 

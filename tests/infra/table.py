@@ -68,7 +68,7 @@ def render() -> str:
 
 
 def trigger(logical: str) -> str:
-    """What makes the function run."""
+    """Return what makes the function run."""
     for mapping in cfn.resources("AWS::Lambda::EventSourceMapping").values():
         if mapping["FunctionName"] == {"Ref": logical}:
             queue = account().attribute(mapping["EventSourceArn"]["Fn::GetAtt"][0], "Arn")
@@ -94,7 +94,7 @@ def trigger(logical: str) -> str:
 
 
 def permissions(name: str) -> list[str]:
-    """The statements of a role's policies, or of a managed policy, a row each."""
+    """Return the statements of a role's policies, or of a managed policy, a row each."""
     one = cfn.template()["Resources"][name]
     managed = one["Type"] == "AWS::IAM::ManagedPolicy"
     documents = [one["Properties"]["PolicyDocument"]] if managed else cfn.role_documents(name)
@@ -109,7 +109,7 @@ def permissions(name: str) -> list[str]:
 
 
 def conditions(condition: dict[str, Any]) -> list[str]:
-    """A condition in words as few as can be."""
+    """Return a condition in words as few as can be."""
     found = []
     for operator, keys in condition.items():
         for key, values in keys.items():
@@ -123,12 +123,12 @@ def conditions(condition: dict[str, Any]) -> list[str]:
 
 
 def short(resource: str) -> str:
-    """An ARN without what is the same everywhere; 20 question marks as an ellipsis."""
+    """Return an ARN without what is the same everywhere; 20 question marks as an ellipsis."""
     return re.sub(r"^arn:[^:]*:[^:]*:[^:]*:[^:]*:", "", resource).replace("s????????????????????", "s…")
 
 
 def written() -> str:
-    """What stands between the markers now."""
+    """Return what stands between the markers now."""
     return PATH.read_text(encoding="utf-8").split(BEGIN)[1].split(END)[0].strip()
 
 

@@ -29,12 +29,12 @@ ON_ONE_MACHINE = {*FUNCTIONS, *(handler.__module__.removeprefix("lambdas.") for 
 
 
 def rows(page: str) -> set[str]:
-    """What stands first in the rows of a page's tables."""
+    """Return what stands first in the rows of a page's tables."""
     return set(re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.MULTILINE))
 
 
 def calls(role: str) -> set[str]:
-    """The actions that a role allows, but for writing its own log."""
+    """Return the actions that a role allows, but for writing its own log."""
     policies = cfn.resources("AWS::IAM::Role")[role].get("Policies", [])
     statements = [
         one for policy in policies for one in policy["PolicyDocument"]["Statement"] if one["Effect"] == "Allow"

@@ -117,7 +117,7 @@ class Played:
             self._told |= {one["value"] for one in environment if one["name"] in {"TOKEN", "CREDENTIAL"}}
 
     def shown(self, judge: Judge, who: str = POLICY) -> list[str]:
-        """The documents that show a secret to a holder of this policy or role."""
+        """Return the documents that show a secret to a holder of this policy or role."""
         found = []
         for entry in self.study.world.platform.documents.list(""):
             arn = f"arn:aws:s3:::{self.study.world.env['BUCKET']}/{entry.key}"

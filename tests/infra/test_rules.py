@@ -16,7 +16,7 @@ INSTALLATIONS = list(installations())
 
 
 def faults(rule: Rule, there: list[Installation]) -> list[str]:
-    """The violations of a rule in these installations, each once."""
+    """Return the violations of a rule in these installations, each once."""
     return sorted({fault for one in there for fault in rule.faults(one)})
 
 

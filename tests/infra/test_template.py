@@ -338,7 +338,7 @@ def test_writers_of_new_documents_are_updated_after_their_readers(writer: str, d
 
 
 def waits_for(name: str) -> set[str]:
-    """The resources that CloudFormation makes and updates before this one because it says so."""
+    """Return the resources that CloudFormation makes and updates before this one because it says so."""
     found = cfn.template()["Resources"][name].get("DependsOn", [])
     before = {found} if isinstance(found, str) else set(found)
     return before.union(*map(waits_for, before))

@@ -58,14 +58,14 @@ def platform() -> Iterator[FakePlatform]:
 
 
 def new_platform() -> FakePlatform:
-    """A platform in memory with the study that the payloads name."""
+    """Return a platform in memory with the study that the payloads name."""
     made = studies.installed(studies.study(id=PROJECT, events=Events("2", "4")))
     installed.use(made)
     return made
 
 
 def users(event: dict[str, Any]) -> list[str]:
-    """The participants of the ECS events of a batch, in order."""
+    """Return the participants of the ECS events of a batch, in order."""
     found = []
     for record in event["Records"]:
         overrides = json.loads(record["body"])["detail"]["overrides"]["containerOverrides"]

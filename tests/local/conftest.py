@@ -78,7 +78,7 @@ class Env(Env):
 def write_study(
     folder: Path, *, live: bool = True, start: int = 1, frames: int = 30, warm: int = 0, holds: int = 0
 ) -> Path:
-    """A project folder: hello, a game of so many frames, bye, end; so many servers are kept warm.
+    """Write a project folder: hello, a game of so many frames, bye, end; so many servers are kept warm.
 
     The game `holds` after so many frames, as long as there is the file `hold` beside the folder.
     """
@@ -156,7 +156,7 @@ class Local:
         return self.process.wait(30)
 
     def servers(self) -> list[str]:
-        """The names of servers that have a process."""
+        """Return the names of servers that have a process."""
         return sorted(marked(self.state))
 
 

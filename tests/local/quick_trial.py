@@ -15,7 +15,7 @@ begun: list[str] = []
 
 
 def whose() -> tuple[str, str]:
-    """The participant and the server's name, also for a server that was warm."""
+    """Return the participant and the server's name, also for a server that was warm."""
     if told.get("USER_ID"):
         return told["USER_ID"], told["SERVER"]
     import json

@@ -52,7 +52,7 @@ IMPORT = (
 
 
 def write_clone(folder: Path, config: str = CONFIG) -> Path:
-    """A clone with a study of its own: its agent needs what lies beside it, and plays 12 frames."""
+    """Write a clone with a study of its own: its agent needs what lies beside it, and plays 12 frames."""
     files = {
         "config.yml": config,
         "App/agent.py": IMPORT + AGENT.format(frames="FRAMES"),

@@ -104,7 +104,7 @@ def installing(
 
 
 def installed(place: Path) -> dict[str, str]:
-    """The lines of the requirements that pip was given, by the names of the packages."""
+    """Return the lines of the requirements that pip was given, by the names of the packages."""
     lines: list[str] = []
 
     def read(file: Path) -> None:
@@ -130,7 +130,7 @@ def test_the_pinned_packages_are_installed(somewhere: Path) -> None:
 
 
 def pinned(*names: str) -> dict[str, str]:
-    """The lines of these files of requirements, by package."""
+    """Return the lines of these files of requirements, by package."""
     lines = [line for name in names for line in (ROOT / f"requirements/{name}.txt").read_text().splitlines()]
     return {line.partition("==")[0]: line for line in lines if "==" in line}
 

@@ -80,7 +80,7 @@ class Study:
 
 
 def cut(study: Study, root: Path, moment: int) -> list[str]:
-    """The broken ones of the promises that were made before that moment."""
+    """Return the broken ones of the promises that were made before that moment."""
     broken = []
     documents = FolderDocuments(root / "data", root / "state")
     for key, bodies in study.written.items():

@@ -52,7 +52,7 @@ def limited(here: Local, what: int, to: int) -> Iterator[None]:
 
 
 def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
-    """A participant who has played for a while, and the server's state on their page."""
+    """Return a participant who has played for a while, and the server's state on their page."""
     walker = at_the_game(here.url)
     state = walker.until("ready")
     with walker.connect(state) as game:

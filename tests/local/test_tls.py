@@ -30,7 +30,7 @@ FRONT_END = "http://testing.localhost:3000"
 
 
 def hold(local: Make, *options: str, front_end: bool = True) -> Local:
-    """A study whose page is HIPPO's front end, held with TLS."""
+    """Return a study whose page is HIPPO's front end, held with TLS."""
     one = local(frames=20)
     if front_end:
         config = one.folder / "config.yml"
@@ -135,7 +135,7 @@ def test_servers_of_a_run_with_other_addresses_are_replaced(local: Make) -> None
 
 
 def poll(client: httpx.Client, one: Local, link: dict[str, str], attempt: int = 1) -> dict[str, Any]:
-    """The server's state, once it is ready."""
+    """Return the server's state, once it is ready."""
 
     def ready() -> dict[str, Any] | None:
         state: dict[str, Any] = client.get(f"{one.url}/next", params={**link, "poll": "2"}).json()

@@ -28,7 +28,7 @@ class Walker:
         return answer.text
 
     def state(self) -> dict[str, Any]:
-        """What a program is told: `page`, `state`, `url`, `token`."""
+        """Return what a program is told: `page`, `state`, `url`, `token`."""
         found = self.http.get(self.link, headers={"accept": "application/json"})
         assert found.status_code == 200, found.text
         return found.json()  # type: ignore[no-any-return]

@@ -32,7 +32,7 @@ class Newcomer:
     internet: dict[tuple[str, str], Sequence[str]]
 
     def types(self, line: str, answer: str = "", seconds: float = 280) -> tuple[int, str]:
-        """The exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks."""
+        """Return the exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks."""
         keyboard, terminal = pty.openpty()
         try:
             os.write(keyboard, f"{answer}\n".encode())

@@ -62,7 +62,7 @@ class Agent:
 
 
 def write_project(folder: Path) -> Path:
-    """The study's project folder."""
+    """Write the study's project folder."""
     (folder / "steps").mkdir(parents=True)
     (folder / "config.yml").write_text(yaml.safe_dump(CONFIG, sort_keys=False))
     (folder / "agent.py").write_text(AGENT)
@@ -112,13 +112,13 @@ class Person:
         assert self.at == GAME
 
     def poll(self) -> Any:
-        """The answer to a poll of the waiting page."""
+        """Return the answer to a poll of the waiting page."""
         found = self.browser.get(f"{self.link}&poll={GAME}", headers={"Accept": "application/json"})
         assert found.status_code == 200, found.text
         return found.json()
 
     def is_told(self, state: str) -> Any:
-        """The answer to a poll of the waiting page if it has this state, else None."""
+        """Return the answer to a poll of the waiting page if it has this state, else None."""
         told = self.poll()
         return told if told["state"] == state else None
 
@@ -127,7 +127,7 @@ class Member(Person):
     """A participant of the study when it is played in pairs."""
 
     def poll(self) -> Any:
-        """The answer to a poll of the lobby's page, which sends its ticket."""
+        """Return the answer to a poll of the lobby's page, which sends its ticket."""
         link = f"{self.link}&poll={GAME}&ticket={self.proof['hippodrome-ticket']}"
         found = self.browser.get(link, headers={"Accept": "application/json"})
         assert found.status_code == 200, found.text
@@ -143,7 +143,7 @@ class Trial:
         self.told = {one["name"]: one["value"] for one in overrides["environment"]}
 
     def asks(self, method: str, key: str, body: bytes = b"", **change: str) -> httpx.Response:
-        """The site's answer to a server that asks for this presigned request."""
+        """Return the site's answer to a server that asks for this presigned request."""
         who = {"server": self.told["SERVER"], "credential": self.told["CREDENTIAL"], **change}
         return self.browser.post("/sign", json={**who, "requests": [{"method": method, "key": key, "size": len(body)}]})
 
@@ -158,5 +158,5 @@ class Trial:
 
 
 def trial_done(score: int) -> bytes:
-    """The documents that the trial writes at the end of a game."""
+    """Return the documents that the trial writes at the end of a game."""
     return json.dumps({"step": GAME, "answers": {"score": score}}).encode()

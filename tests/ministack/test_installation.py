@@ -122,7 +122,7 @@ def test_a_second_apply_changes_nothing(world: MinistackWorld, installed: Minist
 
 
 def events(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
-    """The events of a stack: the types of their resources, by the events' ids."""
+    """Return the events of a stack: the types of their resources, by the events' ids."""
     pages = world.client("cloudformation").get_paginator("describe_stack_events").paginate(StackName=stack)
     return {event["EventId"]: event["ResourceType"] for page in pages for event in page["StackEvents"]}
 
@@ -296,7 +296,7 @@ def test_a_message_that_always_fails_becomes_a_dead_letter(installed: MinistackI
 
 
 def alarms(installed: MinistackInstallation, namespace: str, metric: str, dimension: str) -> dict[str, dict[str, Any]]:
-    """The alarms on a metric, by the value of a dimension."""
+    """Return the alarms on a metric, by the value of a dimension."""
     found = installed.world.client("cloudwatch").describe_alarms()["MetricAlarms"]
     return {
         d["Value"]: alarm
@@ -348,7 +348,7 @@ Call = tuple[str, str, dict[str, Any]]  # service, operation, arguments
 
 
 def refused(installed: MinistackInstallation, role: str, call: Call) -> bool:
-    """Whether a caller with this role is refused the call."""
+    """Return whether a caller with this role is refused the call."""
     service, operation, arguments = call
     keys = installed.world.assume(role, TRESPASSER)
     try:
@@ -483,7 +483,7 @@ def role_of(installed: MinistackInstallation, who: str) -> str:
 
 
 def resource(installed: MinistackInstallation, what: str) -> str:
-    """The ARN of a thing of the stack."""
+    """Return the ARN of a thing of the stack."""
     kind, _, name = what.partition(":")
     place = f"{REGION}:{ACCOUNT}"
     if kind == "log":
@@ -759,13 +759,13 @@ def test_logs_hold_no_ids_answers_or_tokens(installed: MinistackInstallation, pe
 
 
 def functions(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
-    """The functions' code, by name."""
+    """Return the functions' code, by name."""
     found = world.client("lambda").list_functions()["Functions"]
     return {f["FunctionName"]: f["CodeSha256"] for f in found if f["FunctionName"].startswith(f"{stack}-")}
 
 
 def things(world: MinistackWorld, stack: str = "hippodrome") -> dict[str, str]:
-    """What the stack is made of: physical ids by logical ids."""
+    """Return what the stack is made of: physical ids by logical ids."""
     pages = world.client("cloudformation").get_paginator("list_stack_resources").paginate(StackName=stack)
     return {one["LogicalResourceId"]: one["PhysicalResourceId"] for p in pages for one in p["StackResourceSummaries"]}
 

@@ -120,7 +120,7 @@ def _changes(node: ast.AST) -> Iterator[Change]:
 
 
 def _is_wording(node: ast.AST) -> bool:
-    """Whether a node is a docstring, a log call, or something that only readers and type checkers use."""
+    """Return whether a node is a docstring, a log call, or something that only readers and type checkers use."""
     if isinstance(node, ast.Assign):
         name = ast.unparse(node.targets[0])
         return ast.unparse(node).startswith(("__all__ =", f"{name} = TypeVar(", f"{name} = Literal["))

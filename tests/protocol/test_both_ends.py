@@ -51,7 +51,7 @@ def task_request(platform: FakePlatform, user: str = "alice") -> TaskRequest:
 
 
 def variables_of(found: TaskRequest) -> dict[str, str]:
-    """All variables that the container of this server gets."""
+    """Return all variables that the container of this server gets."""
     tasks = EcsTasks(lambda: None, lambda: None, {"SIGN_URL": "https://study.example.org/sign"}.__getitem__)
     (container,) = tasks._overrides(found)["containerOverrides"]
     return {each["name"]: each["value"] for each in container["environment"]}

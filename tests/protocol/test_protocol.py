@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def top_level_imports(folder: str) -> dict[str, set[str]]:
-    """The top-level names that each module of a package imports."""
+    """Return the top-level names that each module of a package imports."""
     return {
         path.relative_to(ROOT).as_posix(): {name.partition(".")[0] for name in imported(path)}
         for path in sorted((ROOT / folder).rglob("*.py"))

@@ -70,7 +70,7 @@ MINE = "alice"
 
 
 def study(**changes: object) -> Project:
-    """A study like the example, whose pages show all that a participant has sent."""
+    """Return a study like the example, whose pages show all that a participant has sent."""
     pages = ("mirror", "game", "mirror", "mirror")
     steps = [Step("1", "consent", 2), *map(Step, ("2", "3", "4", "finalStep"), pages)]
     return studies.study(steps=steps, secret="the-project-secret-f00d", **changes)
@@ -82,7 +82,7 @@ MIRROR = """<h1>Mirror</h1><p title="{{ participant }}">{{ participant.note }} {
 
 
 def installed(**changes: object) -> FakePlatform:
-    """A platform in memory with that study."""
+    """Return a platform in memory with that study."""
     platform = studies.installed(study(**changes))
     platform.documents.put(f"{PROJECT}/steps/mirror.html", MIRROR.encode())
     platform.documents.put(f"{PROJECT}/steps/picture.svg", b"<svg xmlns='http://www.w3.org/2000/svg'><script/></svg>")
@@ -131,7 +131,7 @@ def check_html(text: str, *, whole: bool = True) -> None:
 
 
 def body_of(answer: dict[str, Any]) -> bytes:
-    """The bytes that a browser would receive."""
+    """Return the bytes that a browser would receive."""
     raw = answer["body"]
     data = base64.b64decode(raw, validate=True) if answer["isBase64Encoded"] else raw.encode()
     return gzip.decompress(data) if answer["headers"].get("Content-Encoding") == "gzip" else data

@@ -187,7 +187,7 @@ whole = st.sampled_from([True, False, False, False, False])
 
 
 def _near(method: str, form: dict[str, Any] | str, header: dict[str, str], query: str, coded: bool) -> dict[str, Any]:
-    """A valid request, except for what the visitor wrote."""
+    """Return a valid request, except for what the visitor wrote."""
     text = form if isinstance(form, str) else json.dumps(form) if header["content-type"] == JSON else _form(form)
     body = base64.b64encode(text.encode("utf-8", "surrogatepass")).decode() if coded else text
     return _event(method, "/next", query, header, body, coded)
@@ -227,7 +227,7 @@ STUDIES = st.sampled_from([{}, {}, LIMITS, {"signed_links": True}, {"signed_link
 
 
 def _world(**changes: Any) -> FakePlatform:
-    """A platform with the study, a participant with a running server, and another one whom the attacker does not know."""
+    """Return a platform with the study, a participant with a running server, and one whom the attacker does not know."""
     platform = hostile.installed(**changes)
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
         arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())

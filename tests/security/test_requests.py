@@ -80,7 +80,7 @@ def test_a_link_with_half_a_surrogate_pair_is_refused(platform: FakePlatform) ->
 
 
 def nested(depth: int, inside: str = "1") -> str:
-    """A JSON object with so many levels, including itself."""
+    """Return a JSON object with so many levels, including itself."""
     return '{"a":' + "[" * (depth - 1) + inside + "]" * (depth - 1) + "}"
 
 

@@ -90,7 +90,7 @@ class World:
         raise AssertionError([(one.user, one.step, one.state) for one in self.people])
 
     def left_over(self) -> list[str]:
-        """The servers, tasks and names that are left an hour after the end."""
+        """Return the servers, tasks and names that are left an hour after the end."""
         for _ in range(12):
             self.platform.wait(minutes=5)
             self._deliver()
@@ -102,7 +102,7 @@ class World:
         return [*opened, *(task.name for task in self.platform.tasks.running.values()), *self.platform.dns.records]
 
     def members(self) -> list[str]:
-        """The participants in all sessions, once for each session."""
+        """Return the participants in all sessions, once for each session."""
         entries = self.platform.documents.list(sessions_folder("maze"))
         found = [self.repository.session("maze", entry.key.split("/")[2]) for entry in entries]
         return [user for session in found if session for user in session.user_ids]
@@ -114,7 +114,7 @@ class World:
         return len(json.loads(task.environment["TRIAL"])["players"] or [owner])
 
     def plays_alone(self, user: str) -> bool:
-        """Whether the participant has a server of their own, and no membership."""
+        """Return whether the participant has a server of their own, and no membership."""
         record = self.repository.server_of("maze", user)
         has_server = record is not None and record.state is ServerState.READY
         return has_server and self.repository.membership("maze", user) is None

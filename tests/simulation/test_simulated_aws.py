@@ -174,7 +174,7 @@ def test_the_gateway_answers_a_page_request_without_a_free_execution():
 
 
 def told(conditions, seconds=300.0):
-    """The events of one task on Spot, in the order in which they come."""
+    """Return the events of one task on Spot, in the order in which they come."""
     world = SimulatedWorld(2, conditions)
     found = []
     world.platform.tasks.changed = lambda event, delay: found.append(event["detail"])
@@ -287,7 +287,7 @@ def test_a_change_takes_the_time_that_its_second_determines():
 
 
 def of_s3(act):
-    """What `act(world, documents)` returns, run as a function would."""
+    """Return what `act(world, documents)` returns, run as a function would."""
     world, found = SimulatedWorld(1), []
     world.clock.spawn(lambda: found.append(act(world, world.platform.documents)))
     world.run(60)

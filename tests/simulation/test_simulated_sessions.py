@@ -72,7 +72,7 @@ def assert_fair(world, came):
 
 
 def in_groups(world, came):
-    """The numbers of participants who came to the end as members of a full session, and as unmatched ones."""
+    """Return the numbers of participants who came to the end as members of a full session, and as unmatched ones."""
     full = [one for one in lobby.formed(world.platform.documents.kept, world.project) if len(one.members) > 1]
     together = {member.user_id for one in full for member in one.members}
     finished = [person.visit.user for person in came if person.visit.finished is not None]

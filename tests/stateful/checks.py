@@ -243,13 +243,13 @@ def play(world: World, user: str, page: dict[str, object]) -> None:
 
 
 def running_at(world: World, url: str) -> list[Task]:
-    """The tasks that run at this address."""
+    """Return the tasks that run at this address."""
     host = world.account.zone.records.get(url.split("/")[2].split(":", maxsplit=1)[0])
     return [task for task in world.tasks if task.host == host and task.last == "RUNNING" and task.alive]
 
 
 def is_last_or_true(world: World, user: str, page: dict[str, object]) -> bool:
-    """Whether this is the last page, or one that correctly says why the participant cannot go on."""
+    """Return whether this is the last page, or one that correctly says why the participant cannot go on."""
     if page.get("step") == world.project.final.key:
         return True
     if "message" in page:

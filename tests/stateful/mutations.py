@@ -38,7 +38,7 @@ def assert_noticed(
 
 
 def messages_of(error: BaseException) -> list[str]:
-    """The messages of all failed assertions, of one example or of several."""
+    """Return the messages of all failed assertions, of one example or of several."""
     if isinstance(error, BaseExceptionGroup):
         return [text for one in error.exceptions for text in messages_of(one)]
     return [str(error)] if isinstance(error, AssertionError) else []

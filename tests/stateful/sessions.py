@@ -33,7 +33,7 @@ TOGETHER = 3  # seconds between two requests of a page in the lobby
 
 
 def pairs(**changes: Any) -> Project:
-    """The study, for pairs who wait for each other for a minute."""
+    """Return the study, for pairs who wait for each other for a minute."""
     return study(players=2, patience=60, **changes)
 
 
@@ -55,28 +55,28 @@ class SessionWorld(World):
     # State
 
     def documents(self) -> dict[str, bytes]:
-        """The documents of sessions and of memberships."""
+        """Return the documents of sessions and of memberships."""
         kept = self.account.kept
         return {key: kept[key][0] for key in kept if key.endswith("/session.json")}
 
     def sessions(self) -> list[SessionDocument]:
-        """All sessions that were formed."""
+        """Return all sessions that were formed."""
         folder = sessions_folder(self.project.id)
         return [parse(body) for key, body in self.documents().items() if key.startswith(folder)]
 
     def membership(self, user: str) -> Membership | None:
-        """The participant's membership, once it is decided."""
+        """Return the participant's membership, once it is decided."""
         found = self.account.kept.get(membership_key(self.project.id, user))
         return from_json(found[0], Membership) if found else None
 
     def record_of(self, user: str) -> Server | None:
-        """The record of the server of their session."""
+        """Return the record of the server of their session."""
         membership = self.membership(user)
         session = membership.session if membership else None
         return self.record(ids.server_label(self.project.id, session)) if session else None
 
     def decisions(self) -> Decisions:
-        """The lobby's document."""
+        """Return the lobby's document."""
         found = self.account.kept.get(lobby_key(self.project.id))
         try:
             return from_json(found[0], Decisions) if found else Decisions()
@@ -84,7 +84,7 @@ class SessionWorld(World):
             return Decisions()
 
     def session_of(self, task: Task) -> SessionDocument | None:
-        """The session that plays on the task, if it was formed."""
+        """Return the session that plays on the task, if it was formed."""
         told = self.handovers().get(task.name)
         session_id = task.session or (told.user_id if told else "")
         return next((one for one in self.sessions() if one.id == session_id), None)

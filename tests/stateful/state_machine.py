@@ -28,7 +28,7 @@ BEGINNINGS = st.sampled_from(["nowhere", "at the game", "starting", "running", "
 
 
 def project(limits: dict[str, int], own_clusters: bool, warm: int) -> Project:
-    """The study, with the chosen settings."""
+    """Return the study, with the chosen settings."""
     return study(cluster="participant" if own_clusters else "installation", warm_servers=warm, **limits)
 
 

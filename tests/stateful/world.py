@@ -147,12 +147,12 @@ class World:
         self.listener(line)
 
     def who(self, name: str) -> str:
-        """A server's name in words."""
+        """Return a server's name in words."""
         label, dash, rest = name.partition("-")
         return self._labels.get(label, label) + dash + rest
 
     def _whose(self, user_id: str) -> str:
-        """A participant, or a warm server by its number."""
+        """Return a participant, or a warm server by its number."""
         if not ids.is_warm_id(user_id):
             return user_id
         label = ids.server_label(self.project.id, user_id)
@@ -165,7 +165,7 @@ class World:
         return [task for task in self.account.fleet.tasks.values() if task.name != STRANGER]
 
     def records(self) -> list[Server]:
-        """All servers' records."""
+        """Return all servers' records."""
         kept = self.account.kept
         return [from_json(kept[key][0], Server) for key in sorted(kept) if key.startswith("_servers/")]
 
@@ -174,17 +174,17 @@ class World:
         return from_json(found[0], Server) if found else None
 
     def record_of(self, user: str) -> Server | None:
-        """The record of the server on which the participant plays."""
+        """Return the record of the server on which the participant plays."""
         return self.record(ids.server_label(self.project.id, user))
 
     def owner(self, name: str) -> Server | None:
-        """The record that owns this resource name: the server's own, or after a handover the participant's."""
+        """Return the record that owns this resource name: the server's own, or after a handover the participant's."""
         record = self.record((ids.parse_server_name(name) or ("", 0))[0])
         heir = self.record(record.assigned_to) if record and record.assigned_to else None
         return heir if heir and heir.name == name else record
 
     def handovers(self) -> dict[str, Handover]:
-        """The handovers, by the warm servers' names."""
+        """Return the handovers, by the warm servers' names."""
         prefix, kept = handovers_folder(self.project.id), self.account.kept
         found = {key.removeprefix(prefix).removesuffix(".json"): key for key in kept if key.startswith(prefix)}
         return {name: handover.parse(kept[key][0]) for name, key in found.items()}
@@ -219,7 +219,7 @@ class World:
         }
 
     def _hopeless(self, message: Message) -> bool:
-        """Whether an event needs one that was lost, or is from before an erasure and names a new server."""
+        """Return whether an event needs one that was lost, or is from before an erasure and names a new server."""
         name = str(message.body.get("detail", {}).get("startedBy", ""))
         return bool(name) and (self.lost > 0 or name.partition("-")[0] in self.erased)
 
@@ -247,7 +247,7 @@ class World:
         self.queued.append(Message(next(self._numbers), queue, dict(body), visible, self._describe(queue, body)))
 
     def visible(self, queue: str | None = None) -> list[Message]:
-        """The messages that may be delivered now."""
+        """Return the messages that may be delivered now."""
         now = self.account.now()
         return [message for message in self.queued if message.visible <= now and queue in (None, message.queue)]
 
@@ -312,7 +312,7 @@ class World:
                 self.done = [*self.done[-30:], message]
 
     def pending(self, record: Server) -> bool:
-        """Whether a queued message or a running function will still change this server."""
+        """Return whether a queued message or a running function will still change this server."""
         label = record.label
         if any(self._concerns(message, record) for message in [*self.queued, *self.in_flight]):
             return True
@@ -349,7 +349,7 @@ class World:
     # Participants
 
     def request(self, user: str, method: str, fields: Mapping[str, str] | None = None, **query: str) -> dict[str, Any]:
-        """The HTTP API's event for a program's request."""
+        """Return the HTTP API's event for a program's request."""
         return aws_events.program_event(method, {"projectId": self.project.id, "userId": user, **query}, fields or {})
 
     def ask(
@@ -461,7 +461,10 @@ class World:
         self.functions.invoke("administrator", "stop all", lambda: installed.shared(Servers).stop(stops), done, fault)
 
     def may_erase(self, user: str) -> bool:
-        """Whether `deploy erase` may begin: no message of the participant is being handled, no function waits, listings show all tasks."""
+        """Return whether `deploy erase` may begin.
+
+        No message of the participant is being handled, no function waits, and listings show all tasks.
+        """
         busy = any(m.body.get("userId") == user for m in self.in_flight) or bool(self.functions.waiting)
         now = self.account.now()
         return not busy and all(task.listed <= now for task in self.tasks)

@@ -145,5 +145,5 @@ async def hippo_page(
 
 
 def new_user_id() -> str:
-    """A user id, as its constants.js makes one at each load of the page."""
+    """Return a user id, as its constants.js makes one at each load of the page."""
     return str(uuid.uuid4())

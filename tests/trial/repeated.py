@@ -140,7 +140,7 @@ class Game:
         self.begin(recorded)
 
     def make_settings(self, section: Mapping[str, Any]) -> TrialSettings:
-        """The settings of the server."""
+        """Return the settings of the server."""
         return settings_of(section, USER_ID="P1")
 
     def begin(self, recorded: RecordedTrial | None) -> None:
@@ -203,7 +203,7 @@ class Game:
 
 
 def settings_of(section: Mapping[str, Any], **env: str) -> TrialSettings:
-    """The settings of a server of the study, from this section and these variables."""
+    """Return the settings of a server of the study, from this section and these variables."""
     trial = json.dumps({"game": "x", "actionSpace": SPACE, **section})
     common = {"PROJECT_ID": "study", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
     return TrialSettings.from_env({**common, "TRIAL": trial, **env})
@@ -217,7 +217,7 @@ def adapter(folder: Path) -> JointAdapter:
 
 
 def cast(agent: JointAdapter, folder: Path, section: Section) -> tuple[list[Player], dict[str, Any]]:
-    """The players, and the policies by player, with those that may play for a participant."""
+    """Return the players, and the policies by player, with those that may play for a participant."""
     players = list(who_plays(section, {name: agent.action_spaces[name] for name in agent.players}, None))
     substitute = section.substitute
     stand_ins = [replace(player, plays=substitute) for player in players if player.human and substitute]
@@ -225,7 +225,7 @@ def cast(agent: JointAdapter, folder: Path, section: Section) -> tuple[list[Play
 
 
 def chosen(policy: Any, *seen: Any) -> Any:
-    """The action that the policy chooses, or the exception that it raises."""
+    """Return the action that the policy chooses, or the exception that it raises."""
     try:
         return policy.act(*seen)
     except ValueError as error:

@@ -162,7 +162,7 @@ class SessionDriver:
         return self.answer_calls()
 
     def state_seen_by(self, number):
-        """The newest state of the trial that the member was sent."""
+        """Return the newest state of the trial that the member was sent."""
         tab, latest_first = f"tab{number}", reversed(self.all)
         texts = (e.text for e in latest_first if isinstance(e, SendState | SendMessage) and e.connection == tab)
         return next(said for said in map(json.loads, texts) if "state" in said)

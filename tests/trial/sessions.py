@@ -43,7 +43,7 @@ ENV = {
 def document(
     members: Iterable[str] = MEMBERS, *, players: int = 2, group: int | None = None, sid: str = SID
 ) -> SessionDocument:
-    """A session whose members have the seats 0, 1 and so on."""
+    """Return a session whose members have the seats 0, 1 and so on."""
     found = tuple(Member(user_id, group, seat) for seat, user_id in enumerate(members))
     return SessionDocument(sid, players, found, group, "2026-11-22T22:00:00.000000Z")
 
@@ -77,7 +77,7 @@ def launch_formed(launch: Any, **options: Any) -> Any:
 
 
 def hello_of(user_id: str, **change: Any) -> dict[str, Any]:
-    """The fields of the hello that a member's page sends."""
+    """Return the fields of the hello that a member's page sends."""
     return {"userId": user_id, "token": member_token(TOKEN, user_id), "step": "3", **change}
 
 
@@ -130,12 +130,12 @@ async def wait_for_pictures(frames: int, *clients: Client) -> None:
 
 
 def answer(store: Path, user_id: str, step: str = "3") -> dict[str, Any]:
-    """The document of a member's answer."""
+    """Return the document of a member's answer."""
     found: dict[str, Any] = json.loads((store / f"study/users/{user_id}/answers/{step}.json").read_text())
     return found
 
 
 def recordings(store: Path, server: str = "pair-1") -> dict[str, list[dict[str, Any]]]:
-    """The lines that a server of the session has recorded, by file."""
+    """Return the lines that a server of the session has recorded, by file."""
     folder = store / f"study/sessions/{SID}/trials/{server}"
     return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob("*.gz*"))}

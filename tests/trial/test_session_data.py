@@ -75,7 +75,7 @@ def data(store: Path, out: Path) -> dict[str, list[dict[str, str]]]:
 
 
 def entries_of_one_player(store: Path, player: str) -> list[Any]:
-    """All entries of the session's recordings that belong to one player alone."""
+    """Return all entries of the session's recordings that belong to one player alone."""
     (lines,) = recordings(store).values()
     found: list[Any] = [m for line in lines for m in line.get("messages") or () if m.get("player") in (player, None)]
     for line in lines:

@@ -28,7 +28,7 @@ def connect(port, first=SILENT):
 
 
 def masked(opcode, payload, *, fin=True, length=None, reserved=0):
-    """A client's frame; `length` is the length in its header, if that is to be wrong."""
+    """Return a client's frame; `length` is the length in its header, if that is to be wrong."""
     size = len(payload) if length is None else length
     head = bytes([(0x80 if fin else 0) | reserved | opcode])
     if size < 126:

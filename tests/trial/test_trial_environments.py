@@ -56,7 +56,7 @@ gymnasium.register("Odd-v0", Odd)
 
 
 def agent() -> str:
-    """An agent.py that registers an environment: action 1 hangs, action 2 ends its process."""
+    """Return an agent.py that registers an environment: action 1 hangs, action 2 ends its process."""
     return grid_agent() + REGISTERS
 
 

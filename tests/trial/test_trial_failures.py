@@ -241,7 +241,7 @@ async def test_a_slow_step_keeps_the_connection_alive(launch, open_client, tmp_p
 
 
 async def steps_by(launch, open_client, source):
-    """How the steps of an episode say who chose the action; `left` is held in the later steps."""
+    """Return how the steps of an episode say who chose the action; `left` is held in the later steps."""
     waits = "self.steps += 1\n        while self.steps == 20 and not os.path.exists('go_on'): time.sleep(0.02)"
     server = launch("import os\n" + source.replace("self.steps += 1", waits), {**NAMES, "maxEpisodes": 1})
     async with open_client(server.address) as client:

@@ -223,7 +223,7 @@ async def test_an_interrupted_game_of_two_players_goes_on_where_it_was(launch, o
 
 
 def steps_until_the_last_answer(lines):
-    """The number of steps until the last one at which the partner was not late."""
+    """Return the number of steps until the last one at which the partner was not late."""
     return max((number for number, line in enumerate(lines, 1) if line["players"]["right"]["by"] != "late"), default=0)
 
 

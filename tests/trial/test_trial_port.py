@@ -54,7 +54,7 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing
 
 
 def container(port: str) -> dict[str, Any]:
-    """The container in a study's task definition, in an installation with that ServerPort."""
+    """Return the container in a study's task definition, in an installation with that ServerPort."""
     names = ("TaskExecutionRole", "TaskRole", "TrialLogGroup")
     installation = Installation(
         "hippodrome", "us-east-1", "CREATE_COMPLETE", {**dict.fromkeys(names, "x"), "ServerPort": port}

@@ -48,7 +48,7 @@ async def closed(websocket: ClientConnection) -> int | None:
 
 
 async def steps(websocket: ClientConnection, count: int) -> list[dict[str, Any]]:
-    """The next lines of steps."""
+    """Return the next lines of steps."""
     found: list[dict[str, Any]] = []
     while len(found) < count:
         line = await next_line(websocket)

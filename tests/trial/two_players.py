@@ -57,5 +57,8 @@ TRIAL = {"players": {"left": "human", "right": "agent:Partner"}, "actionSpace": 
 
 
 def two_players(*, length: int | None = None, turns: bool = False, act: str = "") -> str:
-    """The source of agent.py. `turns`: the players take turns; `act`: code that the partner runs before it acts."""
+    """Return the source of agent.py.
+
+    `turns`: the players take turns; `act`: code that the partner runs before it acts.
+    """
     return TWO.format(length=length, to_act=TURN if turns else "", act=act or "pass")

@@ -47,7 +47,10 @@ def add_broken_entry(world: Installed) -> None:
 
 
 def findings_of(account: Account) -> list[Finding]:
-    """The findings of doctor that are not good. Checks that each has a remedy and none holds the participant's id."""
+    """Return the findings of doctor that are not good.
+
+    Checks that each has a remedy and none holds the participant's id.
+    """
     findings = [one for one in examine(context(account), CHECKS) if one.mark is not Mark.GOOD]
     assert not any(USER in one.text + one.advice for one in findings)
     assert all(one.advice for one in findings)

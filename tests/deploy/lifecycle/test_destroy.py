@@ -138,7 +138,7 @@ def test_destroy_deletes_all_but_the_data(
 
 
 def last_commands(said: str) -> list[list[str]]:
-    """The commands that the output names at its end, split as a shell would split them."""
+    """Return the commands that the output names at its end, split as a shell would split them."""
     return [shlex.split(line)[3:] for line in said.splitlines() if line.startswith("  python -m deploy ")]
 
 

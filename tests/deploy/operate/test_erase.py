@@ -56,7 +56,7 @@ def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str
 
 
 def versions(world: Installed, prefix: str = "") -> dict[str, int]:
-    """The number of versions and delete markers of each key."""
+    """Return the number of versions and delete markers of each key."""
     found: dict[str, int] = {}
     for page in world.client("s3").get_paginator("list_object_versions").paginate(Bucket=world.env["BUCKET"]):
         for line in [*page.get("Versions", ()), *page.get("DeleteMarkers", ())]:
@@ -66,7 +66,7 @@ def versions(world: Installed, prefix: str = "") -> dict[str, int]:
 
 
 def traces(world: Installed, user: str) -> list[str]:
-    """The keys, servers and timers that belong to the participant."""
+    """Return the keys, servers and timers that belong to the participant."""
     label = ids.server_label("maze", user)
     keys = [key for key in versions(world) if key.startswith(f"maze/users/{user}/") or label in key]
     tasks = [task.name for task in world.platform.tasks.list() if label in task.name]
@@ -86,7 +86,7 @@ def start(world: Installed, user: str = ANN) -> str:
 
 
 def bodies(world: Installed) -> list[bytes]:
-    """The contents of every version of every document."""
+    """Return the contents of every version of every document."""
     s3, bucket = world.client("s3"), world.env["BUCKET"]
     found = s3.list_object_versions(Bucket=bucket)["Versions"]
     return [s3.get_object(Bucket=bucket, Key=v["Key"], VersionId=v["VersionId"])["Body"].read() for v in found]

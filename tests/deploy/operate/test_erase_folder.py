@@ -50,7 +50,7 @@ class Machine:
         return CommandResult(code, printed.out, printed.err)
 
     def contents(self) -> dict[str, bytes]:
-        """The contents of every file, with recordings unpacked."""
+        """Return the contents of every file, with recordings unpacked."""
         found = {}
         for path in self.data.rglob("*"):
             if path.is_file():

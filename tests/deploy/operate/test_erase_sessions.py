@@ -67,7 +67,7 @@ def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> Command
 
 
 def contents(world: Installed) -> dict[tuple[str, str], bytes]:
-    """The contents of every version of every document, by key and version id, with recordings unpacked."""
+    """Return the contents of every version of every document, by key and version id, with recordings unpacked."""
     s3, bucket = world.client("s3"), world.env["BUCKET"]
     found = {}
     for page in s3.get_paginator("list_object_versions").paginate(Bucket=bucket):
@@ -81,7 +81,7 @@ def contents(world: Installed) -> dict[tuple[str, str], bytes]:
 
 
 def traces(world: Installed, user: str = ANN) -> list[str]:
-    """The keys of documents of which a version names this participant."""
+    """Return the keys of documents of which a version names this participant."""
     told = [user, said(user), ids.server_label("maze", user), f":{round_trip(user)}"]
     return [
         key for (key, _), body in contents(world).items() if any(each in key or each.encode() in body for each in told)

@@ -93,12 +93,12 @@ def play(running: RunningInstallation, capsys: Any, *arguments: str) -> CommandR
 
 
 def documents(running: RunningInstallation) -> set[str]:
-    """The documents in the bucket, by key."""
+    """Return the documents in the bucket, by key."""
     return set(running.keys())
 
 
 def versions(running: RunningInstallation) -> set[str]:
-    """The keys of every version and delete marker."""
+    """Return the keys of every version and delete marker."""
     found = running.client("s3").list_object_versions(Bucket=running.env["BUCKET"])
     return {line["Key"] for line in [*found.get("Versions", ()), *found.get("DeleteMarkers", ())]}
 
@@ -410,7 +410,7 @@ def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
 
 
 def claims() -> dict[str, str]:
-    """Each claim of docs/unproven.md, with the line that says how to prove it."""
+    """Return each claim of docs/unproven.md, with the line that says how to prove it."""
     page = (ROOT / "docs/unproven.md").read_text()
     found = re.findall(r"^\* \*\*(.+)\.\*\* .+\n  \* \*Proof\*: (.+)\n", page, re.MULTILINE)
     assert len(found) == len(dict(found)) == page.count("* *Proof*:"), "a claim has another form, or stands twice"
@@ -418,7 +418,7 @@ def claims() -> dict[str, str]:
 
 
 def arrows() -> dict[str, list[str]]:
-    """The lines of the transcript that each claim of docs/unproven.md names."""
+    """Return the lines of the transcript that each claim of docs/unproven.md names."""
     return {claim: re.findall(r"`(.*?)`", proof.partition("→")[2]) for claim, proof in claims().items()}
 
 

@@ -56,7 +56,7 @@ def authority(monkeypatch: pytest.MonkeyPatch) -> Authority:
 
 
 def installation(world: World, number: int, monkeypatch: pytest.MonkeyPatch, root: str = DOMAIN) -> Installation:
-    """The number-th installation of the same name, with a bucket of its own."""
+    """Return the number-th installation of the same name, with a bucket of its own."""
     bucket = f"hippodrome-bucket-{number}"
     if bucket not in buckets(world):
         make_bucket(world, bucket, TAG)
@@ -83,7 +83,7 @@ def document(world: World, number: int, key: str) -> bytes:
 
 
 def stored_serial(world: World, number: int) -> str:
-    """The serial number of the stored certificate."""
+    """Return the serial number of the stored certificate."""
     stored = order.read_stored(document(world, number, PRIVKEY))
     assert stored
     return stored.serial

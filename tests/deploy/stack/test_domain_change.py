@@ -29,7 +29,7 @@ def world(monkeypatch: pytest.MonkeyPatch, access_keys: None) -> Iterator[Instal
 
 
 def prepared(world: Installed, account: Account | None = None, **changed: str) -> Prepared:
-    """A prepared apply that gives the servers' names a level of their own, or other changes."""
+    """Return a prepared apply that gives the servers' names a level of their own, or other changes."""
     stands = {"RootDomain": "example.org", "HostedZoneId": world.env["HOSTED_ZONE_ID"], "SiteHost": "study"}
     outputs = [{"OutputKey": key, "OutputValue": value} for key, value in world.outputs.items()]
     parameters = [{"ParameterKey": key, "ParameterValue": value} for key, value in stands.items()]

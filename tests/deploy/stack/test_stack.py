@@ -358,7 +358,7 @@ def test_the_name_of_the_site_must_fit_a_certificate(world: World) -> None:
 
 
 def chosen(world: World, previous: dict[str, str] | None = None, **asked: Any) -> dict[str, str]:
-    """The availability zones that the settings choose, with a template that has them as parameters."""
+    """Return the availability zones that the settings choose, with a template that has them as parameters."""
     defaults = Template(TEMPLATE).defaults | {"ZoneA": None, "ZoneB": None}
     subnets = asked.pop("standing", ())
     settings = StackSettings(domain="example.org", **asked)

@@ -44,7 +44,7 @@ ENDS = {  # the possible ends of each operation in progress
 
 
 def what_follows(status: str) -> list[list[Step]]:
-    """The operations that CloudFormation executes for `apply` in that state."""
+    """Return the operations that CloudFormation executes for `apply` in that state."""
     return {
         StackAction.RECREATE: [list(DELETED)],
         StackAction.ROLL_BACK: [list(TAKEN_BACK)],

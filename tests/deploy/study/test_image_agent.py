@@ -16,7 +16,7 @@ from tests.trial.conftest import grid_agent
 
 
 def tried(recipe: Recipe, folder: Path, tmp_path: Path, seconds: str = "150", **trial: Any) -> tuple[int, str]:
-    """The exit status and output of the step that tries the agent, where the image's files are."""
+    """Return the exit status and output of the step that tries the agent, where the image's files are."""
     make_bundle(folder, trial=trial).write_folder(tmp_path / "context")
     (command,) = (json.loads(step) for step in stages()[1].all("RUN"))
     assert command[3:] == ["/hippodrome/check.json", "60"]

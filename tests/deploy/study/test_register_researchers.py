@@ -78,7 +78,7 @@ def test_two_versions_registered_at_once_both_succeed_and_share_one_image(
 
 
 def _asks(register_world: RegisterWorld, action: str, params: dict[str, Any]) -> list[Ask]:
-    """The permissions that a call of `register` needs, by AWS's Service Authorization Reference."""
+    """Return the permissions that a call of `register` needs, by AWS's Service Authorization Reference."""
     here, bucket = f"us-east-1:{ACCOUNT}", f"arn:aws:s3:::{register_world.env['BUCKET']}"
     stack, families = f"arn:aws:cloudformation:{here}:stack/hippodrome/1", f"arn:aws:ecs:{here}:task-definition"
     service, operation = action.split(":")

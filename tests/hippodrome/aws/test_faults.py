@@ -300,7 +300,7 @@ def run(installation: TimedInstallation, journey: Journey, fault: AwsFault | Non
 
 
 def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
-    """The fault points of each journey, by the rule above."""
+    """Return the fault points of each journey, by the rule above."""
     combos = {c.action: faults_of(c.action) for made in calls.values() for c in made}
     turn = {action: itertools.cycle(worst_first(found)) for action, found in combos.items()}
     points: dict[str, list[AwsFault]] = {name: [] for name in calls}
@@ -319,7 +319,7 @@ def plan(calls: Calls, each: int = EACH) -> dict[str, list[AwsFault]]:
 
 
 def faults_of(action: str) -> list[tuple[FaultKind, Reach]]:
-    """All kinds and reaches of faults of an operation."""
+    """Return all kinds and reaches of faults of an operation."""
     return [(kind, reach) for kind in kinds(action) for reach in reaches(action, kind)]
 
 

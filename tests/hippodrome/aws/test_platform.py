@@ -13,7 +13,7 @@ from testing.moto_world import MotoWorld
 
 
 def _loaded(code: str) -> set[str]:
-    """The modules that are loaded after running `code` in a fresh Python."""
+    """Return the modules that are loaded after running `code` in a fresh Python."""
     script = f"import sys\n{code}\nprint(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     return set(done.stdout.split())

@@ -88,7 +88,7 @@ def read(folder: Path, text: str) -> Config:
 
 
 def mistakes(folder: Path, text: str | bytes) -> list[str]:
-    """The messages that a researcher sees for this config.yml, one per line."""
+    """Return the messages that a researcher sees for this config.yml, one per line."""
     data = text if isinstance(text, bytes) else textwrap.dedent(text).encode()
     (folder / "config.yml").write_bytes(data)
     with pytest.raises(ConfigErrors) as caught:
@@ -109,6 +109,6 @@ def small(project: str = "", trial: str = "", steps: str = "") -> str:
 
 
 def only_mistake(folder: Path, text: str | bytes) -> str:
-    """The one mistake of a file, without the file's name and line."""
+    """Return the one mistake of a file, without the file's name and line."""
     (line,) = mistakes(folder, text)
     return re.sub(r"^config\.yml(:\d+)?: ", "", line)

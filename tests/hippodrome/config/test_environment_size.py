@@ -23,14 +23,14 @@ Make = Callable[[int], dict[str, Any]]
 
 
 def message(trial: dict[str, Any], games: int = 1, **project: Any) -> dict[str, Any]:
-    """A registration with the longest possible id."""
+    """Return a registration with the longest possible id."""
     pages = ["game"] * games + ["bye"]
     steps = [{"key": str(number), "page": page} for number, page in enumerate(pages, 1)]
     return {"id": LONG, "steps": steps, "trial": {"game": "x/Y-v0", **trial}, **project}
 
 
 def request_of(registration: dict[str, Any]) -> TaskRequest:
-    """The request to ECS for the server of a participant with the longest possible id."""
+    """Return the request to ECS for the server of a participant with the longest possible id."""
     steps = [{**step, "variants": 0} for step in registration["steps"]]
     kept = {"id": LONG, "name": "n", "live": True, "secret": "s", "awsSetup": {"cpu": 16, "memory": 120}}
     project = from_json(

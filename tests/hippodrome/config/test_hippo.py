@@ -21,7 +21,7 @@ from tests.hippodrome.config.folder import HIPPO, SMALL, mistakes, read, small
 
 
 def remarks(config: Config) -> list[str]:
-    """The remarks, without the file's name and line."""
+    """Return the remarks, without the file's name and line."""
     return [re.sub(r"^config\.yml:\d+: remark: ", "", str(remark)) for remark in config.remarks]
 
 

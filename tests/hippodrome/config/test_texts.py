@@ -26,12 +26,12 @@ project:
 
 
 def with_lines_of_texts(config: str, texts: str) -> str:
-    """The configuration with these lines of texts."""
+    """Return the configuration with these lines of texts."""
     return config.replace("project:\n", f"project:\n  texts:\n{texts}", 1)
 
 
 def remarks(folder: Path, config: str) -> list[str]:
-    """The remarks on texts."""
+    """Return the remarks on texts."""
     return [str(said) for said in remarks_on(folder, read(folder, config)) if "another language" in str(said)]
 
 
@@ -169,7 +169,7 @@ NOT_ENGLISH = "the study does not seem to be in English, but its pages tell brow
 
 
 def remarks_on_language(folder: Path, config: str) -> list[str]:
-    """The remarks of this configuration that are about a missing language."""
+    """Return the remarks of this configuration that are about a missing language."""
     found = [str(said) for said in remarks_on(folder, read(folder, config))]
     return [said for said in found if NOT_ENGLISH in said]
 

@@ -72,7 +72,7 @@ SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: eac
 
 
 def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
-    """The section that the study's servers get after registration, or the list of problems."""
+    """Return the section that the study's servers get after registration, or the list of problems."""
     try:
         return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
     except ConfigErrors as errors:
@@ -80,7 +80,7 @@ def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
 
 
 def started(section: dict[str, Any]) -> trial.TrialSection | str:
-    """The settings that a server reads from it, or the first problem."""
+    """Return the settings that a server reads from it, or the first problem."""
     try:
         return trial_section(section)
     except SettingsError as error:

@@ -179,7 +179,7 @@ class Crossing:
     # Documents and messages
 
     def sessions(self) -> dict[str, Any]:
-        """The sessions' documents, by id."""
+        """Return the sessions' documents, by id."""
         return {
             key.split("/")[2]: json.loads(found[0])
             for key, found in self.platform.documents.kept.items()
@@ -195,7 +195,7 @@ class Crossing:
         return json.loads(found[0]) if found else {}
 
     def ids_in_start_messages(self) -> set[str]:
-        """The ids of all sessions whose start message was sent."""
+        """Return the ids of all sessions whose start message was sent."""
         return {m["userId"] for topic, m in self.platform.bus.sent if topic is Topic.START}
 
     def label(self, user: str) -> str:

@@ -28,7 +28,7 @@ def ago(seconds: float) -> datetime:
 
 
 def one(label: str, came: float = 5, seen: float = 0, trait: str = "-") -> Waiting:
-    """The entry of a participant who came and was seen so many seconds ago."""
+    """Return the entry of a participant who came and was seen so many seconds ago."""
     return Waiting(label, milliseconds(NOW) - round(came * 1000), trait, ago(seen))
 
 
@@ -617,7 +617,7 @@ def test_erasing_an_unknown_participant_changes_nothing() -> None:
 
 
 def pair_of(labels: str, server: str, at: datetime = NOW) -> Formed:
-    """A session that waits for the server of this id."""
+    """Return a session that waits for the server of this id."""
     ahead = OpenSession(server, ago(60))
     return Formed(server, tuple(Matched(label, label.upper()) for label in labels), at, True, ahead)
 
@@ -682,7 +682,7 @@ def test_a_session_whose_server_has_ended_waits_for_an_open_one_that_starts() ->
 
 
 def of(players: int, session: Formed) -> Formed:
-    """The session, for a registration with so many players."""
+    """Return the session, for a registration with so many players."""
     assert session.waits_for
     return replace(session, players=players, waits_for=replace(session.waits_for, players=players))
 

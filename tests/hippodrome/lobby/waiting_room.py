@@ -32,7 +32,7 @@ POLL = 2.0
 
 
 def pairs(**changes: Any) -> Project:
-    """The study of `testing/studies.py` for two players."""
+    """Return the study of `testing/studies.py` for two players."""
     return study(**{"players": 2, "patience": 60, **changes})
 
 
@@ -59,11 +59,11 @@ class WaitingRoom:
         self.lobby = self.function()
 
     def function(self) -> Lobby:
-        """The lobby of another running function, whose caches are empty."""
+        """Return the lobby of another running function, whose caches are empty."""
         return Lobby(self.platform, Repository(self.platform.documents))
 
     def visit(self, user: str, lobby: Lobby | None = None) -> LobbyState | NoServerYet | Membership:
-        """A request of the participant's page; its reply."""
+        """Send a request of the participant's page; return its reply."""
         asked = (lobby or self.lobby).visit
         return asked(self.project, user, self.groups.get(user), lambda: self.answers.get(user, {}))
 
@@ -79,7 +79,7 @@ class WaitingRoom:
         return self.repository.membership(self.project.id, user)
 
     def session(self, user: str) -> SessionDocument:
-        """The session in which the participant is."""
+        """Return the session in which the participant is."""
         membership = self.membership(user)
         assert membership is not None
         assert membership.session is not None
@@ -88,7 +88,7 @@ class WaitingRoom:
         return found
 
     def together(self, *users: str) -> bool:
-        """Whether these participants, and no others, are in one session, each in a seat of their own."""
+        """Return whether these participants, and no others, are in one session, each in a seat of their own."""
         found = self.session(users[0])
         seats = {member.user_id: member.seat for member in found.members}
         return set(seats) == set(users) and all(
@@ -102,7 +102,7 @@ class WaitingRoom:
         return from_json(found[0], Decisions) if found else Decisions()
 
     def entries(self) -> list[str]:
-        """The names of the entries in the lobby's folder, sorted."""
+        """Return the names of the entries in the lobby's folder, sorted."""
         prefix = folder.folder(self.project.id)
         return [key.removeprefix(prefix) for key in sorted(self.platform.documents.kept) if key.startswith(prefix)]
 
@@ -110,7 +110,7 @@ class WaitingRoom:
         return ids.server_label(self.project.id, user)
 
     def started(self) -> list[str]:
-        """The ids in the start messages so far."""
+        """Return the ids in the start messages so far."""
         return [message["userId"] for topic, message in self.platform.bus.sent if topic is Topic.START]
 
     def stopped(self) -> list[str]:
@@ -137,6 +137,6 @@ class WaitingRoom:
 
 
 def waits(told: LobbyState | NoServerYet | Membership) -> LobbyState:
-    """The reply to a participant who still waits; fails for any other reply."""
+    """Return the reply to a participant who still waits; fails for any other reply."""
     assert isinstance(told, LobbyState), told
     return told

@@ -82,7 +82,7 @@ def test_events_of_other_tasks_are_not_parsed() -> None:
 
 
 def ended(stop_code: str | None = "SpotInterruption", **container: object) -> dict[str, Any]:
-    """The event of a task whose network interface is being taken down."""
+    """Return the event of a task whose network interface is being taken down."""
     detail = {
         "startedBy": "s" + "a" * 20 + "-1",
         "taskArn": "t",

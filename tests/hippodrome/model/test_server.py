@@ -28,7 +28,7 @@ def new_record(user: str = "alice", attempt: int = 1, **project: object) -> Serv
 
 
 def changes(before: Server, after: Server) -> dict[str, object]:
-    """The fields in which two records differ, as the second has them."""
+    """Return the fields in which two records differ, as the second has them."""
     old, new = msgspec.structs.asdict(before), msgspec.structs.asdict(after)
     return {name: new[name] for name in new if new[name] != old[name]}
 

@@ -21,7 +21,7 @@ _ENDS = {")", "]", "}", "++", "--"}
 
 
 def tokens(code: str) -> list[str]:
-    """The tokens, without the spaces between them. A template gives its texts and the tokens of the code in it.
+    """Return the tokens, without the spaces between them. A template gives its texts and the tokens of the code in it.
 
     Left out, because they have no effect: a semicolon at the end of a block, a comma behind the last item of a list.
     Raises ValueError for text that is no token, that would begin a comment of HTML, or that would end the script.
@@ -35,7 +35,7 @@ def tokens(code: str) -> list[str]:
 
 
 def _tokens(code: str, at: int) -> tuple[list[str], int]:
-    """The tokens from `at` up to a closing bracket that was opened before, and its position; or up to the end."""
+    """Return the tokens from `at` to a closing bracket that was opened before, and its position; or to the end."""
     found: list[str] = []
     depth = 0
     while (at := _end(_SPACE, code, at)) < len(code) and (depth or code[at] != "}"):
@@ -58,7 +58,7 @@ def _tokens(code: str, at: int) -> tuple[list[str], int]:
 
 
 def _template(code: str, at: int) -> tuple[list[str], int]:
-    """The template that begins at `at`, and the position of its end."""
+    """Return the template that begins at `at`, and the position of its end."""
     found: list[str] = []
     while True:
         part = _TEMPLATE.match(code, at + 1)

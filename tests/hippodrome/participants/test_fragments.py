@@ -433,7 +433,7 @@ def test_a_page_may_have_two_million_characters() -> None:
 
 
 def work(source: str) -> float:
-    """The processor seconds that preparing a page takes: the smaller of two measurements."""
+    """Return the processor seconds that preparing a page takes: the smaller of two measurements."""
     times = []
     for _ in range(2):
         begun = time.process_time()

@@ -353,7 +353,7 @@ def test_a_participant_whose_server_was_lost_sees_that_another_replaces_it(
 
 
 def program(alice: Browser, form: dict[str, str] | None = None) -> dict[str, Any]:
-    """The answer that HIPPO's front end gets; with `form`, after a click on its button."""
+    """Return the answer that HIPPO's front end gets; with `form`, after a click on its button."""
     sent, method = (None, "GET") if form is None else (json.dumps(form), "POST")
     response = alice.send(method, sent, accept="application/json, text/plain, */*", content_type="application/json")
     found: dict[str, Any] = json.loads(response["body"])

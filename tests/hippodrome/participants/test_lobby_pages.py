@@ -65,7 +65,7 @@ class Player(Browser):
         return dict(json.loads(found[1]))
 
     def poll(self, address: str | None = None) -> dict[str, Any]:
-        """The answer of the page's poll address."""
+        """Return the answer of the page's poll address."""
         query = urlsplit(address or self.data["poll"]).query
         answer = next_step.handler(http_event("GET", query, None, headers={"accept": "application/json"}), None)
         return {"status": answer["statusCode"], **json.loads(answer["body"])}

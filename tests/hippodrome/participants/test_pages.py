@@ -532,13 +532,16 @@ def test_the_game_page_hands_the_necessary_data_to_its_script() -> None:
 
 
 def code(text: str) -> str:
-    """The lines of a script or style that are neither empty nor comments."""
+    """Return the lines of a script or style that are neither empty nor comments."""
     lines = map(str.strip, re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
     return "".join(f"{line}\n" for line in lines if line and not line.startswith("//"))
 
 
 def texts(script: str) -> list[str]:
-    """The texts in a script; of templates, the parts that are no code. No regular expression in the scripts has quotes."""
+    """Return the texts in a script; of templates, the parts that are no code.
+
+    No regular expression in the scripts has quotes.
+    """
     found: list[str] = []
     within = ["{"]  # what is open: the quote of a text, a template or a bracket
     at = 0

@@ -41,7 +41,7 @@ def with_pages(project: Project, **pages: str) -> FakePlatform:
 
 
 def game_page(platform: FakePlatform) -> str:
-    """The page that alice gets at the game step, whatever its status."""
+    """Return the page that alice gets at the game step, whatever its status."""
     alice = Browser(platform)
     alice.answer(alice.get(), consent="yes")
     alice.answer(alice.get(), age="33")

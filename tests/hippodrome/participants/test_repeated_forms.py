@@ -30,7 +30,7 @@ WINDOW = REPEAT_WINDOW.total_seconds()
 
 
 def pages_only() -> Project:
-    """A study of four pages and a final one, where each step may be answered with the same form."""
+    """Return a study of four pages and a final one, where each step may be answered with the same form."""
     return study(steps=[Step(key, "survey") for key in PAGES[:-1]] + [Step("finalStep", "debrief")], events=Events())
 
 
@@ -54,14 +54,14 @@ class Fields(HTMLParser):
 
 
 def hippos_form(page: str) -> dict[str, str]:
-    """What HIPPO's front end posts of a page: every named element but buttons."""
+    """Return what HIPPO's front end posts of a page: every named element but buttons."""
     fields = Fields()
     fields.feed(page)
     return fields.values
 
 
 def answered(platform: FakePlatform, user: str = "alice") -> dict[str, Any]:
-    """The stored answers, by step."""
+    """Return the stored answers, by step."""
     folder = f"maze/users/{user}/answers/"
     found = {key: body for key, (body, *_) in platform.documents.kept.items() if key.startswith(folder)}
     return {key.removeprefix(folder).removesuffix(".json"): json.loads(found[key])["answers"] for key in sorted(found)}

@@ -21,7 +21,7 @@ NOT_CODE = re.compile(r"""^\s*//.*|\s// .*|"(?:[^"\\\n]|\\.)*"|(?<=\.)\w+|\b\w+(
 
 
 def declared(module: Path, *, exported: bool = False) -> list[str]:
-    """The top-level names of a module, `const KEY = 0, DIFFERENCE = 1` included."""
+    """Return the top-level names of a module, `const KEY = 0, DIFFERENCE = 1` included."""
     found = []
     for match in DECLARED.finditer(module.read_text()):
         if match["export"] or not exported:
@@ -30,17 +30,17 @@ def declared(module: Path, *, exported: bool = False) -> list[str]:
 
 
 def imported(module: Path) -> dict[str, list[str]]:
-    """The names that a module imports, by the module they come from."""
+    """Return the names that a module imports, by the module they come from."""
     return {name: re.findall(r"\w+", names) for names, name in IMPORT.findall(module.read_text())}
 
 
 def words(module: Path) -> set[str]:
-    """The names that the module's code mentions."""
+    """Return the names that the module's code mentions."""
     return set(re.findall(r"[A-Za-z_]\w*", NOT_CODE.sub(" ", IMPORT.sub("", module.read_text()))))
 
 
 def local(module: Path) -> set[str]:
-    """The names that a module declares inside its functions: variables and parameters, also unpacked ones."""
+    """Return the names that a module declares inside its functions: variables and parameters, also unpacked ones."""
     text = module.read_text()
     found = re.findall(r"\b(?:const|let) (\w+|[\[{][^\]}]*[\]}])", text) + re.findall(
         r"\(([\w, {}=]*)\)(?: =>| \{)", text
@@ -89,7 +89,7 @@ def test_additional_modules_come_before_the_script_and_behind_their_imports(tmp_
 
 
 def code_of(module: Path) -> str:
-    """The last function of a module, or its last constant, as it stands in the script."""
+    """Return the last function of a module, or its last constant, as it stands in the script."""
     match = list(DECLARED.finditer(module.read_text()))[-1]
     return match[0].removeprefix("export ")
 
@@ -138,7 +138,7 @@ def test_a_page_has_its_script_without_comments_spaces_and_line_ends_and_with_un
 
 
 def shortened_tokens(source: str) -> list[str]:
-    """The tokens of a script in the shortened form in which a page has it."""
+    """Return the tokens of a script in the shortened form in which a page has it."""
     return tokens(frame._plain("a.js", source))
 
 

@@ -12,7 +12,7 @@ from testing.servers import Servers
 
 
 def events(platform: FakePlatform, status: str, **changes: object) -> list[TaskChanged]:
-    """The event of this status for each task that runs."""
+    """Return the event of this status for each task that runs."""
     given = {"interface": "eni-1", "stop_code": None, "stopped_reason": "", "exit_code": None, **changes}
     return [
         TaskChanged(task=task, cluster=request.cluster, name=request.name, status=status, **given)  # type: ignore[arg-type]

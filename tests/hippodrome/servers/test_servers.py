@@ -32,7 +32,7 @@ def servers(platform: FakePlatform) -> Servers:
 
 
 def token(platform: FakePlatform) -> str:
-    """The token that the page gets."""
+    """Return the token that the page gets."""
     return SecretCache(platform.documents).token(record(platform))
 
 
@@ -493,7 +493,7 @@ def test_a_trial_that_ended_by_itself_is_closed_at_its_first_event(platform: Fak
 
 
 def own(platform: FakePlatform, status: str, code: str = "SpotInterruption") -> TaskChanged:
-    """An event of a task in a cluster of its participant's own. Only STOPPED takes it out of there."""
+    """Return an event of a task in a cluster of its participant's own. Only STOPPED takes it out of there."""
     told = event(platform, status, stop_code=code)
     if status == "STOPPED":
         platform.tasks.running.pop(told.task, None)

@@ -636,7 +636,7 @@ def register_as_well(platform: FakePlatform, project: Project) -> None:
 
 
 def task(platform: FakePlatform) -> tuple[str, str | None, int]:
-    """What the only task runs: the game of its trial, its task definition, and its port."""
+    """Return what the only task runs: the game of its trial, its task definition, and its port."""
     (request,) = platform.tasks.running.values()
     return json.loads(request.environment["TRIAL"])["game"], request.definition, request.port
 

@@ -57,7 +57,7 @@ class World(FakePlatform):
         self.secrets.get_or_create()
 
     def claim(self, user: str = ALICE, attempt: int = 1, project: Project | None = None, **change: Any) -> Server:
-        """The record of a server that has just been started."""
+        """Return the record of a server that has just been started."""
         made = server.new_attempt(
             project or study(id=PROJECT), user, attempt,
             token="the-token", nonce=f"nonce-{user}-{attempt}", settings=self.settings, now=self.now(),

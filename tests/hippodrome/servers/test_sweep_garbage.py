@@ -34,7 +34,7 @@ def platform() -> FakePlatform:
 
 
 def calls(platform: FakePlatform) -> Counter[str]:
-    """The calls to the documents that a sweep makes."""
+    """Return the calls to the documents that a sweep makes."""
     platform.documents.calls.clear()
     assert sweep.handler({}, None)["failed"] == 0
     return Counter(platform.documents.calls)

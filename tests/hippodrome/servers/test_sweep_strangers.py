@@ -190,7 +190,7 @@ class Place(MotoWorld):
     # Ours
 
     def claimed(self, attempt: int = 1, ago: timedelta = timedelta(minutes=1), own_cluster: bool = False) -> Server:
-        """A new record of one of our servers."""
+        """Return a new record of one of our servers."""
         project = msgspec.structs.replace(STUDY, cluster="participant" if own_cluster else "shared")
         now = datetime.now(UTC) - ago
         user = f"R_{self.number}"
@@ -278,7 +278,7 @@ class Place(MotoWorld):
     # Resources of others
 
     def similar_name(self) -> str:
-        """A name like that of a server, without a record in our bucket: it is another installation's."""
+        """Return a name like that of a server, without a record in our bucket: it is another installation's."""
         return ids.server_name(ids.server_label("somebody-elses", f"P{self.number}"), 1)
 
     def their_site(self) -> None:

@@ -20,7 +20,7 @@ LABEL = ids.server_label("maze", "alice")
 
 
 def started(project: Project, user: str = "alice") -> tuple[FakePlatform, TaskRequest, Server]:
-    """A platform with one server, the request to ECS for it, and its record."""
+    """Return a platform with one server, the request to ECS for it, and its record."""
     platform = installed(project)
     Servers(platform).start(StartServer("maze", user))
     (request,) = platform.tasks.running.values()
@@ -67,7 +67,7 @@ OWN = ["SSL/servers.example.org/fullchain.pem", "SSL/servers.example.org/privkey
 
 
 def certificate_of(request: TaskRequest) -> list[str]:
-    """The keys of the certificate that the request tells the server to fetch."""
+    """Return the keys of the certificate that the request tells the server to fetch."""
     return [request.environment[f"SSL_{name}"] for name in ("FULLCHAIN", "PRIVKEY")]
 
 

@@ -58,7 +58,7 @@ def document(platform: FakePlatform, key: str) -> Any:
 
 
 def secret(platform: FakePlatform, project_id: str = "maze") -> str:
-    """The secret that signs the project's tickets and links, as a new function reads it."""
+    """Return the secret that signs the project's tickets and links, as a new function reads it."""
     project = ProjectCache(platform, SecretCache(platform.documents)).project(project_id)
     assert project
     return project.secret
@@ -162,7 +162,7 @@ def test_a_function_reads_the_secret_once(platform: FakePlatform) -> None:
 
 
 def reads_of_secret(platform: FakePlatform) -> list[str]:
-    """A list to which each read of the secret from now on is added."""
+    """Return a list to which each read of the secret from now on is added."""
     reads: list[str] = []
     get = platform.documents.get
 

@@ -65,13 +65,13 @@ def put(value: Any, path: str, new: Any) -> None:
 
 
 def first(template: Template, kind: str) -> dict[str, Any]:
-    """The properties of the template's first resource of a type."""
+    """Return the properties of the template's first resource of a type."""
     found: dict[str, Any] = next(one for one in template["Resources"].values() if one["Type"] == kind)["Properties"]
     return found
 
 
 def setting(kind: str, path: str, new: Any) -> Spoil:
-    """A function that breaks a template by one value."""
+    """Return a function that breaks a template by one value."""
     return lambda template: put(first(template, kind), path, new)
 
 
@@ -117,7 +117,7 @@ def _texts(there: Installation, kind: str, path: str) -> Iterator[tuple[str, str
 
 
 def number(kind: str, path: str, source: str, least: float, most: float) -> Rule:
-    """A number in a range."""
+    """Return a number in a range."""
     return Rule(
         kind,
         path,
@@ -151,7 +151,7 @@ def each(
     wrong: Callable[[Resource, Installation], Iterable[str]],
     spoil: Spoil,
 ) -> Rule:
-    """A rule for each resource of a type by itself; `wrong` says what is wrong with one."""
+    """Return a rule for each resource of a type by itself; `wrong` says what is wrong with one."""
     return Rule(
         kind,
         path,

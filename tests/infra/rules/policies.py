@@ -71,7 +71,7 @@ def _names_of_policies(one: Resource, there: Installation) -> Iterator[str]:
 
 
 def _comes(service: str, there: Installation) -> str:
-    """The `aws:SourceArn` with which a service asks for a role; "" where it sends none."""
+    """Return the `aws:SourceArn` with which a service asks for a role; "" where it sends none."""
     place = f"{there.account.region}:{there.account.id}"
     (group,) = there.of("AWS::Scheduler::ScheduleGroup")
     (builder,) = there.of("AWS::CodeBuild::Project")

@@ -49,7 +49,7 @@ REPLACED = {  # what a change of a parameter replaces: of the new one and the ol
 
 
 def name_of(one: Resource) -> str | None:
-    """The name that the template gives a resource, if it gives it any."""
+    """Return the name that the template gives a resource, if it gives it any."""
     return next((str(found) for _, found in values(one.properties, NAMES.get(one.kind, "-"))), None)
 
 

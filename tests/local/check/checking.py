@@ -33,17 +33,17 @@ def agent(folder: Path, old: str, new: str) -> None:
 
 
 def looked(folder: Path) -> list[str]:
-    """The findings without a try of the agent."""
+    """Return the findings without a try of the agent."""
     return [str(problem) for problem in check_project(folder, read_project(folder))]
 
 
 def tried(folder: Path, seconds: float = 60) -> list[str]:
-    """The findings of a try of the agent."""
+    """Return the findings of a try of the agent."""
     return [str(problem) for problem in agent_check.try_agent(folder, read_project(folder), seconds)]
 
 
 def run(folder: Path) -> tuple[int, list[str]]:
-    """The exit status and the lines of the command."""
+    """Return the exit status and the lines of the command."""
     said = folder.parent / "said.log"
     with said.open("w") as errors:
         done = preloaded.start(

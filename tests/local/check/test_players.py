@@ -70,7 +70,7 @@ def folder(tmp_path: Path) -> Path:
 def tried(
     folder: Path, plays: str, old: str = "", new: str = "", said: list[str] | None = None, seconds: float = 60
 ) -> list[str]:
-    """What is said of the study in which `plays` plays the right player, with a text of the `trial` section replaced."""
+    """Return what is said of the study in which `plays` plays the right player, with a text of `trial` replaced."""
     file = folder / "config.yml"
     project = file.read_text().partition("\ntrial:")[0]
     assert old in TRIAL

@@ -54,7 +54,7 @@ def test_gymnasium_names_its_packages_itself() -> None:
 
 
 def raised(code: str) -> tuple[str, str]:
-    """The name and the text of the error that the code raises where `import gym` finds the stand-in."""
+    """Return the name and the text of the error that the code raises where `import gym` finds the stand-in."""
     program = f"try:\n    {code}\nexcept Exception as error:\n    print(type(error).__name__, error, sep='\\n')"
     source = f"import sys; sys.path.append({str(OLD_GYM)!r})\n{program}"
     done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)

@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def configured(folder: Path, project: str = "", trial: str = "") -> Path:
-    """The study with more lines in the sections of its config.yml."""
+    """Return the study with more lines in the sections of its config.yml."""
     file = folder / "config.yml"
     before = file.read_text().partition("\ntrial:")[0].replace("  players: 2\n", "")
     file.write_text(before.replace("project:\n", f"project:\n  players: 2\n{project}") + TRIAL + trial)

@@ -34,7 +34,7 @@ MARKS = [(spans.COMMENT, "<!--"), (spans.SCRIPT, "<script"), (spans.SCRIPT, "<sc
 
 
 def seconds(act: Callable[[], object]) -> float:
-    """The processor's time that it takes, the least of three times."""
+    """Return the processor's time that it takes, the least of three times."""
     times = []
     for _ in range(3):
         begun = time.process_time()

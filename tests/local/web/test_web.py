@@ -361,7 +361,7 @@ def raw(site: Site) -> socket.socket:
 
 
 def ends(connection: socket.socket) -> bool:
-    """Whether the server closes the connection within twenty seconds."""
+    """Return whether the server closes the connection within twenty seconds."""
     try:
         while connection.recv(65536):
             pass

@@ -24,7 +24,7 @@ FACTS = TrialFacts("trial-1", "3", 1)
 
 
 def callbacks_of(agent, seconds=5.0, facts=FACTS, **more):
-    """The callbacks of an agent, and the list of those that raised, with their errors."""
+    """Return the callbacks of an agent, and the list of those that raised, with their errors."""
     raised = []
     callbacks = Callbacks(
         listening(agent),

@@ -85,7 +85,7 @@ def test_the_functions_that_the_docs_show_do_what_they_say(code: str, chosen: li
 async def stored_answer(
     tmp_path: Path, function: Callable[..., Any], seconds: float = 20, question: bytes | None = None
 ) -> Any:
-    """The answer that a server without members stores; None if it stores none within `seconds`."""
+    """Return the answer that a server without members stores; None if it stores none within `seconds`."""
     store = FolderStore(tmp_path)
     store.create(waiting_key("maze"), question if question is not None else json.dumps(QUESTION).encode())
 

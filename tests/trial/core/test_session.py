@@ -642,7 +642,7 @@ def test_a_long_round_trip_during_the_game_changes_nothing():
 
 
 def recorded_of(driver, *, ended=True):
-    """The trial that the next server reads from this one's lines; the agent's own lines are made up."""
+    """Return the trial that the next server reads from this one's lines; the agent's own lines are made up."""
     lines = [{"kind": "reset", "episode": 1, "seed": 7}]
     part = {"action": 0, "reward": 1.0}
     for number in range(1, driver.steps + 1):

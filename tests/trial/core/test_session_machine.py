@@ -62,7 +62,7 @@ class Machine(RuleBasedStateMachine):
         return self.driver.trial.progress.over
 
     def missing(self) -> list[int]:
-        """The members for whom the others wait now."""
+        """Return the members for whom the others wait now."""
         if self.over or not self.here:
             return []
         return [number for number in self.missed if number not in self.here and number not in self.replaced]

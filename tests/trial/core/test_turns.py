@@ -349,7 +349,7 @@ def test_the_next_server_goes_on_with_a_policys_last_action() -> None:
 
 
 def resumed_game(*its: RecordedAction) -> Game:
-    """A game that goes on after these actions of the policy on an earlier server; the human's actions were idle."""
+    """Return a game that goes on after these actions of the policy on an earlier server; the human's were idle."""
     game = Game()
     steps = [RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0, None, "none"), "it": it}) for it in its]
     recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))

@@ -48,7 +48,7 @@ def _raise(error: BaseException) -> Any:
 
 
 def nested(levels: int) -> Any:
-    """A list in a list in a list."""
+    """Return a list in a list in a list."""
     found: list[Any] = []
     for _ in range(levels):
         found = [found]

@@ -31,7 +31,7 @@ class RawConnection:
             self.socket.sendall(piece)
 
     def hear(self) -> Frame:
-        """The next frame, also a close frame; EOFError at the end of the connection."""
+        """Return the next frame, also a close frame; EOFError at the end of the connection."""
         while not (events := self.protocol.events_received()):
             data = self.socket.recv(65536)
             if not data:

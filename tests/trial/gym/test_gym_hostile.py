@@ -33,13 +33,13 @@ def nothing_stays_behind(server: GymServerProcess) -> Iterator[None]:
 
 
 def patient_server() -> contextlib.AbstractContextManager[GymServerProcess]:
-    """A server of its own, which gives environments ten minutes for each call."""
+    """Return a server of its own, which gives environments ten minutes for each call."""
     odd = ("--import", "odd_environments", "--seconds", "600")
     return gym_server(*odd, env={"PYTHONPATH": str(Path(__file__).parent)})
 
 
 def descendants(server: GymServerProcess) -> list[psutil.Process]:
-    """The processes below the server's."""
+    """Return the processes below the server's."""
     return psutil.Process(server.pid).children(recursive=True)
 
 
@@ -51,7 +51,7 @@ def first_step(client: TextClient, env_id: str, **action: Any) -> Any:
 
 
 def kind_and_sentence(said: Any) -> tuple[str, str]:
-    """The kind and the sentence of an error."""
+    """Return the kind and the sentence of an error."""
     return said["error"]["type"], said["error"]["message"]
 
 
@@ -202,7 +202,7 @@ def test_the_close_says_how_an_environments_process_ended(asking: TextClient, en
 
 
 def closed_within(client: TextClient) -> str:
-    """The reason with which the server closes the connection."""
+    """Return the reason with which the server closes the connection."""
     with pytest.raises(ConnectionClosed) as found:
         client.websocket.recv(WITHIN)
     assert found.value.rcvd is not None

@@ -11,7 +11,7 @@ SHOW = "; import sys; print(*sorted(sys.modules))"
 
 
 def imported(program: str) -> set[str]:
-    """The modules that a new Python has after this program."""
+    """Return the modules that a new Python has after this program."""
     command = [sys.executable, "-c", program + SHOW]
     return set(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
 

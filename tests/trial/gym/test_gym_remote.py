@@ -43,7 +43,7 @@ def url() -> Iterator[str]:
 
 
 def comparable(result: Any) -> Any:
-    """A result of Gymnasium's as RemoteEnv has it: rewards are floats, and a number of a Discrete numpy's."""
+    """Return a result of Gymnasium's as RemoteEnv has it: rewards are floats, and a number of a Discrete numpy's."""
     observation, reward, *rest = result
     return _numpy(observation), float(reward), *rest
 
@@ -449,7 +449,7 @@ def test_a_token_is_sent_and_is_not_shown(url: str) -> None:
 
 
 def sockets() -> set[str]:
-    """The open sockets of this process by their inodes. Those of earlier tests may be closed at any time."""
+    """Return the open sockets of this process by their inodes. Those of earlier tests may be closed at any time."""
     found = set()
     for fd in os.listdir("/proc/self/fd"):
         with contextlib.suppress(FileNotFoundError):  # closed meanwhile

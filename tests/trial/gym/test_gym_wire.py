@@ -63,7 +63,7 @@ class Wire:
         return data
 
     def frame(self) -> tuple[int, bytes]:
-        """The next frame that the server sends: its opcode and its payload; it must be whole and unmasked."""
+        """Return the next frame that the server sends: its opcode and its payload; it must be whole and unmasked."""
         first, length = self.exactly(2)
         assert first & 0xF0 == 0x80
         assert length < 0x80
@@ -79,7 +79,7 @@ class Wire:
         return json.loads(payload)
 
     def closed(self) -> int:
-        """The code with which the server closes; assert that nothing follows."""
+        """Return the code with which the server closes; assert that nothing follows."""
         opcode, payload = self.frame()
         assert opcode == CLOSE, (opcode, payload)
         with contextlib.suppress(OSError):
@@ -92,7 +92,7 @@ class Wire:
 def frame(
     opcode: int, payload: bytes = b"", *, fin: bool = True, bits: int = 0, mask: bool = True, size: int = 0
 ) -> bytes:
-    """A client's frame; `size` 2 or 8 writes the length in so many bytes, whether needed or not."""
+    """Return a client's frame; `size` 2 or 8 writes the length in so many bytes, whether needed or not."""
     first = (0x80 if fin else 0) | bits << 4 | opcode
     length = len(payload)
     size = size or (0 if length < 126 else 2 if length < 2**16 else 8)

@@ -133,7 +133,7 @@ PEOPLE = TOGETHER.replace('"brains/two.txt"', "configuration_constants.PolicyTyp
 
 
 def environment() -> dict[str, str]:
-    """The variables of a process that finds `trial`."""
+    """Return the variables of a process that finds `trial`."""
     return {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

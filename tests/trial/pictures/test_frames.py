@@ -120,7 +120,7 @@ def scrolling(count: int, height: int = 120, width: int = 200) -> list[Frame]:
 
 
 def with_figure(background: Frame, number: int) -> Frame:
-    """A small square that walks over a picture."""
+    """Return a small square that walks over a picture."""
     frame = background.copy()
     at = 4 * number % (background.shape[1] - 10)
     frame[10:20, at : at + 10] = 255
@@ -128,7 +128,7 @@ def with_figure(background: Frame, number: int) -> Frame:
 
 
 def hippos_picture(frame: Frame) -> Frame:
-    """The picture that HIPPO's browsers would show."""
+    """Return the picture that HIPPO's browsers would show."""
     data = base64.b64decode(json.loads(jpeg_message(frame, 0))["frame"])
     return np.asarray(Image.open(io.BytesIO(data))).reshape(frame.shape)
 
@@ -322,7 +322,7 @@ class SentMessages:
 
 
 def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[int], Frame]:
-    """The kinds of frames that a scrolling texture is sent as, and what is shown once it has stopped."""
+    """Return the kinds of frames that a scrolling texture is sent as, and what is shown once it has stopped."""
     sequence = scrolling(10)
 
     async def talk(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
@@ -392,7 +392,7 @@ class Agent:
 
 
 def textured(seen: Any) -> Any:
-    """The agent's picture of the step that the first pixel of this one names."""
+    """Return the agent's picture of the step that the first pixel of this one names."""
     step = 256 * int(seen[0, 0, 0]) + int(seen[0, 0, 1])
     noise = np.random.default_rng(7).integers(0, 256, (100, 400, 3), np.uint8).repeat(2, 0).repeat(2, 1)
     picture = np.roll(noise, 3 * step, axis=1)[:, :300].copy()

@@ -18,7 +18,7 @@ BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "colo
 
 
 def problem(**fields: Any) -> str:
-    """The one sentence about a scene whose only object is a ball with other fields; the ball is not drawn."""
+    """Return the one sentence about a scene whose only object is a ball with other fields; the ball is not drawn."""
     scene = as_scene([BALL | fields])
     assert not scene.objects
     (sentence,) = scene.problems
@@ -237,7 +237,7 @@ class Raises:
 
 
 def endless_list() -> list[Any]:
-    """A list in a list in a list …"""
+    """Return a list in a list in a list …"""
     inner: list[Any] = []
     for _ in range(100_000):
         inner = [inner]

@@ -44,7 +44,7 @@ def adapter(tmp_path: Path) -> JointAdapter:
 
 
 def views(adapter: JointAdapter) -> dict[str, set[str]]:
-    """The ids of the objects in each player's view."""
+    """Return the ids of the objects in each player's view."""
     pictures = adapter.pictures()
     assert isinstance(pictures, Mapping)
     found = {}

@@ -259,7 +259,7 @@ def test_a_value_that_has_no_text_or_raises_does_not_end_the_game(value, kept):
 
 
 def tree(children):
-    """A search tree as researchers write it: each node has its parent and its children."""
+    """Return a search tree as researchers write it: each node has its parent and its children."""
     root: dict[str, object] = {"parent": None}
     root["children"] = [{"parent": root, "children": [], "n": number} for number in range(children)]
     return root

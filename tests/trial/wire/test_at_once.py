@@ -131,7 +131,7 @@ async def test_an_acknowledgement_that_comes_alone_needs_no_parser(monkeypatch: 
 
 
 def text(said: str, *, opcode: Opcode = Opcode.TEXT, last: bool = True) -> bytes:
-    """A message of a client, or a part of one, as it comes from the network."""
+    """Return a message of a client, or a part of one, as it comes from the network."""
     return RawFrame(opcode, said.encode(), fin=last).serialize(mask=True)
 
 

@@ -62,7 +62,7 @@ def cold_start_and_a_warm_server() -> FakePlatform:
 
 
 def plays_on_what_the_record_says(platform: FakePlatform) -> bool:
-    """Whether the address that the page gets leads to a server that accepts the token that the page gets."""
+    """Return whether the address that the page gets leads to a server that accepts the token that the page gets."""
     mine = record(platform)
     request = platform.tasks.running.get(mine.task or "")
     named = platform.dns.records.get(mine.dns) == mine.host

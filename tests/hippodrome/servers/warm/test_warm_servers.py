@@ -52,7 +52,7 @@ def deliver(platform: FakePlatform) -> None:
 
 
 def warmed(number: int = 2, **changes: object) -> FakePlatform:
-    """An installation with so many warm servers that are ready."""
+    """Return an installation with so many warm servers that are ready."""
     platform = installed(warm(number, **changes))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
     deliver(platform)
@@ -65,7 +65,7 @@ def pool(platform: FakePlatform) -> Pool:
 
 
 def token(platform: FakePlatform, server: Server) -> str:
-    """The token that the page of this server's participant gets."""
+    """Return the token that the page of this server's participant gets."""
     return SecretCache(platform.documents).token(server)
 
 
