@@ -4,10 +4,13 @@ Faults are injected *below* `local/`, in the functions of Python's library that 
 identified by its operation and its kind of file (`OsCall`) and by its number among those: threads make calls in an
 order that changes from run to run, but the n-th call of one kind is nearly always the same.
 
-* `OsReach.ONCE`: this call fails. * `OsReach.SPELL`: this call fails, and for `SPELL_SECONDS` each call that can fail
-with the same errno, as on a full disk. * `OsReach.EVER`: the data folder and the state folder are on different file
-systems, so no hard link can be made between them. * `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill
--9`) just before the call, or just after it. None of its threads makes another call.
+* `OsReach.ONCE`: this call fails.
+* `OsReach.SPELL`: this call fails, and for `SPELL_SECONDS` each call that can fail with the same errno, as on a full
+  disk.
+* `OsReach.EVER`: the data folder and the state folder are on different file systems, so no hard link can be made
+  between them.
+* `OsReach.BEFORE`, `OsReach.AFTER`: the process is killed (`kill -9`) just before the call, or just after it. None of
+  its threads makes another call.
 """
 
 from __future__ import annotations

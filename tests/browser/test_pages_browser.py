@@ -106,7 +106,7 @@ class World:
         return [each[name] for each in list(self.received) if name in each]
 
     def player_commands(self) -> list[str]:
-        """Return the participant's commands, without `requestUI`, which a page sends by itself when it receives nothing."""
+        """Return the participant's commands, without `requestUI`, which a page sends by itself when it hears nothing."""
         return [command for command in self.commands("command") if command != "requestUI"]
 
     def wait_for(self, message: dict[str, Any]) -> None:

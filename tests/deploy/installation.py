@@ -91,7 +91,6 @@ class Installed(MotoWorld):
     def _secure_bucket(self) -> None:
         """Give the bucket the settings of the template, without the policy.
 
-
         Gap: moto ignores the conditions of a bucket policy, so the policy that requires TLS would refuse every request.
         """
         s3, bucket = self.client("s3"), self.env["BUCKET"]

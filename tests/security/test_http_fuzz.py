@@ -227,7 +227,7 @@ STUDIES = st.sampled_from([{}, {}, LIMITS, {"signed_links": True}, {"signed_link
 
 
 def _world(**changes: Any) -> FakePlatform:
-    """Return a platform with the study, a participant with a running server, and one whom the attacker does not know."""
+    """Return a platform with the study, a participant with a running server, and one unknown to the attacker."""
     platform = hostile.installed(**changes)
     for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
         arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())
