@@ -36,10 +36,11 @@ class Backend(Protocol):
     platform: Platform
 
     def request(self, name: str, **changes: Any) -> TaskRequest:
-        """A server that this backend can run; in the installation's cluster unless `changes` say otherwise."""
+        """Return the request for a server; in the installation's cluster unless `changes` say otherwise."""
+        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
-        """Let the task reach RUNNING; the id of its network interface, as in the task's event."""
+        """Let the task reach RUNNING; return the id of its network interface, as in the task's event."""
 
     def fire(self, name: str) -> None:
         """Let the timer fire now."""
@@ -48,15 +49,12 @@ class Backend(Protocol):
         """Take the messages that the function behind "start", "stop" or "task" would get; delayed messages come at once."""
 
 
-class MotoBackend:
+class MotoBackend(Backend):
     """`hippodrome.aws` on moto; `testing/moto_world.py` adds, and notes, what moto lacks."""
 
     def __init__(self, world: MotoWorld) -> None:
         self.world = world
         self.platform: Platform = world.platform
-
-    def request(self, name: str, **changes: Any) -> TaskRequest:
-        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
         details = self.world.task_event(task, "RUNNING")["detail"]["attachments"][0]["details"]
@@ -70,15 +68,12 @@ class MotoBackend:
         return [json.loads(record["body"]) for record in self.world.receive(queue)["Records"]]
 
 
-class LocalBackend:
+class LocalBackend(Backend):
     """`local`: files and processes. Its queues and timers are not started, so that only a test takes from them."""
 
     def __init__(self, platform: LocalPlatform) -> None:
         self.local = platform
         self.platform: Platform = platform
-
-    def request(self, name: str, **changes: Any) -> TaskRequest:
-        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
         until = time.monotonic() + 30
@@ -98,15 +93,12 @@ class LocalBackend:
         return self.local.bus.take(queue)
 
 
-class MemoryBackend:
+class MemoryBackend(Backend):
     """The fake platform of the services' tests: they prove something only if it keeps the contract."""
 
     def __init__(self) -> None:
         self.fake = FakePlatform()
         self.platform: Platform = self.fake
-
-    def request(self, name: str, **changes: Any) -> TaskRequest:
-        return replace(_REQUEST, name=name, **changes)
 
     def interface(self, task: str) -> str:
         return "eni-" + task[-17:]
@@ -126,12 +118,6 @@ class MemoryBackend:
 
 
 @contextmanager
-def moto_backend() -> Iterator[Backend]:
-    with MotoWorld() as world:
-        yield MotoBackend(world)
-
-
-@contextmanager
 def local_backend(folder: Path) -> Iterator[Backend]:
     state = folder / "state"
     command = (sys.executable, str(Path(__file__).parent / "stub_server.py"))
@@ -141,8 +127,3 @@ def local_backend(folder: Path) -> Iterator[Backend]:
     finally:
         platform.tasks.close()
         end_everything(state)
-
-
-@contextmanager
-def memory_backend() -> Iterator[Backend]:
-    yield MemoryBackend()

@@ -8,21 +8,21 @@ from pathlib import Path
 import pytest
 
 from hippodrome.ports import Platform
-from tests.contract.backends import Backend, local_backend, memory_backend, moto_backend
+from testing.moto_world import MotoWorld
+from tests.contract.backends import Backend, MemoryBackend, MotoBackend, local_backend
 
 
 @pytest.fixture(params=["aws", "local", "memory"])
 def backend(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Backend]:
     """A new installation."""
     if request.param == "aws":
-        with moto_backend() as made:
-            yield made
-    elif request.param == "memory":
-        with memory_backend() as made:
-            yield made
-    else:
+        with MotoWorld() as world:
+            yield MotoBackend(world)
+    elif request.param == "local":
         with local_backend(tmp_path) as made:
             yield made
+    else:
+        yield MemoryBackend()
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import contextlib
 import http.client
 import json
 import os
-import re
 import signal
 import sys
 import time
@@ -33,6 +32,7 @@ from local.backend.processes import end_everything, marked
 from local.publish import publish
 from testing import aws_events, derived
 from testing.os_faults import Killed, OsFault, OsFaultInjector
+from testing.visitors import hidden
 from tests.local.conftest import write_study
 
 QUICK = (sys.executable, "-I", "-S", str(Path(__file__).with_name("quick_trial.py")))
@@ -162,8 +162,7 @@ class FaultyStudy:
 
     def answer(self, step: str, word: str) -> None:
         page = str(self.ask("GET", accept="text/html")["body"])
-        hidden = dict(re.findall(r'<input[^>]*type="?hidden"?[^>]*name="?([\w-]+)"?[^>]*value="?([^">]*)', page))
-        sent = self.ask("POST", {**hidden, "word": word}, "text/html")
+        sent = self.ask("POST", {**hidden(page), "word": word}, "text/html")
         assert sent["statusCode"] == 303, sent
         self.promised[step] = word
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +11,8 @@ from typing import Any
 import httpx
 from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import ClientConnection, connect
+
+from testing.visitors import hidden
 
 
 class Walker:
@@ -35,9 +36,7 @@ class Walker:
 
     def answer(self, **answers: str) -> None:
         """Fill in the page that is shown."""
-        page = self.page()
-        hidden = dict(re.findall(r'<input[^>]*type="?hidden"?[^>]*name="?([\w-]+)"?[^>]*value="?([^">]*)', page))
-        sent = self.http.post(self.link, data={**hidden, **answers}, headers={"accept": "text/html"})
+        sent = self.http.post(self.link, data={**hidden(self.page()), **answers}, headers={"accept": "text/html"})
         assert sent.status_code == 303, sent.text
 
     def until(self, wanted: str, seconds: float = 40, *, attempt: int | None = None) -> dict[str, Any]:
