@@ -91,6 +91,13 @@ def matched(platform: FakePlatform, *players: Player) -> list[dict[str, Any]]:
     return told
 
 
+def matched_pair(platform: FakePlatform) -> tuple[Player, Player]:
+    """Return ann and bob, who have come to the game and are in a session."""
+    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
+    matched(platform, ann, bob)
+    return ann, bob
+
+
 def serve(platform: FakePlatform) -> str:
     """Start the server of the one session, up to ready. Its token."""
     [sid] = {m["userId"] for topic, m in platform.bus.sent if topic is Topic.START and m["userId"].startswith("s.")}
@@ -123,8 +130,7 @@ def test_the_lobby_shows_how_many_are_there_and_what_happens_when_patience_ends(
 
 
 def test_a_pair_gets_one_server_and_each_a_token_of_their_own(platform: FakePlatform) -> None:
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, bob = matched_pair(platform)
     token = serve(platform)
     told = {player.user: player.poll() for player in (ann, bob)}
     assert {one["url"] for one in told.values()} == {told["ann"]["url"]}
@@ -170,8 +176,7 @@ def test_opening_the_link_at_the_end_of_patience_shows_the_next_step_at_once(pla
 
 def test_members_of_a_session_are_not_unmatched(platform: FakePlatform) -> None:
     platform.documents.put(step_key("maze", "survey"), b"{{ participant.unmatched }} {{ participant.members }}")
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, _ = matched_pair(platform)
     platform.documents.put("maze/users/ann/answers/3.json", b'{"answers": {}}')
     assert "False 2" in ann.get()
 
@@ -235,8 +240,7 @@ def test_a_signed_link_is_needed_where_links_are_signed() -> None:
 
 
 def test_a_form_for_another_server_asks_for_the_sessions_next_server(platform: FakePlatform) -> None:
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, _ = matched_pair(platform)
     serve(platform)
     membership = Repository(platform.documents).membership("maze", "ann")
     assert membership
@@ -273,8 +277,7 @@ def test_members_whose_game_ends_after_the_study_is_closed_get_the_same_answer_a
     platform: FakePlatform, project: Project
 ) -> None:
     """When the study is open again, they go on where they were: docs/config.md, "closing"."""
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, bob = matched_pair(platform)
     addresses = [player.data["poll"] for player in (ann, bob)]
     register(platform, project, live=False)
     for user in ("ann", "bob"):
@@ -324,8 +327,7 @@ def register_three(platform: FakePlatform) -> None:
 
 def test_the_page_of_a_pair_stays_that_of_a_pair_when_another_number_is_registered(platform: FakePlatform) -> None:
     """Both before and after its server has a record."""
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, _ = matched_pair(platform)
     register_three(platform)
     for _ in range(2):
         page, data = ann.get(), ann.data
@@ -337,8 +339,7 @@ def test_the_page_of_a_pair_stays_that_of_a_pair_when_another_number_is_register
 
 
 def test_a_start_message_that_a_pairs_page_sends_again_is_for_two_players(platform: FakePlatform) -> None:
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, _ = matched_pair(platform)
     register_three(platform)
     platform.bus.sent.clear()
     platform.wait(seconds=31)
@@ -357,8 +358,7 @@ def test_a_participant_in_the_lobby_gets_the_new_number_of_players_by_page_and_p
 
 
 def test_a_missing_page_that_the_pairs_earlier_registration_named_is_left_out(platform: FakePlatform) -> None:
-    ann, bob = (Player(platform, user).to_game() for user in ("ann", "bob"))
-    matched(platform, ann, bob)
+    ann, _ = matched_pair(platform)
     before = study(**{**STUDY, "trial": {**STUDY["trial"], "instructions": "rules", "betweenEpisodes": "consent-0"}})
     platform.documents.keep(MASTER_LIST, to_json(MasterList([study(**{**STUDY, **THREE}).following(before)])))
     platform.wait(seconds=11)

@@ -67,12 +67,18 @@ def answered(platform: FakePlatform, user: str = "alice") -> dict[str, Any]:
     return {key.removeprefix(folder).removesuffix(".json"): json.loads(found[key])["answers"] for key in sorted(found)}
 
 
+def asking(platform: FakePlatform) -> Program:
+    """Return a program of alice's that has asked for her first page."""
+    program = Program(platform)
+    program.ask()
+    return program
+
+
 # Sent again
 
 
 def test_a_form_without_a_step_that_is_sent_twice_answers_one_step(platform: FakePlatform) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     first = program.post({"agree": "yes"})
     again = program.post({"agree": "yes"})
     assert answered(platform) == {"1": {"agree": "yes"}}
@@ -82,8 +88,7 @@ def test_a_form_without_a_step_that_is_sent_twice_answers_one_step(platform: Fak
 def test_a_repeated_form_is_recognized_after_other_forms_and_with_its_fields_in_another_order(
     platform: FakePlatform,
 ) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     program.post({"age": 7, "names": {"a": 1, "b": [2]}})
     program.post({"word": "hello"})
     program.post({"names": {"b": [2], "a": 1}, "age": 7})
@@ -92,16 +97,14 @@ def test_a_repeated_form_is_recognized_after_other_forms_and_with_its_fields_in_
 
 @pytest.mark.parametrize("other", [{"age": "7"}, {"age": 7.0}, {"age": True}, {"age": [7]}, {}, {"age": 7, "x": None}])
 def test_a_form_with_any_difference_is_another_answer(platform: FakePlatform, other: object) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     program.post({"age": 7})
     program.post(other)
     assert list(answered(platform)) == ["1", "2"]
 
 
 def test_a_form_that_a_browser_sent_is_not_accepted_again_from_a_program(platform: FakePlatform) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
     program.ask("POST", urlencode({"agree": "yes", **proof}), FORM)
     program.post({"agree": "yes"})
@@ -110,8 +113,7 @@ def test_a_form_that_a_browser_sent_is_not_accepted_again_from_a_program(platfor
 
 
 def test_a_form_with_a_step_and_no_ticket_answers_only_this_step(platform: FakePlatform) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     for _ in range(3):
         program.post({"agree": "yes", "hippodrome-step": "1"})
     assert list(answered(platform)) == ["1"]
@@ -120,8 +122,7 @@ def test_a_form_with_a_step_and_no_ticket_answers_only_this_step(platform: FakeP
 
 
 def test_an_unreadable_answer_of_an_agent_does_not_stop_the_participant(platform: FakePlatform) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     for step, body in (("1", b"\xff{"), ("2", b"[]"), ("3", b'{"answers": 3}')):
         platform.documents.put(f"maze/users/alice/answers/{step}.json", body)
     program.post({"agree": "yes"})
@@ -132,8 +133,7 @@ def test_an_unreadable_answer_of_an_agent_does_not_stop_the_participant(platform
 def test_few_documents_are_read_however_many_steps_were_answered() -> None:
     steps = [Step(str(n), "survey") for n in range(1, 101)] + [Step("finalStep", "debrief")]
     platform = installed(study(steps=steps, events=Events()))
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     for step in steps[:-2]:
         platform.documents.put(f"maze/users/alice/answers/{step.key}.json", b'{"answers": {}}')
     platform.documents.calls.clear()
@@ -146,8 +146,7 @@ def test_few_documents_are_read_however_many_steps_were_answered() -> None:
 
 
 def test_a_program_that_names_no_step_may_answer_the_same_after_a_minute(platform: FakePlatform) -> None:
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     program.post({})
     platform.wait(seconds=WINDOW - 1)
     assert program.post({})["step"] == "2"
@@ -186,8 +185,7 @@ def test_a_form_that_asks_for_another_server_is_not_taken_for_a_repeated_answer(
     platform = installed(
         study(steps=[Step("1", "survey"), Step("2", "game"), Step("3", "debrief")], events=Events("2"))
     )
-    program = Program(platform)
-    program.ask()
+    program = asking(platform)
     program.post({})
     from hippodrome.model import server
     from hippodrome.model.records import to_json

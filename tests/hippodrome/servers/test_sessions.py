@@ -62,6 +62,18 @@ def form(platform: FakePlatform, session: str = SESSION, users: tuple[str, ...] 
         platform.documents.put(membership_key("maze", user), json.dumps(seated).encode())
 
 
+def start_formed(platform: FakePlatform, servers: Servers) -> None:
+    """Form the session, and handle its start message."""
+    form(platform)
+    servers.start(START)
+
+
+def sweep(platform: FakePlatform, servers: Servers) -> None:
+    """Sweep, and deliver all that follows."""
+    Sweep(platform).run()
+    deliver(platform, servers)
+
+
 def answer(platform: FakePlatform, user: str, *steps: str) -> None:
     platform.documents.put(f"maze/users/{user}/participant.json", b"{}")
     for step in steps:
@@ -216,8 +228,7 @@ def test_a_session_has_its_whole_time_on_a_warm_server_that_was_taken_at_the_las
 
 
 def test_a_lost_server_is_replaced_for_all_members(platform: FakePlatform, servers: Servers) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     runs(platform, servers)
     lose(platform, servers)
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": SESSION, "attempt": 2})]
@@ -230,8 +241,7 @@ def test_a_lost_server_is_replaced_for_all_members(platform: FakePlatform, serve
 def test_a_sessions_server_is_replaced_until_all_members_have_finished_their_games(
     platform: FakePlatform, servers: Servers, played: tuple[str, ...], replaced: bool
 ) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     for user in MEMBERS:
         answer(platform, user, "1", "2", *(["3"] if user in played else []))
     lose(platform, servers)
@@ -260,8 +270,7 @@ def test_the_game_of_an_erased_member_is_no_reason_to_replace_the_server(
 
 
 def test_a_sessions_server_is_stopped_by_its_id(platform: FakePlatform, servers: Servers) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     runs(platform, servers)
     assert servers.stop([STOP]) == []
     assert record(platform).reason is Reason.STOPPED
@@ -280,8 +289,7 @@ def test_a_sessions_server_is_stopped_when_the_last_member_reaches_the_stop_step
 ) -> None:
     """The stop message of the last member comes before their answer is stored."""
     last = next(user for user in MEMBERS if user != first)
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     runs(platform, servers)
     answer(platform, first, "1", "2", "3")
     answer(platform, last, "1", "2")
@@ -295,8 +303,7 @@ def test_a_sessions_server_is_stopped_when_the_last_member_reaches_the_stop_step
 def test_the_stop_messages_of_both_members_in_one_batch_stop_the_server_once(platform: FakePlatform) -> None:
     platform = installed(pairs(max_servers=3, max_server_hours=10))
     servers = Servers(platform)
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     servers.start(StartServer("maze", OTHER))
     runs(platform, servers)
     platform.wait(minutes=10)
@@ -321,8 +328,7 @@ def test_a_members_stop_message_leaves_no_record_of_their_own(platform: FakePlat
 def test_a_stop_in_all_projects_ends_no_session_that_another_member_plays(
     platform: FakePlatform, servers: Servers
 ) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     answer(platform, "alice", "1", "2", "3")
     answer(platform, "bob", "1", "2")
     assert servers.stop([StopUser("alice")]) == []
@@ -447,8 +453,7 @@ def test_the_sweep_stops_a_server_that_no_session_has_if_the_lobbys_document_can
 
 
 def test_the_sweep_does_not_stop_the_server_of_a_formed_session(platform: FakePlatform, servers: Servers) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     runs(platform, servers)
     for user in MEMBERS:
         answer(platform, user, "1", "2")
@@ -459,8 +464,7 @@ def test_the_sweep_does_not_stop_the_server_of_a_formed_session(platform: FakePl
 def test_the_sweep_does_not_stop_a_formed_session_if_its_document_or_project_cannot_be_read(
     platform: FakePlatform, servers: Servers
 ) -> None:
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     platform.documents.put(session_key("maze", SESSION), b"{")
     swept = Sweep(platform).run()
     assert (swept.sessions, swept.failed) == (0, 1)
@@ -472,8 +476,7 @@ def test_the_sweep_does_not_stop_a_formed_session_if_its_document_or_project_can
 
 def test_the_sweep_stops_a_server_whose_members_have_all_left(platform: FakePlatform, servers: Servers) -> None:
     """Their stop messages came at once: each was handled before the other's answer was stored."""
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     for user in MEMBERS:
         answer(platform, user, "1", "2")
         servers.stop([StopServer("maze", user)])
@@ -540,12 +543,10 @@ def test_servers_ahead_are_stopped_when_their_participants_leave(platform: FakeP
         servers.start(StartServer("maze", user))
     deliver(platform, servers)
     assert servers.stop([StopServer("maze", "carol")]) == []
-    Sweep(platform).run()
-    deliver(platform, servers)
+    sweep(platform, servers)
     assert len(open_sessions(platform)) == 1
     assert servers.stop([StopUser("alice"), StopUser("bob")]) == []
-    Sweep(platform).run()
-    deliver(platform, servers)
+    sweep(platform, servers)
     assert open_sessions(platform) == []
     assert nothing_left(platform)
 
@@ -558,8 +559,7 @@ def test_nothing_is_left_when_participants_who_are_under_way_never_arrive(
     started = set()
     for _ in range(24):  # two hours
         platform.wait(minutes=5)
-        Sweep(platform).run()
-        deliver(platform, servers)
+        sweep(platform, servers)
         started |= {one.name for one in open_sessions(platform)}
         assert len(open_sessions(platform)) <= 1
     assert nothing_left(platform)
@@ -571,12 +571,10 @@ def test_nothing_is_left_when_the_lobbys_document_is_lost(platform: FakePlatform
     servers.start(StartServer("maze", "alice"))
     deliver(platform, servers)
     platform.documents.delete("_lobbies/maze.json")
-    Sweep(platform).run()
-    deliver(platform, servers)
+    sweep(platform, servers)
     assert len(open_sessions(platform)) == 1, "another one for who is under way"
     servers.stop([StopServer("maze", "alice")])
-    Sweep(platform).run()
-    deliver(platform, servers)
+    sweep(platform, servers)
     assert nothing_left(platform)
 
 
@@ -586,8 +584,7 @@ def test_a_project_that_is_closed_keeps_no_server_ahead(platform: FakePlatform, 
     platform.documents.keep(MASTER_LIST, to_json(MasterList([pairs(live=False)])))
     platform.wait(seconds=60)
     for _ in range(2):
-        Sweep(platform).run()
-        deliver(platform, servers)
+        sweep(platform, servers)
     assert nothing_left(platform)
     assert json.loads(platform.documents.kept["_lobbies/maze.json"][0]).get("open", []) == []
 
@@ -597,15 +594,13 @@ def test_a_project_that_is_gone_keeps_no_server_ahead(platform: FakePlatform, se
     deliver(platform, servers)
     platform.documents.keep(MASTER_LIST, to_json(MasterList([study(max_runtime=60)])))
     platform.wait(seconds=60)
-    Sweep(platform).run()
-    deliver(platform, servers)
+    sweep(platform, servers)
     assert nothing_left(platform)
 
 
 def test_a_start_message_that_comes_an_hour_late_leaves_no_server(platform: FakePlatform, servers: Servers) -> None:
     """The messages are of a participant who has played, of an unmatched one, and of a session that is over."""
-    form(platform)
-    servers.start(START)
+    start_formed(platform, servers)
     runs(platform, servers)
     for user in MEMBERS:
         answer(platform, user, "1", "2", "3")

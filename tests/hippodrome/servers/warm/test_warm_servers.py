@@ -51,11 +51,22 @@ def deliver(platform: FakePlatform) -> None:
     delivery.deliver(platform, Servers(platform))
 
 
+def keep(platform: FakePlatform) -> None:
+    """Send the message that keeps warm servers, and deliver all that follows."""
+    platform.bus.publish(Topic.START, messages.to_message(KEEP))
+    deliver(platform)
+
+
+def sweep(platform: FakePlatform) -> None:
+    """Sweep, and deliver all that follows."""
+    Sweep(platform).run()
+    deliver(platform)
+
+
 def warmed(number: int = 2, **changes: object) -> FakePlatform:
     """Return an installation with so many warm servers that are ready."""
     platform = installed(warm(number, **changes))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     return platform
 
 
@@ -179,8 +190,7 @@ def test_the_warm_server_that_has_waited_longest_is_assigned_first() -> None:
     first = record(platform, next(iter(warm_server_records(platform))).label).name
     platform.wait(minutes=5)
     register(platform, warm(2))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     Servers(platform).start(START)
     assert record(platform).name == first
 
@@ -218,8 +228,7 @@ def test_a_warm_server_of_an_older_registration_is_never_assigned_and_is_replace
     register(platform, msgspec.structs.replace(warm(1), version="v2"))
     Servers(platform).start(START)
     assert record(platform).warm_server_name is None
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert record(platform, old.label).reason is Reason.STOPPED
     assert [warm_server.version for warm_server in pool(platform).warm_servers.values()] == ["v2"]
 
@@ -269,13 +278,11 @@ def test_after_a_crash_at_any_write_the_next_delivery_finishes_the_assignment(nu
     assert len(handovers(platform)) == 1
     assert len(platform.tasks.running) == 2
     deliver(platform)
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert len(platform.tasks.running) == 3
     assert Servers(platform).stop([STOP]) == []
     register(platform, warm(2, live=False))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert nothing_left(platform)
     assert all(found.is_closed for found in warm_server_records(platform))
 
@@ -297,8 +304,7 @@ def test_a_stop_at_any_write_of_the_assignment_leaves_nothing(number: int) -> No
     assert record(platform).is_closed
     Sweep(platform).run()
     register(platform, warm(1, live=False))
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert nothing_left(platform)
     assert all(found.is_closed for found in warm_server_records(platform))
 
@@ -401,20 +407,17 @@ def test_warm_servers_that_were_started_together_have_different_deadlines() -> N
 def test_a_warm_server_that_can_never_run_is_not_restarted_endlessly() -> None:
     platform = installed(warm(1))
     platform.tasks.fail = [Refused("no such image")]
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert not platform.tasks.by_name
     assert nothing_left(platform)
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert len(platform.tasks.running) == 1
 
 
 def test_a_warm_server_without_spot_capacity_runs_on_demand() -> None:
     platform = installed(warm(1))
     platform.tasks.fail = [NoCapacity()]
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert [request.spot for request in platform.tasks.running.values()] == [False]
     Servers(platform).start(START)
     assert not record(platform).spot
@@ -425,8 +428,7 @@ def test_when_the_study_closes_warm_servers_end_and_games_go_on() -> None:
     Servers(platform).start(START)
     deliver(platform)
     register(platform, warm(3, live=False))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert [request.name for request in platform.tasks.running.values()] == [record(platform).name]
     assert not pool(platform).warm_servers
 
@@ -434,8 +436,7 @@ def test_when_the_study_closes_warm_servers_end_and_games_go_on() -> None:
 def test_if_fewer_warm_servers_are_wanted_the_others_end() -> None:
     platform = warmed(3)
     register(platform, warm(1))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert len(pool(platform).warm_servers) == len(platform.tasks.running) == 1
 
 
@@ -444,8 +445,7 @@ def test_if_fewer_warm_servers_are_wanted_the_others_end() -> None:
 
 def test_the_sweep_fills_the_pool_when_every_message_was_lost() -> None:
     platform = installed(warm(2))
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert len(platform.tasks.running) == 2
 
 
@@ -454,8 +454,7 @@ def test_the_sweep_asks_again_for_a_warm_server_whose_start_was_lost() -> None:
     Servers(platform).start(KEEP)
     platform.bus.sent.clear()
     platform.wait(minutes=6)
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert len(platform.tasks.running) == len(pool(platform).warm_servers) == 1
 
 
@@ -492,8 +491,7 @@ def test_the_sweep_removes_leftovers_of_an_assigned_server() -> None:
     closed = server.close(record(platform), Reason.STOPPED, platform.now())
     platform.documents.put(server.key(LABEL), to_json(closed))
     platform.bus.sent.clear()
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert nothing_left(platform)
 
 
@@ -543,8 +541,7 @@ def test_a_participant_takes_over_the_slot_of_the_warm_server() -> None:
     assert len(platform.tasks.running) == 1
     Servers(platform).stop([STOP])
     assert not running(platform).slots
-    Sweep(platform).run()
-    deliver(platform)
+    sweep(platform)
     assert len(platform.tasks.running) == 1
 
 
@@ -566,8 +563,7 @@ def test_warm_servers_keep_no_participant_out() -> None:
 def test_after_a_new_registration_warm_servers_leave_their_slots_to_their_successors() -> None:
     platform = warmed(2, max_servers=2)
     register(platform, msgspec.structs.replace(warm(2, max_servers=2), version="v2"))
-    platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    deliver(platform)
+    keep(platform)
     assert [(warm_server.version, warm_server.ready) for warm_server in pool(platform).warm_servers.values()] == [
         ("v2", True)
     ] * 2
@@ -586,8 +582,8 @@ def test_the_wait_of_a_warm_server_counts_in_the_hours() -> None:
 def test_a_warm_server_that_finds_no_slot_leaves_the_pool() -> None:
     platform = installed(warm(1, max_servers=1))
     platform.bus.publish(Topic.START, messages.to_message(KEEP))
-    keep, platform.bus.sent = platform.bus.sent, []
-    assert keep
+    kept, platform.bus.sent = platform.bus.sent, []
+    assert kept
     servers = Servers(platform)
     servers.start(KEEP)
     ((_, asked),) = platform.bus.sent
