@@ -1,4 +1,4 @@
-"""Fixtures of this folder's tests: a platform in memory, which a file can replace by its own, and an account in moto."""
+"""Fixtures of this folder's tests: a platform in memory, whose study a file can replace, and an account in moto."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from hippodrome.model.project import Project
 from lambdas import installed
 from testing import studies
 from testing.fake_platform import FakePlatform
@@ -13,9 +14,15 @@ from testing.moto_world import moto_world  # noqa: F401 - a fixture
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    """A platform in memory with the study of `testing/studies.py`; the functions use it."""
-    made = studies.installed()
+def project() -> Project:
+    """The study of `testing/studies.py`."""
+    return studies.study()
+
+
+@pytest.fixture
+def platform(project: Project) -> Iterator[FakePlatform]:
+    """A platform in memory with the study; the functions use it."""
+    made = studies.installed(project)
     installed.use(made)
     yield made
     installed.use(None)

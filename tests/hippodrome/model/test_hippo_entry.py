@@ -13,10 +13,9 @@ from hippodrome.model import hippo_entry
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Project, read_list, step_key, write_list
 from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import SecretCache
-from lambdas import installed as place
 from lambdas import update_project_master_list
 from testing.fake_platform import FakePlatform
-from testing.studies import installed, study
+from testing.studies import study
 from testing.visitors import Browser
 from tests.hippodrome.test_registry import registration
 
@@ -118,9 +117,7 @@ def test_of_two_entries_with_one_id_hippodromes_counts_and_both_are_kept() -> No
 
 
 @pytest.fixture
-def platform() -> FakePlatform:
-    platform = installed()
-    place.use(platform)
+def platform(platform: FakePlatform) -> FakePlatform:
     listed = json.loads(platform.documents.kept[MASTER_LIST][0])
     listed["projects"].append(ENTRY)
     platform.documents.put(MASTER_LIST, json.dumps(listed).encode())

@@ -39,12 +39,6 @@ def project() -> Project:
     return study(**STUDY)
 
 
-@pytest.fixture
-def platform(project: Project) -> Iterator[FakePlatform]:
-    yield installed(project)
-    place.use(None)
-
-
 class Player(Browser):
     """A participant's browser at the game step: its page, and the answers to its polls."""
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.model import ids
-from hippodrome.model.project import Events
+from hippodrome.model.project import Events, Project
 from lambdas import installed as place
 from protocol.keys import NAME
 from testing.fake_platform import FakePlatform
@@ -53,10 +53,9 @@ AHEAD = (
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
+def project() -> Project:
     """The server starts at the first step."""
-    yield installed(study(events=Events("1", "4")))
-    place.use(None)
+    return study(events=Events("1", "4"))
 
 
 def untouched(platform: FakePlatform) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlencode
 
@@ -15,25 +14,20 @@ from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import Topic
 from hippodrome.storage.secret import SecretCache
-from lambdas import installed as place
 from lambdas import send_start_server_message, send_stop_server_message
 from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed
 
 PROOF = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
 START, STOP = send_start_server_message, send_stop_server_message
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    platform = installed()
-    place.use(platform)
+def platform(platform: FakePlatform) -> FakePlatform:
     platform.documents.put("maze/users/alice/participant.json", b"{}")
     platform.documents.put("maze/users/alice/answers/1.json", b"{}")
-    yield platform
-    place.use(None)
+    return platform
 
 
 def ask(function: Any, query: str = "projectId=maze&userId=alice", **body: object) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from html.parser import HTMLParser
 from typing import Any
@@ -35,9 +35,8 @@ def pages_only() -> Project:
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    yield installed(pages_only())
-    place.use(None)
+def project() -> Project:
+    return pages_only()
 
 
 class Fields(HTMLParser):

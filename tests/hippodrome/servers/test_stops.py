@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import msgspec
 import pytest
 
@@ -14,24 +12,20 @@ from hippodrome.model.records import to_json
 from hippodrome.servers import stops as stops_module
 from hippodrome.servers.services import ServerServices
 from hippodrome.servers.termination import STOP_TRIES
-from lambdas import installed as place
 from lambdas import stop_server
 from testing.aws_events import queue_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import study
 
 PROJECTS = ("atari", "gone", "maze")
 ALICE = server.key(ids.server_label("maze", "alice"))
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    platform = installed()
+def platform(platform: FakePlatform) -> FakePlatform:
     list_projects(platform, *PROJECTS)
-    place.use(platform)
-    yield platform
-    place.use(None)
+    return platform
 
 
 def list_projects(platform: FakePlatform, *names: str) -> None:

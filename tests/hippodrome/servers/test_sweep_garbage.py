@@ -10,15 +10,14 @@ from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ServerSlot, ServerSlots
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import KeepWarm, StartServer
-from hippodrome.model.project import MASTER_LIST, MasterList
+from hippodrome.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.warm_pool import Pool, WarmServer
 from hippodrome.ports import Topic
-from lambdas import installed as place
 from lambdas import sweep
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import study
 
 MANY = 16_000
 GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
@@ -27,10 +26,8 @@ STUDY = study(max_servers=3, warm_servers=1, version="1")
 
 
 @pytest.fixture
-def platform() -> FakePlatform:
-    platform = installed(STUDY)
-    place.use(platform)
-    return platform
+def project() -> Project:
+    return STUDY
 
 
 def calls(platform: FakePlatform) -> Counter[str]:
