@@ -153,11 +153,13 @@ class Presence:
         self._changed(now)
         return "returned" if returned else "joined"
 
-    def go(self, player: str, now: float) -> None:
-        """Mark a member as gone, whose connection is closed."""
+    def go(self, player: str, now: float) -> bool:
+        """Mark a member as gone, whose connection is closed. Return False if they were away already."""
         self._give_time_back(now)
-        self._members[player].connected = False
+        member = self._members[player]
+        member.connected = False
         self._changed(now)
+        return not member.stalled and not member.hidden
 
     def stalls(self, player: str, now: float) -> bool:
         """Mark a member as away whose page has stopped answering. Return False if they were away already."""

@@ -149,8 +149,8 @@ class TrialSession:
     def go(self, player: str, now: float, *, closing: bool) -> None:
         """Release the keys of a member whose connection is closed, and count them as gone. `closing` has no effect."""
         self._progress.choices.let_go(player)
-        self.presence.go(player, now)
-        self._record(player, "left")
+        if self.presence.go(player, now):
+            self._record(player, "left")
 
     def stalls(self, player: str, now: float) -> bool:
         """Count a member as gone whose page has stopped answering. Return False if they were gone already."""

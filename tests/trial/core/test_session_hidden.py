@@ -67,6 +67,12 @@ def test_a_hidden_page_stays_hidden_until_it_says_that_it_is_seen_again() -> Non
     assert driver.presence().count(("right", "left")) == 1
 
 
+def test_a_hidden_page_whose_connection_is_lost_is_recorded_as_one_absence() -> None:
+    driver = SessionDriver().begin().wait(1).say(1, hidden=True).wait(1).go(1).wait(1).come(1).wait(1)
+    assert driver.presence()[-2:] == [("right", "left"), ("right", "returned")]
+    assert driver.presence().count(("right", "left")) == 1
+
+
 def test_a_hidden_page_that_stops_answering_and_answers_again_is_still_hidden() -> None:
     driver = SessionDriver().begin().wait(1).say(1, hidden=True)
     session = driver.trial._participants
