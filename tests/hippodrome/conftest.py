@@ -13,6 +13,13 @@ from testing.fake_platform import FakePlatform
 from testing.moto_world import moto_world  # noqa: F401 - a fixture
 
 
+@pytest.fixture(autouse=True)
+def _aws_again() -> Iterator[None]:
+    """After each test the functions use AWS again, whatever platform it has set."""
+    yield
+    installed.use(None)
+
+
 @pytest.fixture
 def project() -> Project:
     """The study of `testing/studies.py`."""
@@ -20,9 +27,8 @@ def project() -> Project:
 
 
 @pytest.fixture
-def platform(project: Project) -> Iterator[FakePlatform]:
+def platform(project: Project) -> FakePlatform:
     """A platform in memory with the study; the functions use it."""
     made = studies.installed(project)
     installed.use(made)
-    yield made
-    installed.use(None)
+    return made

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -30,12 +29,11 @@ PAYLOAD: dict[str, Any] = {
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
+def platform() -> FakePlatform:
     place.use(platform := FakePlatform())
     for file in ("consent", "thank"):
         platform.documents.put(step_key("flight", file), b"<p>")
-    yield platform
-    place.use(None)
+    return platform
 
 
 def test_the_scripts_project_is_registered_with_remarks(platform: FakePlatform) -> None:

@@ -28,7 +28,6 @@ def world() -> Iterator[MotoWorld]:
     with MotoWorld() as made:
         installed.use(made.platform)
         yield made
-    installed.use(None)
 
 
 def ask(body: dict[str, str] | None = None) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import pytest
 from hippodrome.config import read_project
 from hippodrome.model import ids, server
 from lambdas import (
-    installed,
     send_stop_server_message,
     sweep,
     update_project_master_list,
@@ -28,7 +27,6 @@ from testing.moto_world import MotoWorld
 def study() -> Iterator[StudyOnMoto]:
     with MotoWorld() as world:
         yield StudyOnMoto(world)
-    installed.use(None)
 
 
 @pytest.fixture
@@ -88,7 +86,6 @@ def test_messages_in_the_envelope_of_sns_are_also_accepted() -> None:
         assert alice.poll()["state"] == "ready"
         alice.play()
         study.settle()
-    installed.use(None)
 
 
 def test_two_participants_have_a_server_each(study: StudyOnMoto, alice: Person) -> None:
@@ -212,7 +209,6 @@ def test_a_participants_own_cluster_is_removed_with_the_server() -> None:
         alice.play()
         study.settle()
         assert [arn.rpartition("/")[2] for arn in world.client("ecs").list_clusters()["clusterArns"]] == ["hippodrome"]
-    installed.use(None)
 
 
 def test_a_replacement_does_not_wait_until_the_old_cluster_can_be_deleted() -> None:
@@ -232,7 +228,6 @@ def test_a_replacement_does_not_wait_until_the_old_cluster_can_be_deleted() -> N
         alice.play()
         study.settle()
         assert own_clusters(world) == set()
-    installed.use(None)
 
 
 def own_clusters(world: MotoWorld) -> set[str]:
@@ -379,7 +374,6 @@ def test_repeated_messages_in_any_order_lead_to_the_same_end(seed: int) -> None:
         for person in people:
             assert study.record(person.user)["state"] == "closed"
             assert study.stored(f"{PROJECT}/users/{person.user}/answers/{AFTER}.json")["answers"] == {"said": "at 4"}
-    installed.use(None)
 
 
 @pytest.mark.explores
@@ -402,4 +396,3 @@ def test_an_interruption_by_spot_at_any_moment_leads_to_the_same_end(seed: int) 
             raise AssertionError("she did not come to the end")
         study.settle()
         assert len(world.task_arns()) <= struck + 1
-    installed.use(None)

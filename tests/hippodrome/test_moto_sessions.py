@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from hippodrome.model import ids
-from lambdas import installed, sign_requests, stop_server, sweep
+from lambdas import sign_requests, stop_server, sweep
 from protocol.session import member_token, parse
 from testing import aws_events
 from testing.moto_study import (
@@ -30,7 +30,6 @@ from testing.moto_world import MotoWorld
 def study() -> Iterator[StudyOnMoto]:
     with MotoWorld() as world:
         yield StudyOnMoto(world, **PAIRS)
-    installed.use(None)
 
 
 @pytest.fixture
@@ -150,7 +149,6 @@ def test_a_pair_is_handed_a_warm_server() -> None:
         play_together(study, *pair)
         study.deliver()
         assert study.stored(f"{PROJECT}/spares/{name}.json") is None
-    installed.use(None)
 
 
 def test_a_server_ahead_is_stopped_if_its_participant_gives_up(study: StudyOnMoto) -> None:

@@ -29,7 +29,6 @@ from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import Conflict, Documents, NoCapacity, Refused, Topic
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.errors import RetryLater
-from lambdas import installed as place
 from local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
@@ -42,12 +41,6 @@ from testing.visitors import Browser
 from tests.hippodrome.participants.test_journey import to_game
 
 USERS = tuple(f"u{n}" for n in range(40))
-
-
-@pytest.fixture(autouse=True)
-def _ours() -> Iterator[None]:
-    yield
-    place.use(None)
 
 
 def claimed(project: Project, user: str, attempt: int = 1) -> Server:

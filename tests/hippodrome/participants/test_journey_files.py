@@ -9,7 +9,6 @@ import pytest
 
 from hippodrome.model.project import Events
 from hippodrome.participants.journey import OUR_FIELDS, RECRUITER_IDS
-from lambdas import installed as place
 from lambdas import next_step
 from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform
@@ -123,7 +122,6 @@ def test_a_game_at_the_first_step_sends_a_start_message_with_each_load() -> None
     for loads in (1, 2, 3):
         alice.get()
         assert len(platform.bus.sent) == loads
-    place.use(None)
 
 
 def test_a_page_that_is_missing_or_broken_says_so(platform: FakePlatform) -> None:

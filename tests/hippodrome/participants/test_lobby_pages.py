@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -230,7 +229,6 @@ def test_a_signed_link_is_needed_where_links_are_signed() -> None:
     unsigned = address.replace(signature, "0" * 32)
     assert ann.poll(unsigned)["status"] == 400  # as HIPPO answers a program
     assert platform.documents.kept == before
-    place.use(None)
 
 
 def test_a_form_for_another_server_asks_for_the_sessions_next_server(platform: FakePlatform) -> None:
@@ -300,7 +298,6 @@ def test_a_study_for_one_has_no_lobby() -> None:
     assert parse_qs(urlsplit(data["poll"]).query).keys() == {"projectId", "userId", "poll"}
     assert platform.documents.calls == ["list", "get"]
     assert waiting(platform) == NOTHING
-    place.use(None)
 
 
 # Another number of players is registered
@@ -373,9 +370,8 @@ def register_two(platform: FakePlatform) -> None:
 
 
 @pytest.fixture
-def for_one() -> Iterator[FakePlatform]:
-    yield installed(study(**ONE))
-    place.use(None)
+def for_one() -> FakePlatform:
+    return installed(study(**ONE))
 
 
 def test_a_participant_who_plays_alone_stays_in_their_own_game_when_several_players_are_registered(

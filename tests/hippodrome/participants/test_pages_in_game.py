@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -26,9 +25,8 @@ RULES = (
 
 
 @pytest.fixture
-def platform() -> Iterator[FakePlatform]:
-    yield with_pages(STUDY)
-    place.use(None)
+def platform() -> FakePlatform:
+    return with_pages(STUDY)
 
 
 def with_pages(project: Project, **pages: str) -> FakePlatform:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 
 from hippodrome.model import ids
 from hippodrome.model.project import Events, Project
-from lambdas import installed as place
 from protocol.keys import NAME
 from testing.fake_platform import FakePlatform
 from testing.studies import installed, study
@@ -108,7 +106,6 @@ def test_a_head_request_begins_nothing(platform: FakePlatform, query: str) -> No
 def test_any_user_agent_gets_an_answer(agent: str) -> None:
     platform = installed()
     assert Browser(platform, LINK).send(user_agent=agent)["statusCode"] == 200
-    place.use(None)
 
 
 # Signed links
@@ -119,9 +116,8 @@ def invited(user: str = "alice", project: str = "maze", secret: str = "secret") 
 
 
 @pytest.fixture
-def closed() -> Iterator[FakePlatform]:
-    yield installed(study(signed_links=True, events=Events("1", "4")))
-    place.use(None)
+def closed() -> FakePlatform:
+    return installed(study(signed_links=True, events=Events("1", "4")))
 
 
 def test_a_signed_link_leads_through_the_study(closed: FakePlatform) -> None:

@@ -138,7 +138,6 @@ def test_few_documents_are_read_however_many_steps_were_answered() -> None:
     platform.documents.calls.clear()
     program.post({"agree": "yes"})
     assert platform.documents.calls.count("get") <= 12
-    place.use(None)
 
 
 # Equal answers to different steps
@@ -196,7 +195,6 @@ def test_a_form_that_asks_for_another_server_is_not_taken_for_a_repeated_answer(
     platform.bus.sent.clear()
     program.post({"hippodrome-action": "restart"})
     assert [topic for topic, _ in platform.bus.sent] == [Topic.START]
-    place.use(None)
 
 
 # In any order

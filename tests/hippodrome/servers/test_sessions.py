@@ -351,8 +351,7 @@ def test_a_server_from_before_the_project_had_sessions_is_stopped_as_usual() -> 
 @pytest.fixture
 def relays(platform: FakePlatform) -> Any:
     place.use(platform)
-    yield platform
-    place.use(None)
+    return platform
 
 
 def ask(function: Any, user: str, **body: object) -> int:
