@@ -17,12 +17,11 @@ from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.browser import ARGUMENTS, NoChromium, chromium_path, headless_path
 from testing.held_study import HeldStudy
+from tests.browser.world import PATIENCE, SHOTS, world  # noqa: F401 - a fixture
 from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 HERE = Path(__file__).parent
-SHOTS = ROOT / "shots"
-PATIENCE = 45_000  # ms
 WHOLE_STUDIES = (
     *("test_study.py", "test_german_study.py", "test_two_participants.py", "test_two_players_browser.py"),
     *("test_examples.py", "test_gridworld_browser.py", "test_teaching.py"),

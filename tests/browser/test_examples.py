@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from bots.links import with_user
-from tests.browser.conftest import SHOTS, Hold
+from tests.browser.conftest import Hold
+from tests.browser.world import SHOTS
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]

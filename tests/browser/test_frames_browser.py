@@ -15,13 +15,12 @@ import pytest
 from PIL import Image
 
 from testing.browser import game_page
-from tests.browser.conftest import PATIENCE
-from tests.browser.test_pages_browser import World, play, wait_for_reconnection, world
+from tests.browser.world import PATIENCE, World, play, wait_for_reconnection
 from tests.trial.conftest import launch
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 
-__all__ = ["launch", "world"]  # fixtures
+__all__ = ["launch"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 AGENT = """

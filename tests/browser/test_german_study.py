@@ -14,8 +14,7 @@ from bots.links import with_user
 from hippodrome.model.texts import ENGLISH, PLACE
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.held_study import HeldStudy
-from tests.browser.conftest import SHOTS
-from tests.browser.test_pages_browser import FLAWS
+from tests.browser.world import FLAWS, SHOTS
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 

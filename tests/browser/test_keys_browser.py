@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import PATIENCE, hold_timers, note_texts, wait_for_noted
-from tests.browser.test_pages_browser import FLAWS, LAST_PICTURE, World, play, shot, tell, world
+from tests.browser.conftest import hold_timers, note_texts, wait_for_noted
+from tests.browser.world import FLAWS, LAST_PICTURE, PATIENCE, World, play, shot, tell
 from tests.trial.conftest import Running, grid_agent
 
-__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 KEYS = {

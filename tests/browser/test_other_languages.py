@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from hippodrome.model.texts import ENGLISH, is_right_to_left
-from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
 from tests.browser.test_together_browser import LOBBY
+from tests.browser.world import FLAWS, World, play, shot, tell
 
-__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SIZES = [(360, 740), (1280, 800)]
 NO_LONGER_WRITTEN = {"ae"}  # Avestan

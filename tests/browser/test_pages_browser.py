@@ -3,209 +3,37 @@
 from __future__ import annotations
 
 import json
-import re
 import struct
 import threading
 import time
-import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import urlsplit
 
-import msgspec
 import pytest
-from websockets.sync.server import serve
 
-from hippodrome.model.project import Project, Step
 from hippodrome.model.texts import IN_ENGLISH
-from hippodrome.participants import frame, game_modules, pages
+from hippodrome.participants import frame, game_modules
 from hippodrome.participants.texts import in_script
-from tests.browser.conftest import PATIENCE, SHOTS, hold_timers
+from tests.browser.conftest import hold_timers
+from tests.browser.world import (
+    FLAWS,
+    LAST_PICTURE,
+    NOWHERE,
+    PATIENCE,
+    RED,
+    World,
+    deflated_zeros,
+    pack,
+    play,
+    shot,
+    tell,
+    wait_for_reconnection,
+)
 from tests.trial.conftest import Running, grid_agent
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
-FLAWS = (Path(__file__).parent / "flaws.js").read_text()
-MODULES = re.compile(r'(<script type="module" nonce="[^"]*")>.*?(</script>)', re.DOTALL)
-NOWHERE = "ws://127.0.0.1:9/"  # no server listens there
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
-PROJECT = Project(
-    id="demo",
-    name="Demo",
-    steps=[Step("1", "a"), Step("2", "b"), Step("3", "game"), Step("4", "end")],
-    researcher="Ada",
-)
-RED, BLUE = bytes((255, 0, 0)), bytes((0, 0, 255))
-LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as web/game/overlay.js has it
-
-
-def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:
-    """Return a frame of 2 by 2 pixels."""
-    body = pixels if last is None else bytes(a ^ b for a, b in zip(pixels, last, strict=True))
-    deflate = zlib.compressobj(6, zlib.DEFLATED, -15)
-    return struct.pack("!BIHHB", last is not None, frame_id, 2, 2, 3) + deflate.compress(body) + deflate.flush()
-
-
-PLAYING = {"state": "playing", "episode": 1, "score": 70, "frameRate": 30}
-
-
-@dataclass
-class World:
-    """A fake control plane, which shows the pages that a test sets, and a fake trial server, which notes what it receives."""
-
-    step: int = 0
-    source: str = "<p>Hi</p>"
-    state: dict[str, Any] = field(default_factory=lambda: {"state": "queued", "seconds": 0, "attempt": 1})
-    posts: list[dict[str, str]] = field(default_factory=list)
-    received: list[dict[str, Any]] = field(default_factory=list)
-    connections: list[Any] = field(default_factory=list)
-    slow: float = 0.0
-    may_answer: threading.Event = field(default_factory=threading.Event)
-    """Forms are answered once this is set."""
-    joined: bool = True
-    """Whether the game page carries its script, or loads its modules one by one."""
-    trial: dict[str, Any] = field(default_factory=dict)
-    """The section `trial` of the study."""
-    more: dict[str, Any] = field(default_factory=dict)
-    """Other fields of the project."""
-    closed: bool = False
-    """Whether the study is closed."""
-    polls: list[float] = field(default_factory=list)
-    """The times (monotonic) at which the page has asked for the state."""
-    texts: dict[str, str] = field(default_factory=dict)
-    """The pages that the game page shows, by the key that names each."""
-    controls: dict[str, Any] = field(default_factory=dict)
-    """Fields of the trial server's first message that differ from the usual."""
-    subprotocol: str = "hippodrome.1"
-    """The subprotocol of the trial server."""
-    trial_state: dict[str, Any] = field(default_factory=lambda: PLAYING)
-    """What the trial server answers to `requestUI`."""
-    started: dict[str, Any] = field(default_factory=lambda: PLAYING)
-    """What the trial server answers to `start`."""
-    before_pictures: Callable[[], object] = lambda: None
-    """What the trial server waits for between its first message and the first picture."""
-    url: str = ""
-    game_url: str = ""
-
-    def page(self) -> frame.Page:
-        step = PROJECT.steps[self.step]
-        if step.type.on_server:
-            study = msgspec.structs.replace(PROJECT, trial=self.trial, **self.more)
-            texts: dict[str, tuple[str, dict[str, Any]]] = {key: (text, {}) for key, text in self.texts.items()}
-            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "T", "ws://127.0.0.1:*", texts)
-            page = pages.game_page(view)
-            return page if self.joined else page._replace(html=MODULES.sub(r'\1 src="/game/main.js">\2', page.html))
-        return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))
-
-    def ready(self) -> None:
-        self.state = {**self.state, "state": "ready", "url": self.game_url, "token": "TOKEN", "userId": "P1"}
-
-    def commands(self, name: str) -> list[Any]:
-        return [each[name] for each in list(self.received) if name in each]
-
-    def player_commands(self) -> list[str]:
-        """Return the participant's commands, without `requestUI`, which a page sends by itself when it hears nothing."""
-        return [command for command in self.commands("command") if command != "requestUI"]
-
-    def wait_for(self, message: dict[str, Any]) -> None:
-        until = time.monotonic() + PATIENCE / 1000
-        while message not in self.received:
-            assert time.monotonic() < until, self.received
-            time.sleep(0.02)
-
-    # the trial server
-
-    def play(self, connection: Any) -> None:
-        self.connections.append(connection)
-        assert connection.subprotocol == self.subprotocol
-        controls = {
-            "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
-            "actionSpace": ["noop", "fire", "left", "right", "upleft"],
-            "frameRate": 30, "minFrameRate": 1, "maxFrameRate": 60, "allowFrameRateChange": False,
-            "state": "ready", "episode": 1, "maxEpisodes": 2, "score": 0, **self.controls,
-        }  # fmt: skip
-        for text in connection:
-            message = json.loads(text)
-            self.received.append(message)
-            if "token" in message:
-                connection.send(json.dumps(controls))
-                self.before_pictures()
-                connection.send(pack(1, RED * 4))
-                connection.send(pack(2, BLUE * 4, RED * 4))
-            elif message.get("command") == "requestUI":
-                connection.send(json.dumps(self.trial_state))
-            elif message.get("command") == "start":
-                self.trial_state = self.started
-                connection.send(json.dumps(self.started))
-            elif message.get("command") == "pause":
-                connection.send(json.dumps({"state": "paused", "episode": 1, "score": 70, "frameRate": 30}))
-
-
-@pytest.fixture
-def world() -> Iterator[World]:
-    here = World()
-    here.may_answer.set()
-
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, *_: Any) -> None:
-            pass
-
-        def reply(self, status: int, kind: str, body: str, headers: dict[str, str]) -> None:
-            self.send_response(status)
-            for name, value in {"Content-Type": kind, **headers}.items():
-                self.send_header(name, value)
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(body.encode())
-
-        def do_GET(self) -> None:
-            if "poll" in self.path:
-                here.polls.append(time.monotonic())
-                time.sleep(here.slow)
-                self.reply(400 if here.closed else 200, "application/json", json.dumps(here.state), {})
-            elif here.closed:
-                self.reply(404, "text/html; charset=utf-8", "<h1>There is no such study</h1>", {})
-            else:
-                page = here.page()
-                self.reply(200, "text/html; charset=utf-8", page.html, page.headers)
-
-        do_HEAD = do_GET
-
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"])).decode()
-            time.sleep(here.slow)
-            here.may_answer.wait(PATIENCE / 1000)
-            here.posts.append(dict(parse_qsl(body, keep_blank_values=True)))
-            action = here.posts[-1].get("hippodrome-action")
-            if action == "leave":
-                return self.reply(204, "text/plain", "", {})
-            here.step += action != "restart"
-            self.reply(303, "text/plain", "", {"Location": "/"})
-
-    web = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    game = serve(
-        lambda connection: here.play(connection),  # noqa: PLW0108 - a test may put another `play` there
-        "127.0.0.1",
-        0,
-        select_subprotocol=lambda _, offered: here.subprotocol if here.subprotocol in offered else None,
-    )
-    here.url = f"http://127.0.0.1:{web.server_port}/"
-    here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"
-    threads = [threading.Thread(target=server.serve_forever, daemon=True) for server in (web, game)]
-    for thread in threads:
-        thread.start()
-    yield here
-    web.shutdown()
-    web.server_close()
-    game.shutdown()
-
-
-def shot(tab: Any, name: str) -> None:
-    """A picture of the page, for people to look at."""
-    SHOTS.mkdir(exist_ok=True)
-    tab.screenshot(path=SHOTS / f"{name}.png", full_page=True)
 
 
 # Step pages
@@ -388,13 +216,6 @@ def test_step_pages_work_without_javascript(world: World, chromium: Any) -> None
 
 
 # The game
-
-
-def play(world: World, tab: Any) -> None:
-    world.step = 2
-    world.ready()
-    tab.goto(world.url)
-    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_the_page_goes_from_waiting_to_the_game_without_a_reload(world: World, tab: Any) -> None:
@@ -623,15 +444,6 @@ def test_when_the_game_is_done_the_study_goes_on(world: World, tab: Any) -> None
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 2, "score": 70}))
     tab.wait_for_selector("text=Next page")
-
-
-def tell(world: World, **said: Any) -> None:
-    said = {"frameRate": 30, "episode": 1, "score": 70, "episodeScore": 30, **said}
-    if "state" in said:
-        world.trial_state = {
-            name: value for name, value in said.items() if name not in ("nextIn", "startsIn", "timeLeft")
-        }
-    world.connections[0].send(json.dumps(said))
 
 
 def test_the_header_has_the_score_of_this_game_and_the_total(world: World, tab: Any) -> None:
@@ -954,23 +766,6 @@ def test_pictures_of_absurd_sizes_are_refused(
     world.connections[0].send(struct.pack("!BIHHB", *header) + deflated_zeros(unpacked) if header else b"\0\0")
     wait_for_reconnection(world, tab)
     assert tab.evaluate("document.getElementById('screen').width * document.getElementById('screen').height") < 100_000
-
-
-def deflated_zeros(number: int) -> bytes:
-    """Compressed data that unpack to so many zeros. Each megabyte is complete by itself, so only one has to be compressed."""
-    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
-    megabytes, rest = divmod(number, 1 << 20)
-    megabyte = deflate.compress(bytes(1 << 20)) + deflate.flush(zlib.Z_FULL_FLUSH)
-    return megabyte * megabytes + deflate.compress(bytes(rest)) + deflate.flush()
-
-
-def wait_for_reconnection(world: World, tab: Any) -> None:
-    """Wait until the page has closed its connection and plays on another."""
-    until = time.monotonic() + 60
-    while len(world.connections) < 2:
-        assert time.monotonic() < until
-        tab.wait_for_timeout(50)
-    tab.wait_for_selector("#overlay-button:visible")
 
 
 # The script's modules

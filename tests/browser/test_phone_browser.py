@@ -1,5 +1,4 @@
 """The game page on a phone: size of the picture, buttons for thumbs, messages, and a dead connection."""
-# ruff: noqa: F811 - fixtures are imported from test_pages_browser
 
 from __future__ import annotations
 
@@ -10,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import PATIENCE, hold_timers, own_page
-from tests.browser.test_pages_browser import LAST_PICTURE, NOWHERE, World, shot, tell, world  # noqa: F401
+from tests.browser.conftest import hold_timers, own_page
+from tests.browser.world import LAST_PICTURE, NOWHERE, PATIENCE, World, shot, tell
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
-from tests.browser.conftest import PATIENCE
+from tests.browser.world import PATIENCE
 from trial.wire import round_trips
 
 WANTED = 10  # round trips while the page is busy

@@ -1,5 +1,4 @@
 """Games that are drawn by objects, in a real Chromium on a real trial server."""
-# ruff: noqa: F811 - fixtures are imported from test_pages_browser
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ import pytest
 from PIL import Image
 
 from local.rehearsal.study_process import ROOT
-from tests.browser.conftest import PATIENCE
-from tests.browser.test_pages_browser import FLAWS, World, deflated_zeros, shot, world  # noqa: F401
+from tests.browser.world import FLAWS, PATIENCE, World, deflated_zeros, shot
 from tests.trial.conftest import Running
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from local.rehearsal.study_process import servers_of, wait_until_gone
-from tests.browser.conftest import PATIENCE
+from tests.browser.world import PATIENCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 

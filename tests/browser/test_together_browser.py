@@ -13,11 +13,10 @@ import pytest
 
 from testing.browser import ARGUMENTS, chromium_path, html_page
 from testing.waiting import until
-from tests.browser.conftest import PATIENCE, hold_timers, note_texts, wait_for_noted
-from tests.browser.test_pages_browser import FLAWS, LAST_PICTURE, World, shot, tell, world
+from tests.browser.conftest import hold_timers, note_texts, wait_for_noted
+from tests.browser.world import FLAWS, LAST_PICTURE, PATIENCE, World, shot, tell
 from trial.core.session import PARTNER_MISSING, PING
 
-__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 SIZES = [(360, 740), (1280, 800)]
 LOBBY = {

@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from tests.browser.test_pages_browser import FLAWS, World, play, shot, tell, world
+from tests.browser.world import FLAWS, World, play, shot, tell
 
-__all__ = ["world"]  # a fixture
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 

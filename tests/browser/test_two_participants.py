@@ -12,8 +12,8 @@ import pytest
 from bots.links import with_user
 from local.rehearsal.study_process import StudyProcess
 from tests.browser.conftest import Hold
-from tests.browser.test_pages_browser import FLAWS, shot
 from tests.browser.test_together_browser import asleep, players_shown, wait_for_text
+from tests.browser.world import FLAWS, shot
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]

@@ -11,7 +11,8 @@ import pytest
 
 from bots.links import with_user
 from local.rehearsal.study_process import StudyProcess
-from tests.browser.conftest import PATIENCE, SHOTS, Hold, note_texts, wait_for_noted
+from tests.browser.conftest import Hold, note_texts, wait_for_noted
+from tests.browser.world import PATIENCE, SHOTS
 from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
