@@ -182,7 +182,7 @@ $content
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n</div>',
     "reading": """
 <section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>
-<p class="result" id="reading-score"></p>
+<p id="reading-score"></p>
 $texts
 <p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
 </section>""",

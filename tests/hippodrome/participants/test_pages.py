@@ -583,6 +583,14 @@ def test_a_page_has_its_script_and_style_without_comments(name: str, page: Page)
     assert frame.style() == re.sub(r"([{;,}])\n", r"\1", dense).replace(";}", "}")
 
 
+def test_each_class_in_the_html_of_the_pages_has_a_rule_in_a_style_sheet() -> None:
+    written = [*(ROOT / "web").glob("*.html"), Path(frame.__file__), Path(pages.__file__)]
+    quoted = [each for file in written for each in re.findall('class="([^"$]+)"', file.read_text())]
+    styles = "".join(file.read_text() for file in (ROOT / "web").glob("*.css"))
+    names = {name for each in quoted for name in each.split()}
+    assert not [name for name in names if not re.search(rf"\.{name}\b", styles)]
+
+
 def test_spaces_that_have_a_meaning_in_a_style_stay() -> None:
     quoted = re.findall('"[^"]*"', code((ROOT / "web" / "style.css").read_text()))
     assert not [text for text in quoted if re.search(" [{};>~]|[{};>~:,] ", text)]
