@@ -333,6 +333,20 @@ def test_leaving_the_window_releases_the_key(world: World, tab: Any) -> None:
     world.wait_for({"action": "right", "held": False})
 
 
+def test_the_command_key_releases_the_key(world: World, tab: Any) -> None:
+    """macOS sends no keyup of another key while Cmd is held: the browser does not tell that the arrow is released."""
+    play(world, tab)
+    tab.keyboard.down("ArrowRight")
+    world.wait_for({"action": "right", "held": True})
+    tab.keyboard.down("Meta")
+    world.wait_for({"action": "right", "held": False})
+    tab.keyboard.up("Meta")
+    tab.keyboard.up("ArrowRight")  # the browser of this test knows that the arrow was held
+    world.received.clear()
+    tab.keyboard.down("ArrowRight")
+    world.wait_for({"action": "right", "held": True})
+
+
 def test_each_control_of_the_project_has_a_button(world: World, tab: Any) -> None:
     play(world, tab)
     names = tab.eval_on_selector_all(

@@ -1,5 +1,5 @@
 // The keys of the game, and the legend that lists them.
-import { command, press, release } from "./actions.js";
+import { command, press, release, releaseAll } from "./actions.js";
 import { hooks } from "./hooks.js";
 import { find, make } from "./page.js";
 
@@ -46,6 +46,7 @@ export function showLegend(directions, others, shown, space, lines = []) {
 }
 
 export function onKeyDown(event) {
+  if (event.key === "Meta") releaseAll(); // macOS sends no keyup of other keys while Cmd is held
   const does = hooks.key(event) ?? keys.get(event.code);
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const { target } = event;
