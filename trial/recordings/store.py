@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 from pathlib import Path
 from typing import Protocol
 
@@ -21,7 +22,10 @@ class Store(Protocol):
         ...
 
     def create(self, key: str, data: bytes | Path) -> bool:
-        """Create a document of bytes or of a file's content. If the key exists, return False and change nothing."""
+        """Create a document of bytes or of a file's content. If the key exists, return False and change nothing.
+
+        A call that raised may have created the document. Then the next call for it returns True.
+        """
         ...
 
 
@@ -61,6 +65,6 @@ class FolderStore:
         disk.make_folder(path.parent)
         try:
             disk.create(path, data)
-        except FileExistsError:
-            return False
+        except FileExistsError:  # the file may be of an earlier call, which then could not sync the folder
+            return filecmp.cmp(path, data, shallow=False) if isinstance(data, Path) else path.read_bytes() == data
         return True

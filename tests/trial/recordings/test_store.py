@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,8 +12,10 @@ from typing import NamedTuple
 import pytest
 
 from hippodrome.model import server
+from protocol import disk
 from testing.strict_s3 import StrictS3
 from testing.studies import study
+from trial.recordings.spool import store_file
 from trial.recordings.store import Store, open_store
 
 FOLDER = "study/users/P1"
@@ -56,6 +59,25 @@ def test_nothing_is_overwritten(opened: OpenedStore) -> None:
     assert opened.store.create(ANSWER, b"first") is True
     assert opened.store.create(ANSWER, b"second") is False
     assert opened.store.get(ANSWER) == b"first"
+
+
+async def test_a_recording_is_stored_once_if_its_folder_cannot_be_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, recording, full = open_store(str(tmp_path / "data")), tmp_path / "recording", iter([True])
+    assert store.create("k/other.jsonl.gz", b"so the folder is there") is True
+    recording.write_bytes(b"the recording")
+    sync = disk.sync_folder
+
+    def fail_once(folder: Path) -> None:
+        if next(full, False):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(folder)
+
+    monkeypatch.setattr(disk, "sync_folder", fail_once)
+    await store_file(store, "k/3-trial.jsonl.gz", recording)
+    assert sorted(path.name for path in (tmp_path / "data" / "k").iterdir()) == ["3-trial.jsonl.gz", "other.jsonl.gz"]
+    assert not recording.exists()
 
 
 def test_one_of_many_writers_creates_the_file(tmp_path: Path) -> None:
