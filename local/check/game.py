@@ -125,7 +125,7 @@ class CheckedGame:
             name = player.name
             if name not in now.to_act:
                 continue
-            allowed = legal_actions(len(player.action_space), now.masks.get(name))
+            allowed = legal_actions(len(player.action_space), now.masks.get(name)) or [player.idle]
             if player.human and name != replaced:
                 actions[name] = self._press(allowed)
             elif name in self._policies or name == replaced:

@@ -287,6 +287,14 @@ def test_turn_by_turn_no_action_is_taken_that_the_mask_forbids(folder: Path) -> 
     assert tried(folder) == []
 
 
+def test_turn_by_turn_the_idle_action_is_taken_if_the_mask_allows_none_of_the_named_actions(folder: Path) -> None:
+    config(folder, "  maxEpisodes: 1\n", "  maxEpisodes: 1\n  pace: turns\n")
+    agent(folder, "return 0, {}", "return 0, {'action_mask': [0, 0, 1]}")
+    agent(folder, "self.n >= 30, False, {}", "self.n >= 30, False, {'action_mask': [0, 0, 1]}")
+    agent(folder, "self.n += 1", "self.n += 1; assert action == 0, 'another action'")
+    assert tried(folder) == []
+
+
 def test_an_agent_may_turn_names_into_actions_of_the_environment(folder: Path) -> None:
     with_a_third_name(folder, "return self.env.step([0, 0, 1][action])")
     assert tried(folder) == []
