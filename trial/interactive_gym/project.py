@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -221,7 +222,7 @@ def _players(
             remark(f"the policy of {player} is not found: {plays}")
         if looking.is_file(config, plays) and look.joined_as_sorted:
             players[player] = (f"sample:policies/{name}", "")
-        elif file is not None and name != file.name and plays not in files:
+        elif file is not None and name != file.name and os.path.normpath(plays) not in files:
             raise Unplayable(f"policy_mapping has two files that are called {file.name}: give them different names")
         else:
             players[player] = (f"agent:Policy{number}", f"Policy{number}")

@@ -178,7 +178,7 @@ def test_files_of_functions_with_the_same_name_are_refused_if_one_would_hide_the
         (tmp_path / folder / "two.txt").write_text(inside)
     said = refusal_of(tmp_path / "mine", THREE)
     assert said == "policy_mapping has two files that are called two.txt: give them different names"
-    project, _ = project_of(tmp_path, THREE)
+    project, _ = project_of(tmp_path, THREE.replace("left/", "./left/").replace("right/", "left/../right/"))
     assert (project / "left/two.txt").read_text() + (project / "right/two.txt").read_text() == "12"
 
 
