@@ -38,9 +38,9 @@ from trial.recordings import recording
 RATE = 30  # frames a second
 SETTLE = 2.0  # seconds of play before the measurement
 SECONDS = 8.0  # of play that are measured
-MOST_CPU = 1.2  # the goal for a frame of the example: ms of processor time
+MAX_CPU = 1.2  # the goal for a frame of the example: ms of processor time
 TRIALS = 32  # trials that one core has to serve
-MOST_MEMORY = 45.0  # the goal for the memory of each trial: MB
+MAX_MEMORY = 45.0  # the goal for the memory of each trial: MB
 ACTIONS = ("noop", "up", "right", "left", "down")
 TOGETHER = 0.05  # pictures that are drawn within so many seconds are acknowledged together
 _ID = struct.Struct("!BI")  # the beginning of a binary message: kind and number
@@ -294,7 +294,7 @@ def judged_cpu(found: ServerLoad, alone: float) -> Row:
         found.cpu,
         "ms",
         yardstick=alone,
-        at_most=MOST_CPU,
+        at_most=MAX_CPU,
         judge="value",
         bound="ours, for a processor and a Python as fast as the image's; the detail has their speed here",
         detail={"share of the frames delivered": found.share, "MB resident": found.resident, **interpreter()},
@@ -326,7 +326,7 @@ def judged_core(found: list[ServerLoad]) -> Iterator[Row]:
         f"memory of each of {len(found)} trials of the example",
         statistics.mean(one.memory for one in found),
         "MB",
-        at_most=MOST_MEMORY,
+        at_most=MAX_MEMORY,
         bound="ours; each process's own pages, and its part of shared ones",
         detail={"MB resident, shared pages counted in each": statistics.mean(one.resident for one in found)},
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 from hippodrome.model import ids
 
-MOST_TRIED = 10_000
+MAX_TRIED = 10_000
 
 
 def user_ids(
@@ -17,14 +17,14 @@ def user_ids(
     """Return an id for each of the `players`, such that `matching` by groups lets them play together.
 
     With `group` all ids belong to one group. With `mixed` each belongs to the next group, and after the last group
-    comes the first again. `new` makes an id from a number. If `MOST_TRIED` ids do not suffice, the result is shorter.
+    comes the first again. `new` makes an id from a number. If `MAX_TRIED` ids do not suffice, the result is shorter.
     """
     made = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):
         return list(itertools.islice(made, players))
     found: list[str] = []
     first: int | None = None
-    for user_id in itertools.islice(made, MOST_TRIED):
+    for user_id in itertools.islice(made, MAX_TRIED):
         group = ids.group(project_id, user_id, groups)
         first = group if first is None else first
         step = len(found) if matching == "mixed" else 0

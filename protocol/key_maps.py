@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol import keyboard, values
-from protocol.values import LONGEST_NAME, Keys, SectionProblem, checked
+from protocol.values import MAX_NAME, Keys, SectionProblem, checked
 
 MAX_KEYS = 100
 """The largest number of entries in one map: keys of one player, labels, or names."""
-_LABEL = values.text("the text of a button", LONGEST_NAME)
-_NAME = values.text("what participants read", LONGEST_NAME)
+_LABEL = values.text("the text of a button", MAX_NAME)
+_NAME = values.text("what participants read", MAX_NAME)
 
 
 def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[SectionProblem]]:

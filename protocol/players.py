@@ -26,7 +26,7 @@ ALL_KINDS = "human, random, idle, agent:Class, a file such as policies/partner.o
 
 MAX_PLAYERS = 64
 _MAX_FILES_NAMED = 5
-_NAME = values.text("the name of a player", values.LONGEST_NAME)
+_NAME = values.text("the name of a player", values.MAX_NAME)
 _PLAYS = values.text(ALL_KINDS, 200)
 _GROUP = re.compile(r"[0-9]{1,9}")
 _CLASS = re.compile(r"[A-Za-z_]\w*")

@@ -21,7 +21,7 @@ OWN_CONTROL = "A control of your own: a button with this name; a press calls fee
 SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
 """Keys of games of several participants (`project.players`). A registration leaves out a key with its default value."""
 MAX_EPISODES = 1_000_000
-LONGEST_BREAK = 600
+MAX_BREAK = 600
 """Seconds."""
 HIGHEST_RATE = 240
 """The highest frame rate of any project, in frames per second."""
@@ -40,7 +40,7 @@ def _break(value: object) -> float | str:
     if isinstance(value, str) and number_in(value) is None and value.strip():
         return page(value)
     try:
-        return values.number(0, LONGEST_BREAK)(value)  # type: ignore[return-value]
+        return values.number(0, MAX_BREAK)(value)  # type: ignore[return-value]
     except ValueError as error:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
@@ -62,7 +62,7 @@ class TrialSection:
         3,
         "Seconds of the break between two episodes, with the score and a countdown; 0 is no break. Or a file of "
         "steps/, which the page shows until the participant goes on.",
-        {"anyOf": [{"type": "number", "minimum": 0, "maximum": LONGEST_BREAK}, {"type": "string"}]},
+        {"anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_BREAK}, {"type": "string"}]},
     )
     instructions: str | None = keyed.key(
         page,

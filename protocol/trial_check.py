@@ -11,9 +11,9 @@ from protocol import trial_rules, values
 from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, RESERVED_CONTROLS, TrialSection
 from protocol.trial_keys import keys, names
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import LONGEST_NAME, Check, Keys, SectionProblem, checked, is_blank
+from protocol.values import MAX_NAME, Check, Keys, SectionProblem, checked, is_blank
 
-_CONTROL = values.text("the name of a control", LONGEST_NAME)
+_CONTROL = values.text("the name of a control", MAX_NAME)
 
 
 def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 Check = Callable[[object], object]
 Keys = tuple[str | int, ...]
 """The path of a value: keys and, in lists, positions from 0."""
-LONGEST_NAME = 64
+MAX_NAME = 64
 """Characters of the name of an action, a player, or one of the project's own controls."""
 
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
@@ -118,7 +118,7 @@ def action_name(value: object) -> str:
     return str(_ACTION_NAME(str(value) if isinstance(value, int) and not isinstance(value, bool) else value))
 
 
-_ACTION_NAME = text("the name of an action", LONGEST_NAME)
+_ACTION_NAME = text("the name of an action", MAX_NAME)
 
 
 def step_file(text: str) -> str:

@@ -39,7 +39,7 @@ LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
 IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
 UNUSED = 10  # minutes until a server without its participant ends: IDLE_SECONDS in trial/settings.py
-UNUSED_AHEAD = 35  # minutes until a server started ahead of a session is stopped: LONGEST_OPEN, and the next sweep
+UNUSED_AHEAD = 35  # minutes until a server started ahead of a session is stopped: MAX_OPEN, and the next sweep
 DNS_QUERIES = Range(4, 10, 40)
 
 

@@ -41,7 +41,7 @@ CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
 _UNKNOWN_AUTHORITY = ("<the authority>",)
 
 REAL = "python -m deploy certificate --production"
-_LONGEST_BUNDLE = 1_000_000  # bytes
+_MAX_BUNDLE = 1_000_000  # bytes
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ def _bundle(path: Path | None) -> str:
     if path is None:
         return ""
     try:
-        text = path.read_text() if path.stat().st_size <= _LONGEST_BUNDLE else ""
+        text = path.read_text() if path.stat().st_size <= _MAX_BUNDLE else ""
     except (OSError, UnicodeDecodeError):
         text = ""
     if "-----BEGIN CERTIFICATE-----" not in text:

@@ -23,7 +23,7 @@ from hippodrome.aws import errors
 
 _AT_ONCE = 4
 PAUSE = 10  # seconds between two tries to make the bucket
-LONGEST_DELETION = 600
+MAX_DELETION = 600
 """The most seconds to wait while CreateBucket answers OperationAborted, since S3 deletes a bucket of that name: this
 takes minutes, in rare cases up to an hour (aws/aws-cli issues 2411 and 2593)."""
 SETTLING = 180
@@ -139,7 +139,7 @@ class CodeBucket:
         place: dict[str, Any] = {}
         if self._account.region != "us-east-1":  # S3 refuses us-east-1 as a LocationConstraint
             place = {"CreateBucketConfiguration": {"LocationConstraint": self._account.region}}
-        for waited in range(0, LONGEST_DELETION, PAUSE):
+        for waited in range(0, MAX_DELETION, PAUSE):
             try:
                 self._s3.create_bucket(Bucket=self.name, ObjectOwnership="BucketOwnerEnforced", **place)
                 break

@@ -19,7 +19,7 @@ _KNOWN_TO_HIPPO = frozenset(
 )
 _UNKNOWN_TO_HIPPO = sorted(NAMES["project",] - _KNOWN_TO_HIPPO)
 """The keys of `project` that HIPPO's script does not know, so a registration by it keeps their earlier values."""
-_LONGEST_SHOWN = 300  # characters of such a value in a remark
+_MAX_SHOWN = 300  # characters of such a value in a remark
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"
 _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, start() of the agent is given "none"'
 
@@ -87,9 +87,7 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     defaults = ProjectKeys().model_dump(mode="json", by_alias=True)
     kept = {key: earlier[key] for key in _UNKNOWN_TO_HIPPO if key not in project and key in earlier}
     kept = {key: value for key, value in kept.items() if value != defaults[key]}
-    remarks += [
-        f"project.{key}: {printable(json.dumps(value), _LONGEST_SHOWN)} {_STAYS}" for key, value in kept.items()
-    ]
+    remarks += [f"project.{key}: {printable(json.dumps(value), _MAX_SHOWN)} {_STAYS}" for key, value in kept.items()]
     task = {key: earlier[key] for key in ("taskDefinition", "serverPort") if key not in project and key in earlier}
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):

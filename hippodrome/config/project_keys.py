@@ -29,7 +29,7 @@ from protocol.values import Keys, Plain, as_text, number_in, show, step_file
 MAX_STEPS = 500
 MAX_HOSTS = 50
 """Origins in `allowedHosts`."""
-LONGEST_TEXT = 500  # characters
+MAX_TEXT = 500  # characters
 
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
 _DOMAIN = re.compile(rf"({_LABEL}\.)+(?![0-9]+$){_LABEL}", re.IGNORECASE)
@@ -197,7 +197,7 @@ def own_text(value: object) -> str:
     return "" if values.is_blank(value) else str(_OWN_TEXT(value))
 
 
-_OWN_TEXT = values.text('text, in quotes: "…"', LONGEST_TEXT)
+_OWN_TEXT = values.text('text, in quotes: "…"', MAX_TEXT)
 _MATCHING: dict[str, object] = {
     "anyOf": [
         {"enum": list(MATCHINGS)},
@@ -320,7 +320,7 @@ class ProjectKeys(Model):
         default={},
         json_schema_extra={
             "properties": {
-                name: {"type": ["string", "null"], "description": text, "maxLength": LONGEST_TEXT}
+                name: {"type": ["string", "null"], "description": text, "maxLength": MAX_TEXT}
                 for name, text in ENGLISH.items()
             },
             "additionalProperties": False,

@@ -15,7 +15,7 @@ from protocol.trial_sections import SceneSection, Ui
 _OWN_CONTROLS: dict[str, Any] = {
     "additionalProperties": {"type": ["boolean", "null"], "description": trial.OWN_CONTROL},
     "patternProperties": {
-        f"^({'|'.join(sorted(trial.RESERVED_CONTROLS))})$|^.{{{values.LONGEST_NAME + 1},}}$": {"enum": [False, None]}
+        f"^({'|'.join(sorted(trial.RESERVED_CONTROLS))})$|^.{{{values.MAX_NAME + 1},}}$": {"enum": [False, None]}
     },
 }
 """The values of other keys in `ui`. Reserved names stand in a pattern: editors propose all keys under `properties`."""

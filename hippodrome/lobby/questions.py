@@ -25,11 +25,11 @@ WAITED_STEPS = 5
 """The seconds to a multiple of which waiting times are rounded down. A question is asked again as often."""
 ANSWERED_WITHIN = timedelta(seconds=10)
 """A question without an answer is asked again after this time: servers look every two seconds, `match` has five."""
-MOST_WAITING = 200
+MAX_WAITING = 200
 """The most participants in one question. If more wait, the question has the participants who came first."""
-MOST_CAME = 200
+MAX_CAME = 200
 """The most further participants in the document. Others are added by a later request, when there is room."""
-MOST_ANSWERS = 16 * 1024
+MAX_ANSWERS = 16 * 1024
 """The most bytes of a candidate with their answers. If there are more, the answers are left out."""
 
 
@@ -71,13 +71,13 @@ class MatchAnswer:
 def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
     """Return what `match` gets of a participant who comes. Answers that are too large are left out."""
     found = Candidate(label, group=group, answers=answers)
-    return found if len(to_json(found)) <= MOST_ANSWERS else Candidate(label, group=group)
+    return found if len(to_json(found)) <= MAX_ANSWERS else Candidate(label, group=group)
 
 
 def with_candidate(question: Question, one: Candidate) -> Question:
     """Return the document with this participant added to `came`, for the next question.
 
-    It is unchanged if the participant is in the document, or if `came` has `MOST_CAME` participants already.
+    It is unchanged if the participant is in the document, or if `came` has `MAX_CAME` participants already.
     """
     if one.id in question.candidates() or is_full(question):
         return question
@@ -86,7 +86,7 @@ def with_candidate(question: Question, one: Candidate) -> Question:
 
 def is_full(question: Question) -> bool:
     """Return whether no other participant can be added to the document before the next question."""
-    return len(question.came) >= MOST_CAME
+    return len(question.came) >= MAX_CAME
 
 
 def read(body: bytes, question: Question) -> MatchAnswer:
@@ -96,7 +96,7 @@ def read(body: bytes, question: Question) -> MatchAnswer:
     except (ValueError, RecursionError):
         return MatchAnswer(problem="the answer of match cannot be read")
     asked, matched, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
-    for labels in found[:MOST_WAITING]:
+    for labels in found[:MAX_WAITING]:
         if len(labels) != question.players or len(set(labels)) != len(labels):
             problem = problem or f"match chose other members than {question.players} different participants"
         elif not asked.issuperset(labels):
@@ -128,7 +128,7 @@ def next_question(
     asked = sorted(
         (one for one in free if one.label in candidates and one.label not in matched), key=lambda one: one.order
     )
-    asked = asked[:MOST_WAITING]
+    asked = asked[:MAX_WAITING]
     if not _is_due(question, project, {one.label for one in asked}, answered=answered, now=now):
         return question
     in_question = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)

@@ -21,7 +21,7 @@ SALT = "hippo"
 A registration keeps the salt, so tickets and codes stay valid.
 """
 
-USUAL_RUNTIME, LONGEST_RUNTIME = 60, 1440  # minutes: HIPPO's default, and the most that we take
+USUAL_RUNTIME, MAX_RUNTIME = 60, 1440  # minutes: HIPPO's default, and the most that we take
 _PAGE = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 
 
@@ -115,7 +115,7 @@ def _minutes(given: object) -> int:
         return USUAL_RUNTIME
     if isinstance(given, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(given)):
         raise ValueError("its maxRuntime is no number of minutes")
-    return min(int(str(given)), LONGEST_RUNTIME)
+    return min(int(str(given)), MAX_RUNTIME)
 
 
 def _is_blank(value: object) -> bool:

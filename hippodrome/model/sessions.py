@@ -11,18 +11,18 @@ from datetime import timedelta
 from hippodrome.model.project import Project
 from hippodrome.ports import Settings
 
-LONGEST_OPEN = timedelta(minutes=30)
-SHORTEST_OPEN = timedelta(minutes=10)
+MAX_OPEN = timedelta(minutes=30)
+MIN_OPEN = timedelta(minutes=10)
 
 
 def open_for(project: Project, settings: Settings) -> timedelta:
     """Return for how long after its request a server that was started ahead may be given to a session.
 
     The installation's maxRuntime bounds the sum of waiting and play. If the project's maxRuntime leaves less than
-    `SHORTEST_OPEN` for waiting, the waiting takes time from the play.
+    `MIN_OPEN` for waiting, the waiting takes time from the play.
     """
     left = timedelta(minutes=settings.max_runtime - project.max_runtime)
-    return max(SHORTEST_OPEN, min(LONGEST_OPEN, left))
+    return max(MIN_OPEN, min(MAX_OPEN, left))
 
 
 def lifetime(project: Project, settings: Settings) -> timedelta:

@@ -14,7 +14,7 @@ from hippodrome.model.records import Record
 from hippodrome.ports import Settings
 
 POOLS = "_spares/"
-LONGEST_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
+MAX_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
 COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, from which the waiting time is reserved
 MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for a shorter time, none is started
 
@@ -26,7 +26,7 @@ def pool_key(project_id: str) -> str:
 
 def longest_wait(project: Project, settings: Settings) -> timedelta:
     """Return how long a warm server waits at most. The installation's maxRuntime bounds the sum of waiting and play."""
-    longest = LONGEST_WAIT if project.max_server_hours is None else COUNTED_WAIT
+    longest = MAX_WAIT if project.max_server_hours is None else COUNTED_WAIT
     return min(longest, timedelta(minutes=settings.max_runtime) - sessions.lifetime(project, settings))
 
 

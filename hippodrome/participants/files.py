@@ -7,7 +7,7 @@ from hippodrome.model import ids
 from hippodrome.participants.page_error import PageError
 from hippodrome.storage.project_cache import ProjectCache
 
-LONGEST_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
+MAX_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 _HEADERS = {
     "Cache-Control": "public, max-age=300",
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",  # no script in an SVG runs
@@ -33,7 +33,7 @@ class Files:
         )
         name = parts[-1]
         kind = KINDS.get(name.rsplit(".", 1)[-1].lower())
-        is_valid = name.isprintable() and not name.startswith(".") and len(name) <= LONGEST_NAME
+        is_valid = name.isprintable() and not name.startswith(".") and len(name) <= MAX_NAME
         found = self._project_cache.document(f"{project.id}/steps/{name}") if project and kind and is_valid else None
         if found is None or kind is None:
             raise PageError(404, "There is nothing here", "Please open your study link again.")

@@ -28,7 +28,7 @@ from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 from protocol.session import member_token
 
-LONGEST_DELAY = 24 * 60 * 60  # seconds
+MAX_DELAY = 24 * 60 * 60  # seconds
 NO_PROOF = (
     "Nothing was started or stopped: only the participant may do this, and the request proves nothing. Send the fields "
     f"{forms.STEP} and {forms.TICKET} of one of the participant's pages along (`step` and `ticket` beside `page` in "
@@ -53,7 +53,7 @@ class Relays:
     def stop(self, request: Request) -> Response:
         """Publish the stop message of the participant's server, or set a timer that does so after `delay`.
 
-        The request's field `delay` is in seconds, 0 to `LONGEST_DELAY`. A refused request gets a status and a sentence.
+        The request's field `delay` is in seconds, 0 to `MAX_DELAY`. A refused request gets a status and a sentence.
         """
         return self._respond(request, self._stop)
 
@@ -162,6 +162,6 @@ def _delay(answers: Mapping[str, Any]) -> int:
         delay = int(given) if not isinstance(given, bool) else -1
     except (TypeError, ValueError, OverflowError):
         delay = -1
-    if not 0 <= delay <= LONGEST_DELAY:
-        raise Refusal(400, f"delay is a whole number of seconds, 0 to {LONGEST_DELAY}.")
+    if not 0 <= delay <= MAX_DELAY:
+        raise Refusal(400, f"delay is a whole number of seconds, 0 to {MAX_DELAY}.")
     return delay

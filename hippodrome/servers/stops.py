@@ -17,7 +17,7 @@ from hippodrome.servers.services import ServerServices
 from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 
-MOST_READS = 2_000  # of records in one invocation; messages beyond them come again, but at least one is handled
+MAX_READS = 2_000  # of records in one invocation; messages beyond them come again, but at least one is handled
 
 
 class Stops:
@@ -43,7 +43,7 @@ class Stops:
             failure("the list of projects cannot be read", error)
             return list(batch)
         wanted = list(dict.fromkeys(batch))
-        now = wanted[: max(1, MOST_READS // max(1, len(projects)))]
+        now = wanted[: max(1, MAX_READS // max(1, len(projects)))]
         candidates = [StopServer(project_id, message.user_id) for message in now for project_id in projects]
         found, unread = for_each(self._services.platform, candidates, self._open, "a record cannot be read")
         stops = [stop for _, stop in found]

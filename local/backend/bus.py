@@ -28,7 +28,7 @@ from protocol import disk
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
 
-LONGEST_DELAY = 900  # seconds, as SQS
+MAX_DELAY = 900  # seconds, as SQS
 TASK = "task"  # the queue of `task_changed`: ECS events, and what `send_delayed` delays
 QUEUES = (Topic.START.value, Topic.STOP.value, TASK)
 BATCH = 10
@@ -250,8 +250,8 @@ class FolderBus:
         self._queues[topic.value].put(message)
 
     def send_delayed(self, message: Message, seconds: int) -> None:
-        if not 0 <= seconds <= LONGEST_DELAY:
-            raise ValueError(f"a message can be delivered 0 to {LONGEST_DELAY} seconds later, not {seconds}")
+        if not 0 <= seconds <= MAX_DELAY:
+            raise ValueError(f"a message can be delivered 0 to {MAX_DELAY} seconds later, not {seconds}")
         self._queues[TASK].put(message, seconds)
 
     def emit(self, event: Mapping[str, Any]) -> None:

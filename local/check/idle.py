@@ -15,7 +15,7 @@ import numpy as np
 
 SECONDS = 3.0  # after so many seconds `actions_without_effect` gives up
 _STATES = (0, 2, 5, 9)  # each state by its number of steps after a reset
-_MOST_ACTIONS = 10
+_MAX_ACTIONS = 10
 
 
 def actions_without_effect(
@@ -24,7 +24,7 @@ def actions_without_effect(
     """If the idle action changes the picture in a state where another does not, return the actions that never do.
 
     Otherwise return None, also if this is not known: the game is random, or the time or the episode was over too soon.
-    Only the first `_MOST_ACTIONS` actions are tried, in the states of `_STATES`. If the time or the episode is over
+    Only the first `_MAX_ACTIONS` actions are tried, in the states of `_STATES`. If the time or the episode is over
     after such a state was found, the result is what the states before have shown.
 
     `begin(seed)` begins an episode. `step(action)` takes a step, and returns whether the episode is over. `picture`
@@ -33,7 +33,7 @@ def actions_without_effect(
     until = time.monotonic() + SECONDS
     random = Random(1)  # noqa: S311 - the same each time
     walk = [random.randrange(count) for _ in range(max(_STATES))]
-    others = [action for action in range(min(count, _MOST_ACTIONS)) if action != idle]
+    others = [action for action in range(min(count, _MAX_ACTIONS)) if action != idle]
     still = set(others)
     found = False
     for state in _STATES:

@@ -12,7 +12,7 @@ from hippodrome.participants import frame
 from local.web import access
 from local.web.gateway import ROUTES, GatewayResponse, Scope, answer_of, event_of, headers_of, joined, json_answer
 
-LARGEST_BODY = 10 * 1024 * 1024
+MAX_BODY = 10 * 1024 * 1024
 THREADS = 32
 
 Handler = Callable[[dict[str, Any], object], Any]
@@ -67,7 +67,7 @@ class App:
         body = await _body(receive)
         if body is None:
             return None
-        if len(body) > LARGEST_BODY:
+        if len(body) > MAX_BODY:
             return _plain(413, "Request Entity Too Large\n")
         event = event_of(scope, body, route, parameters)
         loop = asyncio.get_running_loop()
@@ -89,13 +89,13 @@ class App:
 
 
 async def _body(receive: Receive) -> bytes | None:
-    """The body, cut off soon after LARGEST_BODY; None if the client has closed its connection."""
+    """The body, cut off soon after MAX_BODY; None if the client has closed its connection."""
     body = bytearray()
     while True:
         message = await receive()
         if message["type"] == "http.disconnect":
             return None
-        if len(body) <= LARGEST_BODY:
+        if len(body) <= MAX_BODY:
             body += message.get("body", b"")
         if not message.get("more_body"):
             return bytes(body)

@@ -45,4 +45,4 @@ def test_scenes_and_effects_of_keys_are_timed(chromium: Any, monkeypatch: pytest
     assert found.seen.share[scenes.RATE] > 0
     assert found.seen.since_opened[scenes.RATE] <= 1.1, "each picture counts once"
     assert 0 < found.bytes_a_tick < 100_000
-    assert 0 < found.weight < scenes.MOST_WEIGHT
+    assert 0 < found.weight < scenes.MAX_WEIGHT

@@ -13,7 +13,7 @@ from PIL import Image
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 DRAWN = sorted(path.parent.name for path in EXAMPLES.glob("*/make_assets.py"))
-MOST_BYTES = 40_000
+MAX_BYTES = 40_000
 """Bytes of all pictures of an example together."""
 
 
@@ -32,4 +32,4 @@ def test_the_script_draws_the_pictures_of_the_example(example: str, tmp_path: Pa
 
 @pytest.mark.parametrize("example", DRAWN)
 def test_pictures_are_small(example: str) -> None:
-    assert sum(file.stat().st_size for file in (EXAMPLES / example / "assets").iterdir()) < MOST_BYTES
+    assert sum(file.stat().st_size for file in (EXAMPLES / example / "assets").iterdir()) < MAX_BYTES

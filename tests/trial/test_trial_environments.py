@@ -29,7 +29,7 @@ from tests.trial.conftest import grid_agent
 from tests.trial.test_trial_tls import KEYS, put
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError, RemoteVectorEnv, linux
 from trial.programs import environments
-from trial.programs.environments import LARGEST_REQUEST, MAX_PROGRAMS, REQUESTS_A_SECOND
+from trial.programs.environments import MAX_PROGRAMS, MAX_REQUEST, REQUESTS_A_SECOND
 
 TOKEN = "the-secret-token"
 SERVES = {"gym": "environments", "startingFrameRate": 30}
@@ -129,7 +129,7 @@ def test_closes_pass_with_their_codes_and_words(launch: Any) -> None:
 def test_a_request_that_is_too_large_ends_its_connection_alone(launch: Any) -> None:
     server = launch(agent(), SERVES)
     with remote_env(server) as env, connect(url(server), compression=None, proxy=None) as large:
-        large.send("x" * (LARGEST_REQUEST + 1))
+        large.send("x" * (MAX_REQUEST + 1))
         with pytest.raises(ConnectionClosed):
             large.recv(SECONDS)
         assert large.close_code == 1009

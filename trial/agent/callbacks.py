@@ -30,12 +30,12 @@ from trial.recordings.recorded_values import text_of
 
 log = logging.getLogger("trial")
 
-MOST_VALUES = 1_000
+MAX_VALUES = 1_000
 """The most values that one call of a callback may record."""
-LONGEST_NAME = 200
+MAX_NAME = 200
 """The most characters of the name of a recorded value."""
-_LONGEST_ERROR = 2_000  # characters of an error in the recording
-_MOST_WAITING = 100_000  # finished lines that wait to be written
+_MAX_ERROR = 2_000  # characters of an error in the recording
+_MAX_WAITING = 100_000  # finished lines that wait to be written
 
 Record = Callable[[str, Any], None]
 
@@ -283,20 +283,20 @@ class _Notes:
         return [self._lines.popleft() for _ in range(count)]
 
     def add(self, **fields: Any) -> None:
-        if len(self._lines) < _MOST_WAITING:
+        if len(self._lines) < _MAX_WAITING:
             self._lines.append(recording.line("callback", **self._stamp(), **fields))
             self.recorded += 1
 
     def once(self, text: str) -> bool:
-        """Return whether this text is new. After MOST_VALUES different texts, no text counts as new."""
-        first = text not in self._warnings and len(self._warnings) < MOST_VALUES
+        """Return whether this text is new. After MAX_VALUES different texts, no text counts as new."""
+        first = text not in self._warnings and len(self._warnings) < MAX_VALUES
         if first:
             self._warnings.add(text)
         return first
 
     def failed(self, name: str, error: BaseException, **where: Any) -> None:
         """Record and log the error that a callback raised; each different error once."""
-        words = " ".join(f"{type(error).__name__}: {_message_of(error)}".split())[:_LONGEST_ERROR]
+        words = " ".join(f"{type(error).__name__}: {_message_of(error)}".split())[:_MAX_ERROR]
         if self.once(f"{name} {words}"):
             self.add(**where, name=name, callback=name, error=self._hide(words))
             self._failed(name, error)
@@ -328,11 +328,11 @@ class _Call:
         """Record a value. If it does not fit beside the earlier values of this call, record its size instead."""
         notes = self._notes
         self._values += 1
-        if self._values > MOST_VALUES:
+        if self._values > MAX_VALUES:
             if notes.once(f"most {self._name}"):
-                log.warning("one call of %s may record %d values; it records more", self._name, MOST_VALUES)
+                log.warning("one call of %s may record %d values; it records more", self._name, MAX_VALUES)
             return
-        name = text_of(name)[:LONGEST_NAME]
+        name = text_of(name)[:MAX_NAME]
         kept, too_large = recording.bounded_extra({name: value}, self._bytes_left)
         size = too_large.get(name)
         if size is None:

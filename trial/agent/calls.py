@@ -16,7 +16,7 @@ from trial.recordings import recording
 
 log = logging.getLogger("trial")
 
-_MOST_WARNINGS = 20  # about values that are too large for the recording
+_MAX_WARNINGS = 20  # about values that are too large for the recording
 
 
 class Diverged(Exception):
@@ -139,7 +139,7 @@ class Calls:
         kept, too_large = recording.bounded_extra(values)
         for name, size in too_large.items():
             value = subject % name[:100]
-            if value not in self._warned_of and len(self._warned_of) < _MOST_WARNINGS:
+            if value not in self._warned_of and len(self._warned_of) < _MAX_WARNINGS:
                 self._warned_of.add(value)
                 log.warning("%s is too large for the recording (%d bytes); its size is recorded instead", value, size)
         return kept

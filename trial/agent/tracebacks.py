@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 _OURS = Path(__file__).resolve().parents[1]
-_LONGEST_CHAIN = 20
+_MAX_CHAIN = 20
 
 
 def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> str:
@@ -50,7 +50,7 @@ def _own_path(path: Path, folder: Path) -> str | None:
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """Yield the error and the errors that led to it, the latest first."""
     each: BaseException | None = error
-    for _ in range(_LONGEST_CHAIN):
+    for _ in range(_MAX_CHAIN):
         if each is None:
             return
         yield each

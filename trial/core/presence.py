@@ -19,7 +19,7 @@ Where = Literal["here", "reads", "awaited", "away", "policy"]
 """Where a member is, as clients show it. reads: connected, and still at the page before the game or between two
 episodes; awaited: has not come yet, or the round trip is still being measured; away: was here, and is not any more;
 policy: a policy plays in the member's place."""
-LEAST_ABSENCE = 3.0
+MIN_ABSENCE = 3.0
 """The least time that one absence uses up, in seconds; a third of `absent` (before the game: of `gather`) if that is
 less. So a member who comes and goes, and so causes one countdown after the other, soon uses their time up."""
 GIVEN_BACK = 0.25
@@ -381,8 +381,8 @@ class Presence:
 
     @property
     def _least(self) -> float:
-        """The least time that one absence uses up now: see `LEAST_ABSENCE`."""
-        return min(LEAST_ABSENCE, (self.rules.absent if self.begun else self.rules.gather) / 3)
+        """The least time that one absence uses up now: see `MIN_ABSENCE`."""
+        return min(MIN_ABSENCE, (self.rules.absent if self.begun else self.rules.gather) / 3)
 
     def _give_time_back(self, now: float) -> None:
         """Give members who have played since the last call some of their used time back. Call it before a change."""

@@ -10,8 +10,8 @@ from trial.core.effects import CloseRecording, Effect, LogAgentError, OpenRecord
 from trial.core.policies import FAILURES
 from trial.core.progress import TrialProgress
 
-_MOST_POLICY_FAILURES = 20  # different ones that are reported in a trial
-_LONGEST_ERROR = 2000  # characters
+_MAX_POLICY_FAILURES = 20  # different ones that are reported in a trial
+_MAX_ERROR = 2000  # characters
 
 
 class Recordings:
@@ -59,7 +59,7 @@ class Recordings:
         if progress.choices.policies.idles(player):
             texts.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")
         for text in texts:
-            if text in self._reported or len(self._reported) >= _MOST_POLICY_FAILURES:
+            if text in self._reported or len(self._reported) >= _MAX_POLICY_FAILURES:
                 continue
             self._reported.add(text)
             self._emit(WriteLog(logging.ERROR, text))
@@ -68,5 +68,5 @@ class Recordings:
 
 
 def words_of(error: Exception) -> str:
-    """Return the type and the message of an error, of at most `_LONGEST_ERROR` characters."""
-    return "".join(traceback.format_exception_only(error)).strip()[:_LONGEST_ERROR]
+    """Return the type and the message of an error, of at most `_MAX_ERROR` characters."""
+    return "".join(traceback.format_exception_only(error)).strip()[:_MAX_ERROR]

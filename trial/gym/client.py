@@ -22,7 +22,7 @@ TIMEOUT = 90.0
 """The seconds in which an answer must come: more than a server's default limit, so that its sentence comes first."""
 
 _CLOSE_SECONDS = 2.0  # in which the server must answer a close
-_LARGEST_REPLY = 2**30  # bytes
+_MAX_REPLY = 2**30  # bytes
 
 
 class RemoteError(RuntimeError):
@@ -57,7 +57,7 @@ class GymClient:
                 ssl=context,
                 subprotocols=[SUBPROTOCOL],
                 compression=None,
-                max_size=_LARGEST_REPLY,
+                max_size=_MAX_REPLY,
                 open_timeout=timeout,
                 close_timeout=_CLOSE_SECONDS,
                 proxy=None if _is_this_machine(address) else True,

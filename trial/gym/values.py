@@ -26,7 +26,7 @@ Decode = Callable[[Any], Any]
 MAX_DEPTH = 100
 """The most levels of lists and objects in a value that is sent."""
 
-_MOST_LISTS = 3  # levels of lists around pictures: a vector returns a list, and each of its elements may be a list
+_MAX_LISTS = 3  # levels of lists around pictures: a vector returns a list, and each of its elements may be a list
 
 _SPECIAL = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 
@@ -331,7 +331,7 @@ def picture(rendered: Any, depth: int = 0) -> Any:
     """
     if rendered is None or isinstance(rendered, str):
         return rendered
-    if isinstance(rendered, list | tuple) and depth < _MOST_LISTS:
+    if isinstance(rendered, list | tuple) and depth < _MAX_LISTS:
         return [picture(part, depth + 1) for part in rendered]
     if not isinstance(rendered, np.ndarray) or rendered.dtype.kind not in "biuf":
         raise CodecError(f"render() returned a {type(rendered).__name__}, which cannot be sent.")

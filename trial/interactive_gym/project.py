@@ -18,9 +18,9 @@ from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.sources import HASHES, ConfigModule, Locate
 
-LEAST_PATIENCE, MOST_PATIENCE = 10, 3600
+MIN_PATIENCE, MAX_PATIENCE = 10, 3600
 """The limits of `project.patience`, in seconds."""
-LONGEST_BUFFER = 10_000
+MAX_BUFFER = 10_000
 """The highest value of `actionBufferLifespan`, in steps."""
 _NO_ID = re.compile(r"[^A-Za-z0-9_-]+")
 _MADE_BY = "made by `python {file}`; change that file and run it again"
@@ -134,7 +134,7 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
     if config.input_mode == InputModes.SingleKeystroke:
         trial["input"] = "single"
         if config.action_population_method == ActionSettings.PreviousSubmittedAction:
-            trial["actionBufferLifespan"] = LONGEST_BUFFER
+            trial["actionBufferLifespan"] = MAX_BUFFER
     if look.several:
         trial["frameSkip"] = config.frame_skip
     if config.reset_freeze_s:
@@ -243,7 +243,7 @@ def _project(config: RemoteConfig, source: ConfigModule, steps: list[str]) -> di
         project["players"] = humans
         if config.waitroom_timeout is not None:
             seconds = round(config.waitroom_timeout / 1000, 3)
-            project["patience"] = _number(max(LEAST_PATIENCE, min(MOST_PATIENCE, seconds)))
+            project["patience"] = _number(max(MIN_PATIENCE, min(MAX_PATIENCE, seconds)))
     return project
 
 

@@ -21,9 +21,9 @@ from trial.interactive_gym.playing import Unplayable
 Locate = Callable[[Any], Path | None]
 """A function that finds the file or folder that an option names, and returns None if there is none."""
 
-MOST_BYTES = 50 * 2**20
+MAX_BYTES = 50 * 2**20
 """The most bytes of one file. Larger files are left out."""
-MOST_BYTES_IN_ALL = 500 * 2**20
+MAX_BYTES_IN_ALL = 500 * 2**20
 """The most bytes of all files of an experiment together, without those that are left out."""
 HASHES = ".made-by-interactive-gym.json"
 """The file of a project's folder that names the files that were made there, with their hashes."""
@@ -127,13 +127,13 @@ def belonging(source: ConfigModule, target: Path) -> tuple[dict[str, Path], list
     total = 0
     for name, file in sorted(files.items()):
         size = file.stat().st_size
-        if size <= MOST_BYTES:
+        if size <= MAX_BYTES:
             total += size
             continue
         del files[name]
-        megabytes, most = size / 2**20, MOST_BYTES / 2**20
+        megabytes, most = size / 2**20, MAX_BYTES / 2**20
         sentences.append(f"{name} is left out: it has {megabytes:.0f} MB, and {most:.0f} are the most")
-    if total > MOST_BYTES_IN_ALL:
+    if total > MAX_BYTES_IN_ALL:
         raise Unplayable(
             f"{source.file.parent} holds {total / 2**20:.0f} MB: put the experiment into a folder of its own"
         )

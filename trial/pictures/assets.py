@@ -17,16 +17,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeGuard
 
-MOST_ASSETS = 500
-MOST_BYTES = 4 * 2**20
+MAX_ASSETS = 500
+MAX_BYTES = 4 * 2**20
 """The most bytes of one file: an image or an atlas."""
-MOST_BYTES_IN_ALL = 20 * 2**20
+MAX_BYTES_IN_ALL = 20 * 2**20
 """The most bytes of all images, packed with their atlases."""
-LONGEST_SIDE = 4096
+MAX_SIDE = 4096
 """The longest side of an image, in pixels: some phones draw no larger images."""
-MOST_PIXELS_IN_ALL = 64 * 2**20
+MAX_PIXELS_IN_ALL = 64 * 2**20
 """The most pixels of all images. A browser needs four bytes for each pixel."""
-MOST_FRAMES = 2_000
+MAX_FRAMES = 2_000
 """The most frames of one atlas."""
 
 IMAGE = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)
@@ -105,10 +105,10 @@ def load(project: Path, folder: str) -> Assets:
             asset = read(path, name)
             total += len(asset.packed)
             pixels += asset.size[0] * asset.size[1]
-            if len(found) == MOST_ASSETS or total > MOST_BYTES_IN_ALL or pixels > MOST_PIXELS_IN_ALL:
+            if len(found) == MAX_ASSETS or total > MAX_BYTES_IN_ALL or pixels > MAX_PIXELS_IN_ALL:
                 problems.append(
-                    f"{folder}: more than {MOST_ASSETS} images, {MOST_BYTES_IN_ALL >> 20} MB or "
-                    f"{MOST_PIXELS_IN_ALL >> 20} megapixels; {shown} and all after it are not shown"
+                    f"{folder}: more than {MAX_ASSETS} images, {MAX_BYTES_IN_ALL >> 20} MB or "
+                    f"{MAX_PIXELS_IN_ALL >> 20} megapixels; {shown} and all after it are not shown"
                 )
                 break
             found[name] = asset
@@ -153,8 +153,8 @@ def read(path: Path, name: str) -> Asset:
 
 def _bytes(path: Path) -> bytes:
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise AssetError(f"has {path.stat().st_size >> 20} MB; a file has at most {MOST_BYTES >> 20} MB")
+        if path.stat().st_size > MAX_BYTES:
+            raise AssetError(f"has {path.stat().st_size >> 20} MB; a file has at most {MAX_BYTES >> 20} MB")
         return path.read_bytes()
     except OSError as error:
         raise AssetError(f"cannot be read ({type(error).__name__})") from None
@@ -172,12 +172,12 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
             warnings.simplefilter("ignore")  # a very large image is refused below
             with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
                 kind, size = _TYPES[str(picture.format)], picture.size
-                if max(size) <= LONGEST_SIDE:
+                if max(size) <= MAX_SIDE:
                     picture.load()  # the whole image, since a file that was cut off has a good beginning
     except Exception:  # noqa: BLE001 - Pillow raises many kinds for a broken file
         raise AssetError("is no PNG, JPEG or WebP image, or is broken") from None
-    if max(size) > LONGEST_SIDE:
-        raise AssetError(f"has {size[0]} x {size[1]} pixels; at most {LONGEST_SIDE} x {LONGEST_SIDE} are shown")
+    if max(size) > MAX_SIDE:
+        raise AssetError(f"has {size[0]} x {size[1]} pixels; at most {MAX_SIDE} x {MAX_SIDE} are shown")
     return kind, size
 
 
@@ -193,8 +193,8 @@ def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[
     if not isinstance(value, dict):
         raise AssetError("is no atlas, which is a JSON object with `frames` or with `frameWidth`")
     frames = _grid(value, size) if "frameWidth" in value else dict(_listed(value, size))
-    if len(frames) > MOST_FRAMES:
-        raise AssetError(f"has {len(frames)} frames; at most {MOST_FRAMES}")
+    if len(frames) > MAX_FRAMES:
+        raise AssetError(f"has {len(frames)} frames; at most {MAX_FRAMES}")
     animations = value.get("animations", {})
     if not isinstance(animations, dict):
         raise AssetError("has animations that are no map")
@@ -207,8 +207,8 @@ def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
     if not _is_whole(width, 1) or not _is_whole(height, 1):
         raise AssetError("has a frameWidth or frameHeight that is no whole number of pixels")
     columns, rows = size[0] // width, size[1] // height
-    if columns * rows > MOST_FRAMES:
-        raise AssetError(f"has {columns * rows} frames; at most {MOST_FRAMES}")
+    if columns * rows > MAX_FRAMES:
+        raise AssetError(f"has {columns * rows} frames; at most {MAX_FRAMES}")
     return {
         str(row * columns + column): (column * width, row * height, width, height)
         for row in range(rows)
@@ -229,7 +229,7 @@ def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[s
         pairs = [(each.get("filename") if isinstance(each, dict) else None, each) for each in frames]
     else:
         raise AssetError("has no frames")
-    for name, each in pairs[: MOST_FRAMES + 1]:
+    for name, each in pairs[: MAX_FRAMES + 1]:
         box = each.get("frame") if isinstance(each, dict) else None
         if not isinstance(name, str) or not isinstance(box, dict):
             raise AssetError("has a frame without a name, or without a box (x, y, w, h) as its `frame`")
@@ -246,14 +246,14 @@ def _inside(start: int, length: int, whole: int) -> bool:
 
 
 def _is_whole(value: Any, least: int) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= LONGEST_SIDE
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MAX_SIDE
 
 
 def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> AtlasAnimation:
     if isinstance(value, list):
         value = {"frames": value}
     listed = value.get("frames") if isinstance(value, dict) else None
-    if not isinstance(listed, list) or not 0 < len(listed) <= MOST_FRAMES:
+    if not isinstance(listed, list) or not 0 < len(listed) <= MAX_FRAMES:
         raise AssetError(f"has the animation {name[:40]!r} without frames")
     missing = next((str(each) for each in listed if str(each) not in frames), None)
     if missing is not None:

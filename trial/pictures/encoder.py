@@ -60,7 +60,7 @@ class Encoder:
         """
         if self._shown is not None and self._shown.shape != frame.shape:
             self.forget()
-        if not self.lossy or max(frame.shape) > frames.LONGEST_JPEG_SIDE:
+        if not self.lossy or max(frame.shape) > frames.MAX_JPEG_SIDE:
             data = self._unlimited(frame, self._exact, frame_id)
         elif self._shown is not None and not self.exact and _same(frame, self._shown):
             return self.sharpen(frame_id)

@@ -34,7 +34,7 @@ HEADER = struct.Struct("!BIHHB")
 """Kind, id, width, height, channels."""
 FIRST_ROW = struct.Struct("!H")
 """The number of the first row, which follows the header of a ROWS frame."""
-LONGEST_JPEG_SIDE = 65_500
+MAX_JPEG_SIDE = 65_500
 """In pixels; libjpeg's JPEG_MAX_DIMENSION."""
 
 _FIRST_CHUNK = 131_072  # bytes of pixels that are packed before the size is compared with the limit

@@ -13,7 +13,7 @@ from trial.pictures.assets import Assets
 from trial.pictures.picture import Picture, as_picture
 from trial.pictures.scene import Scene, images_of
 
-_MOST_SENTENCES = 100  # for `tell`: a long game may have ever new mistakes
+_MAX_SENTENCES = 100  # for `tell`: a long game may have ever new mistakes
 
 
 class PictureReader:
@@ -70,6 +70,6 @@ class PictureReader:
             )
 
     def _tell_once(self, sentence: str) -> None:
-        if sentence not in self._told and len(self._told) < _MOST_SENTENCES:
+        if sentence not in self._told and len(self._told) < _MAX_SENTENCES:
             self._told.add(sentence)
             self._tell(sentence)

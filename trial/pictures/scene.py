@@ -12,7 +12,7 @@ from operator import ne
 from typing import Any
 
 from trial.pictures.scene_object import (
-    LONGEST_TEXT,
+    MAX_TEXT,
     CheckedObject,
     UnusableValue,
     checked_again,
@@ -24,13 +24,13 @@ from trial.pictures.scene_object import (
     shown_name,
 )
 
-MOST_OBJECTS = 2_000
+MAX_OBJECTS = 2_000
 """The most objects of one scene, with the permanent ones of scenes before it."""
-MOST_POINTS_IN_ALL = 20_000
+MAX_POINTS_IN_ALL = 20_000
 """The most points of all lines and polygons of one scene."""
-MOST_TEXT_IN_ALL = 100_000
+MAX_TEXT_IN_ALL = 100_000
 """The most characters of all texts of one scene."""
-MOST_PROBLEMS = 20
+MAX_PROBLEMS = 20
 """The most sentences about the mistakes in one scene."""
 
 
@@ -70,7 +70,7 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
     """Read the scene that `render()` returned: a list of objects, or `{"objects": […], "hud": "text"}`.
 
     `before` is the scene before it in the same episode: its permanent objects stay. An object that did not change is
-    the same Python object in both scenes. Raises SceneError if `value` has neither form or more than MOST_OBJECTS.
+    the same Python object in both scenes. Raises SceneError if `value` has neither form or more than MAX_OBJECTS.
     """
     given, hud = _parts(value)
     if before is not None and (scene := _changed_in_place(before, given, hud)) is not None:
@@ -102,7 +102,7 @@ def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene |
         objects[name], given[name] = checked, dict(value)
         if earlier.get("image") != checked.get("image"):
             images = _images(objects)
-        if "text" in checked and (letters := letters + len(checked["text"]) - len(earlier["text"])) > MOST_TEXT_IN_ALL:
+        if "text" in checked and (letters := letters + len(checked["text"]) - len(earlier["text"])) > MAX_TEXT_IN_ALL:
             return None
     return Scene(objects, hud, before.permanent, (), given, images, letters)
 
@@ -125,7 +125,7 @@ class _SceneBuilder:
         """Add, change or remove objects. Most objects are as in the scene before, so these take the shortest way."""
         objects, before, known = self._objects, self._before.objects, self._before.given
         not_permanent = before.keys() - self._before.permanent  # permanent ones need `_put`
-        room = len(objects) + len(values) <= MOST_OBJECTS
+        room = len(objects) + len(values) <= MAX_OBJECTS
         for index, value in enumerate(values):
             name = value.get("id") if room and type(value) is dict else None
             if type(name) is str and name in not_permanent and name not in objects:
@@ -165,8 +165,8 @@ class _SceneBuilder:
             self._problems.append(f"object {index + 1} of render() cannot be read ({type(error).__name__})")
             return
         points = self._points + len(checked.get("points", ())) - len(self._objects.get(name, {}).get("points", ()))
-        if points > MOST_POINTS_IN_ALL:
-            self._problems.append(f"the scene has more than {MOST_POINTS_IN_ALL} points; some objects are left out")
+        if points > MAX_POINTS_IN_ALL:
+            self._problems.append(f"the scene has more than {MAX_POINTS_IN_ALL} points; some objects are left out")
             return
         self._points = points
         earlier = self._before.objects.get(name)
@@ -178,9 +178,9 @@ class _SceneBuilder:
     def _has_room(self, text: Any) -> bool:
         """Whether the scene has room for this text. Texts without room are not checked, which would delay the game."""
         letters = 0 if text is None else len(text if isinstance(text, str) else str(text))
-        if letters > LONGEST_TEXT:
+        if letters > MAX_TEXT:
             return True  # `checked_object` refuses it
-        if self._new_letters + letters > MOST_TEXT_IN_ALL:
+        if self._new_letters + letters > MAX_TEXT_IN_ALL:
             self._problems.append(_TOO_MUCH_TEXT)
             return False
         self._new_letters += letters
@@ -199,9 +199,9 @@ class _SceneBuilder:
     def _put(self, name: str, checked: CheckedObject, fields: Mapping[str, Any]) -> None:
         if name in self._objects and name not in self._not_returned:
             self._problems.append(f"two objects have the id {name!r}; the later one counts")
-        if name not in self._objects and len(self._objects) >= MOST_OBJECTS:
+        if name not in self._objects and len(self._objects) >= MAX_OBJECTS:
             self._problems.append(
-                f"the scene has more than {MOST_OBJECTS} objects with those that are permanent; some are left out"
+                f"the scene has more than {MAX_OBJECTS} objects with those that are permanent; some are left out"
             )
             return
         self._not_returned.discard(name)
@@ -218,10 +218,10 @@ class _SceneBuilder:
             first = {name: each for name, each in objects.items() if name in permanent}
             objects = first | {name: each for name, each in objects.items() if name not in permanent}
         letters = self._before.letters + self._new_letters
-        if letters > MOST_TEXT_IN_ALL:
+        if letters > MAX_TEXT_IN_ALL:
             objects, letters = self._with_few_letters(objects)
             permanent &= objects.keys()
-        problems = tuple(dict.fromkeys(self._problems))[:MOST_PROBLEMS]
+        problems = tuple(dict.fromkeys(self._problems))[:MAX_PROBLEMS]
         return Scene(objects, hud, frozenset(permanent), problems, self._given, _images(objects), letters)
 
     def _with_few_letters(self, objects: dict[str, CheckedObject]) -> tuple[dict[str, CheckedObject], int]:
@@ -233,7 +233,7 @@ class _SceneBuilder:
         letters = 0
         for name, each in objects.items():
             text = each.get("text", "")
-            if letters + len(text) > MOST_TEXT_IN_ALL:
+            if letters + len(text) > MAX_TEXT_IN_ALL:
                 self._problems.append(_TOO_MUCH_TEXT)
                 self._given.pop(name, None)
                 continue
@@ -242,7 +242,7 @@ class _SceneBuilder:
         return fitting, letters
 
 
-_TOO_MUCH_TEXT = f"the scene's texts have more than {MOST_TEXT_IN_ALL} characters; some are left out"
+_TOO_MUCH_TEXT = f"the scene's texts have more than {MAX_TEXT_IN_ALL} characters; some are left out"
 _MAPS = frozenset({dict})
 _SCALARS = frozenset({str, int, float, bool, type(None)})
 
@@ -267,9 +267,9 @@ def _parts(value: Any) -> tuple[Sequence[Any], str]:
         value, hud = value["objects"], value.get("hud")
     if not isinstance(value, list | tuple):
         raise SceneError(f"render() must return a list of objects, not {type(value).__name__}")
-    if len(value) > MOST_OBJECTS:
-        raise SceneError(f"render() returned {len(value)} objects; a scene has at most {MOST_OBJECTS}")
+    if len(value) > MAX_OBJECTS:
+        raise SceneError(f"render() returned {len(value)} objects; a scene has at most {MAX_OBJECTS}")
     try:
-        return value, "" if hud is None else str(hud)[:LONGEST_TEXT]
+        return value, "" if hud is None else str(hud)[:MAX_TEXT]
     except Exception as error:
         raise SceneError(f"render() returned a hud that cannot be read ({type(error).__name__})") from error

@@ -15,14 +15,14 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-MOST_POINTS = 5_000
+MAX_POINTS = 5_000
 """The most points of one line or polygon."""
-LONGEST_TEXT = 1_000
+MAX_TEXT = 1_000
 """The most characters of one text."""
-LONGEST_TWEEN = 10_000
+MAX_TWEEN = 10_000
 """The longest tween, in milliseconds."""
 
-_LONGEST_ID = 100  # characters
+_MAX_ID = 100  # characters
 _FARTHEST = 1e6  # the largest coordinate or length
 _DIGITS = 4  # with them, a relative coordinate is exact to a tenth of a pixel in a picture 1,000 pixels wide
 _HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
@@ -79,11 +79,9 @@ def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[st
     name = fields.pop("id", None)
     if isinstance(name, int | np.integer) and not isinstance(name, bool):
         name = str(name)
-    if not isinstance(name, str) or not 0 < len(name) <= _LONGEST_ID:
+    if not isinstance(name, str) or not 0 < len(name) <= _MAX_ID:
         kind = str(fields.get("type", "object"))[:20]
-        rule = (
-            "has no id" if name is None or name == "" else f"has an id that is no text of 1 to {_LONGEST_ID} characters"
-        )
+        rule = "has no id" if name is None or name == "" else f"has an id that is no text of 1 to {_MAX_ID} characters"
         problems.append(f"object {index + 1} of render() ({kind}) {rule}; give each object an id that it keeps")
         name = f"#{index + 1}"
     return name, fields
@@ -96,7 +94,7 @@ def shown_name(value: Any, index: int) -> str:
         name = value.get("id", value.get("uuid"))
     elif has_fields(value):
         name = getattr(value, "id", getattr(value, "uuid", None))
-    return f"object {index + 1} of render()" if name is None else f"the object {str(name)[:_LONGEST_ID]!r}"
+    return f"object {index + 1} of render()" if name is None else f"the object {str(name)[:_MAX_ID]!r}"
 
 
 def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) -> CheckedObject:
@@ -193,8 +191,8 @@ def _points(least: int) -> Callable[[Any], list[list[float]]]:
             count = len(value)
         except TypeError:
             raise UnusableValue("are no list") from None
-        if not least <= count <= MOST_POINTS:
-            raise UnusableValue(f"are {count}; there must be {least} to {MOST_POINTS}")
+        if not least <= count <= MAX_POINTS:
+            raise UnusableValue(f"are {count}; there must be {least} to {MAX_POINTS}")
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
@@ -227,8 +225,8 @@ def _is_color_name(value: str) -> bool:
 
 def _text(value: Any) -> str:
     text = str(value)
-    if len(text) > LONGEST_TEXT:
-        raise UnusableValue(f"has {len(text)} characters; at most {LONGEST_TEXT} are shown")
+    if len(text) > MAX_TEXT:
+        raise UnusableValue(f"has {len(text)} characters; at most {MAX_TEXT} are shown")
     if text.isprintable():
         return text
     return "".join(letter for letter in text if letter == "\n" or letter.isprintable())
@@ -273,7 +271,7 @@ def _tween(fields: Mapping[str, Any]) -> float:
     if isinstance(value, bool | np.bool_):
         value = fields.get("tween_duration", _DEFAULT_TWEEN)
     try:
-        return _number(0, LONGEST_TWEEN)(value)
+        return _number(0, MAX_TWEEN)(value)
     except UnusableValue as error:
         raise UnusableValue(f"cannot be drawn: its tween {error}") from None
 

@@ -17,7 +17,7 @@ Shape = Sequence[int | str | None]
 Encoding = Callable[[Any], Array]
 """Turns an observation into an array."""
 
-MOST_ONE_HOT = 10_000_000
+MAX_ONE_HOT = 10_000_000
 """The most numbers of an observation with one-hot discrete parts: no policy takes more."""
 
 
@@ -54,7 +54,7 @@ def encodings(space: Any) -> list[Encoding]:
     One takes the numbers as they are, the other turns each discrete value into one-hot numbers.
     """
     possible: list[Encoding] = [numbers]
-    if space is not None and one_hot_size(space) <= MOST_ONE_HOT:
+    if space is not None and one_hot_size(space) <= MAX_ONE_HOT:
         possible.append(lambda observation: _one_hot(space, observation))
     return possible
 

@@ -30,13 +30,13 @@ log = logging.getLogger("trial")
 
 MAX_PROGRAMS = 4
 """The most programs that may be connected at a time."""
-LARGEST_REQUEST = 2**20
+MAX_REQUEST = 2**20
 """The most bytes in a program's message."""
-LARGEST_REPLY = 8 * 2**20
+MAX_REPLY = 8 * 2**20
 """The most bytes of observations in one answer."""
 REQUESTS_A_SECOND = 500
 """The most requests of all programs together that are passed on in a second. The others wait: the game comes first."""
-_LARGEST_ANSWER = 8 * LARGEST_REPLY  # bytes of a message: JSON takes several for each byte of an observation
+_MAX_ANSWER = 8 * MAX_REPLY  # bytes of a message: JSON takes several for each byte of an observation
 _AHEAD_SECONDS = 0.02  # a request may be passed on this much sooner than an even rate allows
 _START_SECONDS = 60.0
 _CLOSE_SECONDS = 2.0
@@ -49,7 +49,7 @@ def prepare(websocket: ServerConnection, request: Request) -> Response | None:
     """Set a program's connection up as `make gym` does. Return a refusal if its address names an unknown form."""
     if form_of(request.path) is None:
         return websocket.respond(http.HTTPStatus.BAD_REQUEST, UNKNOWN_FORM)
-    websocket.protocol.max_message_size = LARGEST_REQUEST
+    websocket.protocol.max_message_size = MAX_REQUEST
     websocket.ping_timeout = None  # while requests wait for an environment, its pong waits behind them
     return None
 
@@ -99,7 +99,7 @@ class Environments:
                 sock=ours,
                 subprotocols=[SUBPROTOCOL] if websocket.subprotocol == SUBPROTOCOL else None,
                 compression=None,
-                max_size=_LARGEST_ANSWER,
+                max_size=_MAX_ANSWER,
                 open_timeout=_START_SECONDS,
                 close_timeout=_CLOSE_SECONDS,
                 ping_interval=None,

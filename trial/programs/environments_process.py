@@ -16,7 +16,7 @@ from typing import Any
 from trial.gym import linux
 from trial.gym.limits import Limits
 from trial.gym.processes import serve_from
-from trial.programs.environments import LARGEST_REPLY, LARGEST_REQUEST, MAX_PROGRAMS
+from trial.programs.environments import MAX_PROGRAMS, MAX_REPLY, MAX_REQUEST
 
 LIMITS = Limits(
     connections=2 * MAX_PROGRAMS,  # a connection that is closing may still be counted here
@@ -26,8 +26,8 @@ LIMITS = Limits(
     idle_seconds=600.0,
     megabytes=256,
     processes=4,
-    message_bytes=LARGEST_REQUEST,
-    reply_bytes=LARGEST_REPLY,
+    message_bytes=MAX_REQUEST,
+    reply_bytes=MAX_REPLY,
 )
 
 

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 TIMEOUT = 20.0  # seconds without a byte
 PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts after a transient error
-LARGEST_REPLY = 64 * 1024  # the most bytes that are read of an answer of `sign_requests`
+MAX_REPLY = 64 * 1024  # the most bytes that are read of an answer of `sign_requests`
 _TRANSIENT = (400, 403, 408, 409, 429)
 """Statuses after which a request is tried again, as after 500 and above. S3 answers 403 if a presigned request has
 expired, and 400 if the credentials of its signer have (`ExpiredToken`) or if no data came on a connection for a while
@@ -108,7 +108,7 @@ class PresignedStore:
         """Return the presigned request for a method and a key; for a PUT also of a size in bytes. Raises StoreError."""
         payload = {"server": self._server, "credential": self._credential, "requests": [wish]}
         post = {"method": "POST", "url": self._url, "headers": {"Content-Type": "application/json"}}
-        status, body = _send(post, json.dumps(payload).encode(), LARGEST_REPLY)
+        status, body = _send(post, json.dumps(payload).encode(), MAX_REPLY)
         if status != 200:
             raise _UnexpectedStatus(status)
         try:

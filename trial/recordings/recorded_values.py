@@ -12,7 +12,7 @@ import numpy as np
 
 LISTED = 100
 """The most numbers of an array that the field `extra` has as a list. Larger arrays are packed."""
-MOST_VALUES = 2_000_000
+MAX_VALUES = 2_000_000
 """The most values that are converted in one value. Containers that hold one another may have an immense number."""
 CUT_OFF = "<cut off>"
 """The text in a container that stands for the values that were left out."""
@@ -28,7 +28,7 @@ class Values:
     At most `most` values are converted. Texts and bytes that are longer than `longest` are left out.
     """
 
-    def __init__(self, *, listed: int | None = None, most: int = MOST_VALUES, longest: float = math.inf) -> None:
+    def __init__(self, *, listed: int | None = None, most: int = MAX_VALUES, longest: float = math.inf) -> None:
         self._listed = listed
         self._left = most
         self._longest = longest

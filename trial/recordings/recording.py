@@ -43,9 +43,9 @@ SYNC_SECONDS = 5.0
 """The time between two syncs of an open recording to the disk: a power cut loses at most the lines of this time."""
 MAX_EXTRA_BYTES = 1_000_000
 """The most bytes of JSON in one line for the values that an agent's `step` returns beside Gymnasium's."""
-MOST_TOO_LARGE = 100
+MAX_TOO_LARGE = 100
 """The most values of one line that are replaced by their sizes; the values after them are left out."""
-LONGEST_NAME = 1_000
+MAX_NAME = 1_000
 """The most characters of a value's name, if there is no room for the whole name."""
 
 
@@ -104,18 +104,18 @@ def bounded_extra(values: Mapping[str, Any], left: int = MAX_EXTRA_BYTES) -> tup
     """Convert the values that an agent's `step` returned beside Gymnasium's for a recording, `left` bytes at most.
 
     A value for which the values before it leave no room is replaced by `{"tooLarge": bytes}`. The second result has the
-    sizes of these values by name; a value that was not converted whole is at least so large. After `MOST_TOO_LARGE` of
+    sizes of these values by name; a value that was not converted whole is at least so large. After `MAX_TOO_LARGE` of
     them the rest is left out, and `"<cut off>"` is the number of values left out.
     """
     recorded: dict[str, Any] = {}
     too_large: dict[str, int] = {}
     for index, (key, value) in enumerate(values.items()):
-        if len(too_large) == MOST_TOO_LARGE:
+        if len(too_large) == MAX_TOO_LARGE:
             recorded[CUT_OFF] = len(values) - index
             break
         name = text_of(key)
         if len(name) > left:
-            name = name[:LONGEST_NAME]
+            name = name[:MAX_NAME]
         reader = Values(listed=LISTED, most=MAX_EXTRA_BYTES // 2, longest=MAX_EXTRA_BYTES)
         converted = reader.keep(value)
         size = size_of(converted) + reader.left_out
@@ -169,7 +169,7 @@ OF_SEVERAL = ("pettingzoo", "onnxruntime")
 REQUIRED = Path(__file__).resolve().parents[2] / "requirements/project.txt"
 """In the servers' image: a copy of the project's requirements.txt."""
 _PACKAGE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_MOST_PACKAGES = 100
+_MAX_PACKAGES = 100
 
 
 @functools.cache
@@ -180,7 +180,7 @@ def packages(agent_dir: Path) -> tuple[str, ...]:
         with contextlib.suppress(OSError, UnicodeDecodeError):
             matches = map(_PACKAGE.match, map(str.strip, file.read_text(encoding="utf-8-sig").splitlines()))
             names |= dict.fromkeys(match[0] for match in matches if match)
-    return tuple(names)[:_MOST_PACKAGES]
+    return tuple(names)[:_MAX_PACKAGES]
 
 
 def versions(more: Iterable[str] = ()) -> dict[str, str]:

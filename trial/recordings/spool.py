@@ -20,7 +20,7 @@ from trial.settings import TrialSettings
 T = TypeVar("T")
 log = logging.getLogger("trial")
 
-_LONGEST_PAUSE = 20.0  # seconds
+_MAX_PAUSE = 20.0  # seconds
 
 
 class Spool:
@@ -73,4 +73,4 @@ async def retry_forever(action: str, attempt: Callable[[], Awaitable[T]]) -> T:
         except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
             log.warning("cannot %s (%s); trying again in %g s", action, short_error(error), pause)
         await asyncio.sleep(pause)
-        pause = min(2 * pause, _LONGEST_PAUSE)
+        pause = min(2 * pause, _MAX_PAUSE)

@@ -22,7 +22,7 @@ from trial.wire.player_socket import PlayerSocket
 
 log = logging.getLogger("trial")
 
-LARGEST_MESSAGE = 4096
+MAX_MESSAGE = 4096
 """The most bytes in a client's message."""
 MAX_UNAUTHENTICATED_WEBSOCKETS = 64
 """The most WebSockets that have not authenticated. One more closes the oldest. preauth_limit.py limits sockets."""
@@ -63,7 +63,7 @@ class Listener:
             process_request=partial(process_request, gym=settings.trial.gym, token=settings.token),
             server_header=None,
             compression=None,
-            max_size=LARGEST_MESSAGE,
+            max_size=MAX_MESSAGE,
             write_limit=(1, 0),  # so that `send` returns only when the write buffer is empty
             ping_interval=15,
             ping_timeout=15,

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-LONGEST_SECONDS = 10.0
+MAX_SECONDS = 10.0
 """The longest round trip that is reported. A ping without an answer counts as one of this length."""
 EVERY_SECONDS = 5.0
 """The time from the answer to one ping to the next ping, after the first samples."""
@@ -24,7 +24,7 @@ async def measure(websocket: ServerConnection, samples: int, report: Callable[[f
     """Report round trips, in seconds, until the connection is closed.
 
     The first `samples` are measured at once, the others every `EVERY_SECONDS`. One ping is under way at a time. While
-    it has no answer, for instance because a phone sleeps, `LONGEST_SECONDS` is reported every `LONGEST_SECONDS`.
+    it has no answer, for instance because a phone sleeps, `MAX_SECONDS` is reported every `MAX_SECONDS`.
     """
     count = 0
     try:
@@ -41,16 +41,16 @@ async def _measure_one(websocket: ServerConnection, report: Callable[[float], No
     ping, late = asyncio.ensure_future(_round_trip(websocket)), False
     try:
         while True:
-            await asyncio.wait({ping}, timeout=LONGEST_SECONDS)
+            await asyncio.wait({ping}, timeout=MAX_SECONDS)
             if ping.done():
                 break
             late = True
-            report(LONGEST_SECONDS)
+            report(MAX_SECONDS)
     finally:
         ping.cancel()  # changes nothing once it is done
     seconds = ping.result()
     if not late:
-        report(min(seconds, LONGEST_SECONDS))
+        report(min(seconds, MAX_SECONDS))
 
 
 async def _round_trip(websocket: ServerConnection) -> float:

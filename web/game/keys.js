@@ -5,7 +5,7 @@ import { DIRECTIONS } from "./keyboard.js";
 import { actionButton } from "./touch.js";
 
 const ARROWS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
-const MOST_BUTTONS = 64;
+const MAX_BUTTONS = 64;
 
 let bound = new Map(); // the name of a key in this module -> its name in `keys`
 const pressedKeys = new Map(); // event.code -> the name at the press: Shift may change `event.key` before the release
@@ -58,7 +58,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
     space: bound.has(nameOfKey(" ")),
     groups: [
       groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : DIRECTIONS[ARROWS[key]].label))),
-      groupOf("others", actions.filter(standsAlone).slice(0, MOST_BUTTONS).map((action) => {
+      groupOf("others", actions.filter(standsAlone).slice(0, MAX_BUTTONS).map((action) => {
         const key = keyOf(action);
         return actionButton(key === undefined ? action : nameOfKey(key), label(action));
       })),

@@ -8,7 +8,7 @@ import { data, duration, find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const GLANCE = 3_000; // ms for which a participant may look at another page in the game
-const MOST_NAMES = 4; // if there are more players, the page shows their number
+const MAX_NAMES = 4; // if there are more players, the page shows their number
 const READ = 600_000; // ms for which the reason of an early end is shown, if the participant does not go on before
 const STATES = { here: "", reads: TEXT.reads, awaited: TEXT.awaited, away: TEXT.away, policy: TEXT.computer };
 const COVERS = ["gathering", "held", "begins"];
@@ -71,7 +71,7 @@ function showPeople({ people, you }) {
   Object.assign(presence, { people, you: you ?? presence.you });
   const names = Object.keys(people).slice(0, 64);
   const there = names.filter((name) => people[name] === "here").length;
-  const shown = names.length > MOST_NAMES ? names.filter((name) => name === presence.you) : names;
+  const shown = names.length > MAX_NAMES ? names.filter((name) => name === presence.you) : names;
   const parts = shown.map((name) => {
     const text = playerName(name), more = STATES[people[name]];
     const textContent = name === presence.you ? TEXT.you(text) : more ? `${text} (${more})` : text;
@@ -90,7 +90,7 @@ function tellOf(name, before, now) {
 
 // Turn by turn: says whose turn it is, if it is not the participant's.
 function sayWhoseTurn({ state, toAct, turnOf }) {
-  const names = Array.isArray(turnOf) ? turnOf.slice(0, MOST_NAMES).map((name) => playerName(String(name))) : [];
+  const names = Array.isArray(turnOf) ? turnOf.slice(0, MAX_NAMES).map((name) => playerName(String(name))) : [];
   if (state === "playing" && !toAct && names.length) setText(find("turn"), TEXT.theirTurn(names.join(", ")));
 }
 

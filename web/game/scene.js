@@ -7,7 +7,7 @@ import { find, make, setText } from "./page.js";
 import { paint, place, prepare, putAway } from "./painter.js";
 
 const SCENE_HEADER = 5; // bytes: kind, id
-const LARGEST_SCENE = 16 * 2 ** 20; // bytes, unpacked; trial/pictures/scene.py makes none so large
+const MAX_SCENE = 16 * 2 ** 20; // bytes, unpacked; trial/pictures/scene.py makes none so large
 const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
 const DEFAULTS = { angle: 0, alpha: 1 }; // of fields that the server leaves out
 
@@ -29,7 +29,7 @@ document.adoptedStyleSheets = [...document.adoptedStyleSheets, sheet];
 
 async function unpackScene(kind, buffer) {
   const body = buffer.slice(SCENE_HEADER);
-  const bytes = kind === 5 ? await inflate(body, 2, LARGEST_SCENE) : body;
+  const bytes = kind === 5 ? await inflate(body, 2, MAX_SCENE) : body;
   const scene = JSON.parse(utf8.decode(bytes));
   return { draw: () => change(scene) };
 }

@@ -7,7 +7,7 @@ import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const PART_HEADER = 7; // bytes: kind, number, offset
-const LARGEST_ASSET = 8 * 2 ** 20; // bytes; trial/pictures/assets.py sends none so large
+const MAX_ASSET = 8 * 2 ** 20; // bytes; trial/pictures/assets.py sends none so large
 const SPRITE_SIDE = 4096; // pixels
 const AT_ONCE = 16; // images that are asked for; a server refuses more than 200 messages a second
 
@@ -27,7 +27,7 @@ const loading = () => table.some((each) => !loaded.has(each.hash));
 
 export function askForSprites(assets) {
   table = assets;
-  for (const { bytes, hash } of assets) if (!(bytes <= LARGEST_ASSET)) loaded.set(hash, null);
+  for (const { bytes, hash } of assets) if (!(bytes <= MAX_ASSET)) loaded.set(hash, null);
   askForMore();
   showProgress();
 }

@@ -16,7 +16,7 @@ from hippodrome.model import warm_pool
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 OLD = 120  # days after which an image's packages probably need updates
-LONGEST_RUNTIME = 1440  # minutes, the most that `apply --max-runtime` takes
+MAX_RUNTIME = 1440  # minutes, the most that `apply --max-runtime` takes
 AGAIN = "Run `python -m deploy register` in the project's folder."
 
 
@@ -90,7 +90,7 @@ def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Findi
         f"{project.max_runtime} of them.",
         f"Give `python -m deploy apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
         "or warmServers: 0."
-        if needed <= LONGEST_RUNTIME
+        if needed <= MAX_RUNTIME
         else "Register the project with a shorter maxRuntime or warmServers: 0.",
     )
 

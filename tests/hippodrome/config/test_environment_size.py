@@ -18,7 +18,7 @@ from testing.servers import Servers
 from testing.studies import installed
 
 LONG = "i" * 64
-LONGEST_ADDRESS = f"https://{'s' * 63}.{'d' * 200}/sign"  # the template's SiteHost and RootDomain
+MAX_ADDRESS = f"https://{'s' * 63}.{'d' * 200}/sign"  # the template's SiteHost and RootDomain
 Make = Callable[[int], dict[str, Any]]
 
 
@@ -60,7 +60,7 @@ def ecs_takes(request: TaskRequest) -> bool:
         raise Taken
 
     try:
-        EcsTasks(ecs, ecs, lambda name: LONGEST_ADDRESS if name == "SIGN_URL" else "b" * 63).run(request)
+        EcsTasks(ecs, ecs, lambda name: MAX_ADDRESS if name == "SIGN_URL" else "b" * 63).run(request)
     except Taken:
         return True
     except Refused:

@@ -148,7 +148,7 @@ def test_a_full_question_leaves_out_further_participants_until_the_next(
     room: WaitingRoom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two participants fit beside the question. Of three who come before its answer, the third is in a later question."""
-    monkeypatch.setattr(questions, "MOST_CAME", 2)
+    monkeypatch.setattr(questions, "MAX_CAME", 2)
     room.poll("ann", "bob", seconds=2)
     others = ("cem", "dan", "eve")
     room.poll("ann", "bob", *others, seconds=2)

@@ -174,10 +174,10 @@ def test_an_unreadable_list_does_not_affect_stops_of_single_servers(platform: Fa
 
 
 def test_a_call_reads_a_bounded_number_of_records(platform: FakePlatform, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stops_module, "MOST_READS", 7)
+    monkeypatch.setattr(stops_module, "MAX_READS", 7)
     batch = [StopUser(f"user{n}") for n in range(5)]
     assert Servers(platform).stop(batch) == batch[2:]
-    monkeypatch.setattr(stops_module, "MOST_READS", 1)
+    monkeypatch.setattr(stops_module, "MAX_READS", 1)
     assert Servers(platform).stop(batch) == batch[1:], "at least one is handled"
 
 

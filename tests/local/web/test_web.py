@@ -191,9 +191,9 @@ def test_the_error_of_a_function_is_printed_and_not_sent_to_the_participant(
 
 
 def test_bodies_may_have_ten_megabytes(site: Site) -> None:
-    assert site.http.post("/next", content=b"x" * web_app.LARGEST_BODY).status_code == 200
+    assert site.http.post("/next", content=b"x" * web_app.MAX_BODY).status_code == 200
     site.events.clear()
-    assert site.http.post("/next", content=b"x" * (web_app.LARGEST_BODY + 1)).status_code == 413
+    assert site.http.post("/next", content=b"x" * (web_app.MAX_BODY + 1)).status_code == 413
     assert site.events == []
 
 

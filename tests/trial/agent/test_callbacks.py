@@ -16,7 +16,7 @@ from tests.trial.client_messages import play_to_the_end
 from trial.agent import callbacks as callbacks_module
 from trial.agent.agent import AgentAdapter
 from trial.agent.callback_names import NAMES
-from trial.agent.callbacks import MOST_VALUES, Callbacks, Session, TrialFacts, listening
+from trial.agent.callbacks import MAX_VALUES, Callbacks, Session, TrialFacts, listening
 from trial.agent.starting import start
 from trial.recordings import recording
 
@@ -281,14 +281,14 @@ def test_the_amount_that_callbacks_record_is_limited():
             session.record("large", "x" * recording.MAX_EXTRA_BYTES)
             session.record("n" * 1_000, float("nan"))
             session.record("object", object)
-            for _ in range(2 * MOST_VALUES):
+            for _ in range(2 * MAX_VALUES):
                 session.record("many", 0)
 
     callbacks, raised = callbacks_of(Agent())
     callbacks.stepped({}, {}, {}, {})
     found = recorded_lines(callbacks)
     assert not raised
-    assert len(found) == MOST_VALUES
+    assert len(found) == MAX_VALUES
     assert found[0]["value"] == 1
     assert found[1]["value"] == {"tooLarge": recording.MAX_EXTRA_BYTES + 2}
     assert len(found[2]["name"]) == 200

@@ -124,7 +124,7 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
 
 
 def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(assets, "MOST_ASSETS", 2)
+    monkeypatch.setattr(assets, "MAX_ASSETS", 2)
     found = load_files(tmp_path, a_png=image(), b_png=image(), c_png=image())
     assert list(found.by_name) == ["a", "b"]
     assert found.problems == (
@@ -133,7 +133,7 @@ def test_all_images_together_are_bounded(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_pixels_of_all_images_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(assets, "MOST_PIXELS_IN_ALL", 8)
+    monkeypatch.setattr(assets, "MAX_PIXELS_IN_ALL", 8)
     assert list(load_files(tmp_path, a_png=image(), b_png=image()).by_name) == ["a"]
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from trial.pictures.frames import FrameError
 from trial.pictures.picture import as_picture
-from trial.pictures.scene import MOST_OBJECTS, MOST_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
-from trial.pictures.scene_object import MOST_POINTS
+from trial.pictures.scene import MAX_OBJECTS, MAX_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
+from trial.pictures.scene_object import MAX_POINTS
 
 BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}
 
@@ -110,17 +110,17 @@ def test_permanent_objects_come_first_from_the_beginning() -> None:
 def test_permanent_objects_do_not_pile_up_without_end() -> None:
     scene: Scene | None = None
     for number in range(3):
-        drops = [BALL | {"id": f"{number}-{index}", "permanent": True} for index in range(MOST_OBJECTS // 2)]
+        drops = [BALL | {"id": f"{number}-{index}", "permanent": True} for index in range(MAX_OBJECTS // 2)]
         scene = as_scene(drops, scene)
     assert scene is not None
-    assert len(scene.objects) == MOST_OBJECTS
-    said = f"the scene has more than {MOST_OBJECTS} objects with those that are permanent; some are left out"
+    assert len(scene.objects) == MAX_OBJECTS
+    said = f"the scene has more than {MAX_OBJECTS} objects with those that are permanent; some are left out"
     assert scene.problems == (said,)
     assert as_scene([{"id": "0-0", "remove": True}, BALL], scene).objects.keys() >= {"ball"}, "there is room again"
 
 
 def test_an_object_that_found_no_room_is_drawn_when_there_is_room() -> None:
-    drops = [BALL | {"id": str(index), "permanent": True} for index in range(MOST_OBJECTS - 1)]
+    drops = [BALL | {"id": str(index), "permanent": True} for index in range(MAX_OBJECTS - 1)]
     full = as_scene([*drops, BALL])
     crowded = as_scene([BALL | {"id": "last", "permanent": True}, BALL], full)
     assert "ball" not in crowded.objects
@@ -130,7 +130,7 @@ def test_an_object_that_found_no_room_is_drawn_when_there_is_room() -> None:
 
 
 def test_points_of_permanent_objects_do_not_pile_up_without_end() -> None:
-    path = {"type": "line", "points": [(0, 0)] * (MOST_POINTS - 1), "color": "red", "permanent": True}
+    path = {"type": "line", "points": [(0, 0)] * (MAX_POINTS - 1), "color": "red", "permanent": True}
     scene: Scene | None = None
     for number in range(6):
         scene = as_scene([path | {"id": str(number)}], scene)
@@ -212,7 +212,7 @@ def test_the_last_entry_of_an_id_counts_in_the_next_scene_too() -> None:
             "the object 'ball' has the type 'blob'; there are sprite, line, circle, rectangle, polygon, text",
         ),
         (
-            {"type": "polygon", "points": [(0, 0)] * (MOST_POINTS + 1)},
+            {"type": "polygon", "points": [(0, 0)] * (MAX_POINTS + 1)},
             "the object 'ball' cannot be drawn: its points are 5001; there must be 3 to 5000",
         ),
         (
@@ -284,7 +284,7 @@ def test_text_keeps_its_markup_and_loses_control_characters() -> None:
 
 
 def test_all_points_of_a_scene_are_bounded() -> None:
-    lines = [{"id": n, "type": "line", "points": [(0, 0)] * MOST_POINTS} for n in range(6)]
+    lines = [{"id": n, "type": "line", "points": [(0, 0)] * MAX_POINTS} for n in range(6)]
     scene = as_scene(lines)
     assert len(scene.objects) == 4
     assert scene.problems == ("the scene has more than 20000 points; some objects are left out",)
@@ -298,7 +298,7 @@ TOO_MUCH_TEXT = ("the scene's texts have more than 100000 characters; some are l
 
 
 def test_a_scene_has_so_many_characters_in_all_and_goes_on_without_the_others() -> None:
-    most = MOST_TEXT_IN_ALL // 1_000
+    most = MAX_TEXT_IN_ALL // 1_000
     scene = as_scene([*text_objects(2_000 - 1), BALL])
     assert list(scene.objects) == [*(f"t{n}" for n in range(most)), "ball"]
     assert scene.problems == TOO_MUCH_TEXT
@@ -337,7 +337,7 @@ def test_texts_that_stay_count_for_the_limit_too() -> None:
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ([BALL] * (MOST_OBJECTS + 1), "render() returned 2001 objects; a scene has at most 2000"),
+        ([BALL] * (MAX_OBJECTS + 1), "render() returned 2001 objects; a scene has at most 2000"),
         ({"hud": "3"}, "render() returned a map without 'objects'; return a list, or {'objects': […], 'hud': '…'}"),
         ({"objects": 3}, "render() must return a list of objects, not int"),
     ],

@@ -63,7 +63,7 @@ async def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeyp
 
 
 async def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_further_ping_meanwhile(monkeypatch):
-    monkeypatch.setattr(round_trips, "LONGEST_SECONDS", 0.3)
+    monkeypatch.setattr(round_trips, "MAX_SECONDS", 0.3)
     monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
     async with measured_connection(1) as (client, end, reports):
         await until_async(lambda: len(reports) >= 1)
