@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol import keyboard, values
-from protocol.values import MAX_NAME, Keys, SectionProblem, checked
+from protocol.values import MAX_NAME, KeyPath, SectionProblem, checked
 
 MAX_KEYS = 100
 """The largest number of entries in one map: keys of one player, labels, or names."""
@@ -17,7 +17,7 @@ _LABEL = values.text("the text of a button", MAX_NAME)
 _NAME = values.text("what participants read", MAX_NAME)
 
 
-def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], list[SectionProblem]]:
+def actions_of_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, Any], list[SectionProblem]]:
     """Check `keys`: a map `{key: action}`, or such a map for each player.
 
     Returns the valid entries, and the problems.
@@ -32,7 +32,7 @@ def actions_of_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, Any], 
     return found, problems
 
 
-def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
+def _one_players_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
     problems: list[SectionProblem] = []
     names: dict[frozenset[str], str] = {}  # by combination: the same one can be written in several ways
@@ -50,7 +50,7 @@ def _one_players_keys(value: dict[str, Any], path: Keys) -> tuple[dict[str, str]
     return found, problems + _too_many(value, path)
 
 
-def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
+def labels(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
     """Check `labels`, the texts of buttons: `{action: text}`.
 
     Returns the valid entries, and the problems.
@@ -58,7 +58,7 @@ def labels(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[Sect
     return _texts(value, path, _action, _LABEL)
 
 
-def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], list[SectionProblem]]:
+def player_names(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
     """Check `playerNames`, the players' names for participants: `{player: text}`.
 
     Returns the valid entries, and the problems.
@@ -67,7 +67,7 @@ def player_names(value: dict[str, Any], path: Keys) -> tuple[dict[str, str], lis
 
 
 def _texts(
-    value: dict[str, Any], path: Keys, key: Callable[[Any], Any], text: Callable[[Any], Any]
+    value: dict[str, Any], path: KeyPath, key: Callable[[Any], Any], text: Callable[[Any], Any]
 ) -> tuple[dict[str, str], list[SectionProblem]]:
     found: dict[str, str] = {}
     problems: list[SectionProblem] = []
@@ -81,7 +81,7 @@ def _texts(
     return found, problems + _too_many(value, path)
 
 
-def _too_many(value: Mapping[str, Any], path: Keys) -> list[SectionProblem]:
+def _too_many(value: Mapping[str, Any], path: KeyPath) -> list[SectionProblem]:
     if len(value) <= MAX_KEYS:
         return []
     return [SectionProblem(path, f"must have at most {MAX_KEYS} lines, not {len(value)}")]

@@ -11,7 +11,7 @@ from protocol import key_maps, values
 from protocol import players as player_checks
 from protocol import trial_keys as keyed
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import Keys, number_in
+from protocol.values import KeyPath, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
@@ -272,21 +272,21 @@ class TrialSection:
         """Whether `keys` has a map for each player."""
         return any(isinstance(each, dict) for each in self.keys.values())
 
-    def key_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
+    def key_maps(self) -> Iterator[tuple[KeyPath, Mapping[str, str]]]:
         """Yield `keys`, or the map in it for each player, after its path below `keys`."""
         if self.keys_differ:
             yield from (((player,), each) for player, each in self.keys.items())
         else:
             yield (), self.keys
 
-    def player_maps(self) -> Iterator[tuple[Keys, Mapping[str, str]]]:
+    def player_maps(self) -> Iterator[tuple[KeyPath, Mapping[str, str]]]:
         """Yield `players`, or the map in it for each group, after its path below `players`."""
         if player_checks.by_group(self.players):
             yield from (((group,), each) for group, each in self.players.items())
         else:
             yield (), self.players
 
-    def humans(self) -> Iterator[tuple[Keys, list[str]]]:
+    def humans(self) -> Iterator[tuple[KeyPath, list[str]]]:
         """Yield the players that participants play, after the path of their map below `players`.
 
         There is one map for all groups, or a map for each group.

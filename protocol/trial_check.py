@@ -11,7 +11,7 @@ from protocol import trial_rules, values
 from protocol.trial import MAX_OWN_CONTROLS, RATE_CHANGE, RATE_CHANGE_MISSPELT, RESERVED_CONTROLS, TrialSection
 from protocol.trial_keys import keys, names
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import MAX_NAME, Check, Keys, SectionProblem, checked, is_blank
+from protocol.values import MAX_NAME, Check, KeyPath, SectionProblem, checked, is_blank
 
 _CONTROL = values.text("the name of a control", MAX_NAME)
 
@@ -47,7 +47,7 @@ def _with_one_spelling(section: dict[str, Any]) -> tuple[dict[str, Any], list[Se
 
 
 def _section(
-    model: type[TrialSection | Ui | SceneSection], section: dict[str, Any], path: Keys
+    model: type[TrialSection | Ui | SceneSection], section: dict[str, Any], path: KeyPath
 ) -> tuple[dict[str, Any], list[SectionProblem]]:
     """The valid values by attribute, and the problems."""
     found: dict[str, Any] = {}
@@ -73,7 +73,7 @@ def _section(
     return found, problems
 
 
-def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...], list[SectionProblem]]:
+def _own_controls(section: dict[str, Any], path: KeyPath) -> tuple[tuple[str, ...], list[SectionProblem]]:
     """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
     found: list[str] = []
     problems: list[SectionProblem] = []
@@ -93,6 +93,6 @@ def _own_controls(section: dict[str, Any], path: Keys) -> tuple[tuple[str, ...],
     return tuple(found), problems
 
 
-def _items(check_item: Check, items: list[object], path: Keys) -> tuple[tuple[Any, ...], list[SectionProblem]]:
+def _items(check_item: Check, items: list[object], path: KeyPath) -> tuple[tuple[Any, ...], list[SectionProblem]]:
     read = [checked(check_item, item, (*path, index)) for index, item in enumerate(items)]
     return tuple(value for value, _ in read), [problem for _, wrong in read for problem in wrong]

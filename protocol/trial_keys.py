@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from protocol import values
-from protocol.values import Check, Keys, SectionProblem
+from protocol.values import Check, KeyPath, SectionProblem
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Key:
     """If the value is a list: the check of each item."""
     section: type[Any] | None = None
     """If the value is a section of its own: the class of its keys."""
-    entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]] | None = None
+    entries: Callable[[Any, KeyPath], tuple[Any, list[SectionProblem]]] | None = None
     """If the value is a map whose names the project chooses: gets the map and its path, returns its valid entries and
     the problems (`protocol/key_maps.py`)."""
 
@@ -64,7 +64,7 @@ def choice(words: tuple[str, ...], meaning: str) -> Any:
     return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
 
 
-def texts(example: str, meaning: str, entries: Callable[[Any, Keys], tuple[Any, list[SectionProblem]]]) -> Any:
+def texts(example: str, meaning: str, entries: Callable[[Any, KeyPath], tuple[Any, list[SectionProblem]]]) -> Any:
     """Declare a key that maps names, which the project chooses, to texts."""
     schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
     return key(values.section(example), {}, meaning, schema, entries=entries)

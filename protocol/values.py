@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 Check = Callable[[object], object]
-Keys = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 """The path of a value: keys and, in lists, positions from 0."""
 MAX_NAME = 64
 """Characters of the name of an action, a player, or one of the project's own controls."""
@@ -41,7 +41,7 @@ class SectionProblem(NamedTuple):
     `compared` has the keys that a rule compares (`trial_rules.py`); it is empty if the value is wrong by itself.
     """
 
-    path: Keys
+    path: KeyPath
     sentence: str
     compared: tuple[str, ...] = ()
 
@@ -51,7 +51,7 @@ def is_blank(value: object) -> bool:
     return value is None or value == ""
 
 
-def checked(check: Check, value: object, path: Keys) -> tuple[Any, list[SectionProblem]]:
+def checked(check: Check, value: object, path: KeyPath) -> tuple[Any, list[SectionProblem]]:
     """Return the result of the check and no problem, or None and the problem at this path."""
     try:
         return check(value), []
@@ -78,7 +78,7 @@ def printable(text: str, limit: int = 60) -> str:
     return "".join(char if char.isprintable() else "?" for char in text)
 
 
-def path_text(path: Keys) -> str:
+def path_text(path: KeyPath) -> str:
     """Return the path as text: `trial.actionSpace item 3`."""
     words = ""
     for part in path:

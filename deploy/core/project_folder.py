@@ -15,7 +15,7 @@ from deploy.aws.account import Installation
 from hippodrome.config import Config, ConfigErrors, Diagnostic, layout, read_project
 from hippodrome.config.folder import read_source
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
-from protocol.values import Keys
+from protocol.values import KeyPath
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _aws_setup_of(installation: Installation) -> dict[str, str]:
     }
 
 
-def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
+def _no_id(folder: Path) -> Iterator[tuple[KeyPath, str]]:
     """Yield a mistake if the id is empty. On one machine an empty id stands for the folder's name."""
     given: Any = read_source(folder).parsed.values.get("project")
     if isinstance(given, dict) and given.get("id") in (None, ""):
@@ -115,7 +115,7 @@ def _no_id(folder: Path) -> Iterator[tuple[Keys, str]]:
         )
 
 
-def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
+def _lacking_for_aws(config: Config) -> Iterator[tuple[KeyPath, str]]:
     """Yield the missing keys that only AWS needs. With `useAWS: true` the servers' size has been checked already."""
     setup = config.project.aws_setup
     missing = [key for key in ("cpu", "memory") if not setup.given(key)]
@@ -129,7 +129,7 @@ def _lacking_for_aws(config: Config) -> Iterator[tuple[Keys, str]]:
         )
 
 
-def _contradictions(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+def _contradictions(config: Config, installation: Installation) -> Iterator[tuple[KeyPath, str]]:
     """Yield the project's values that this installation does not allow."""
     project = config.project
     given = project.aws_setup.model_dump(by_alias=True)
@@ -155,7 +155,7 @@ def _contradictions(config: Config, installation: Installation) -> Iterator[tupl
         )
 
 
-def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Keys, str]]:
+def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[KeyPath, str]]:
     """Yield the values that have no effect here: another bucket's name, and a maxRuntime that is too long."""
     most = int(installation["MaxRuntime"])
     if config.project.max_runtime > most:
@@ -172,7 +172,7 @@ def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Key
         )
 
 
-def _with_lines(folder: Path, found: list[tuple[Keys, str]], remark: bool = False) -> list[str]:
+def _with_lines(folder: Path, found: list[tuple[KeyPath, str]], remark: bool = False) -> list[str]:
     """Put before each text its line in config.yml."""
     source = read_source(folder) if found else None
     return [str(source.diagnostic(path, text, remark=remark)) for path, text in found] if source else []

@@ -23,7 +23,7 @@ from hippodrome.config import Config, Diagnostic, hippo_requirements, layout
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT, REQUIREMENTS
 from protocol import players
-from protocol.values import Keys, printable
+from protocol.values import KeyPath, printable
 
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_IMAGE = ("trial", "protocol", "pip")  # two packages of Hippodrome, and the package of Python's base image
@@ -90,7 +90,7 @@ def missing_for_players(folder: Path, config: Config) -> list[Diagnostic]:
     return list(found.values())
 
 
-def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[Keys, str, str]]:
+def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[KeyPath, str, str]]:
     """The path and the name of each policy's file or game that needs a package, and the package's line for
     requirements.txt."""
     for path, file in config.trial.policy_files():

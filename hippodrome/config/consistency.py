@@ -16,10 +16,10 @@ from hippodrome.config.step_order import step_name, step_range
 from hippodrome.model.step_order import FINAL, default_start, position, visited
 from hippodrome.model.step_types import type_of
 from protocol.environment import PLAIN_ORIGINS
-from protocol.values import Keys
+from protocol.values import KeyPath
 
 
-def check(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
+def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
     """Check each value of a file's sections by itself, and then the values against each other.
 
     Returns the valid values and all mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
@@ -182,8 +182,8 @@ def _game_step(checked: Checked) -> Iterator[Mistake]:
         yield Mistake(path, "the game cannot be the last step; add a page after it, which stops the server")
 
 
-_START: Keys = ("project", "events", "startServerStep")
-_STOP: Keys = ("project", "events", "stopServerStep")
+_START: KeyPath = ("project", "events", "startServerStep")
+_STOP: KeyPath = ("project", "events", "stopServerStep")
 
 
 def _event_steps(checked: Checked) -> Iterator[Mistake]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from protocol.values import Keys
+from protocol.values import KeyPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Mistake(NamedTuple):
     `line` is the line of the mistake in the file; None stands for the line of the value at `path`.
     """
 
-    path: Keys
+    path: KeyPath
     message: str
     line: int | None = None
 
@@ -54,7 +54,7 @@ class Mistake(NamedTuple):
 class Remark(NamedTuple):
     """A remark on the value at a path of keys."""
 
-    path: Keys
+    path: KeyPath
     message: str
 
 

@@ -23,9 +23,9 @@ from protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
 from protocol.trial_check import check as check_trial
 from protocol.trial_keys import names
 from protocol.trial_sections import Ui
-from protocol.values import Keys, is_blank, show
+from protocol.values import KeyPath, is_blank, show
 
-_EXAMPLES: dict[Keys, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
+_EXAMPLES: dict[KeyPath, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
 _ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding them takes time
 
 
@@ -38,21 +38,21 @@ class Checked:
     has_project: bool
     trial: TrialSection = field(default_factory=TrialSection)
     mistakes: list[Mistake] = field(default_factory=list)
-    invalid: list[Keys] = field(default_factory=list)
+    invalid: list[KeyPath] = field(default_factory=list)
 
     @property
     def game_steps(self) -> list[str]:
         """The keys of the game steps."""
         return [key for key, page in self.project.steps.items() if type_of(page).on_server]
 
-    def valid(self, *paths: Keys) -> bool:
+    def valid(self, *paths: KeyPath) -> bool:
         """Return whether no mistake is at one of these paths, below it or above it."""
         return not any(
             bad[: len(path)] == path or path[: len(bad)] == bad for bad, path in itertools.product(self.invalid, paths)
         )
 
 
-def check_values(sections: dict[str, Any], invalid: Iterable[Keys] = ()) -> Checked:
+def check_values(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
     """Check each value of a file's sections by itself.
 
     Returns the valid values and the mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
@@ -90,7 +90,7 @@ def _check_trial(given: Any, checked: Checked) -> None:
             checked.mistakes.append(Mistake(("trial", *path), sentence))
 
 
-def _unknown_in_trial(trial: Any) -> Iterator[Keys]:
+def _unknown_in_trial(trial: Any) -> Iterator[KeyPath]:
     for path, section in TRIAL_SECTIONS.items():
         given = _at({"trial": trial}, path)
         known = names(section) | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
@@ -109,7 +109,7 @@ def _copy(data: Any, depth: int = 5) -> Any:
     return [_copy(item, depth - 1) for item in data] if isinstance(data, list) and depth else data
 
 
-def _at(data: Any, path: Keys) -> Any:
+def _at(data: Any, path: KeyPath) -> Any:
     for key in path:
         data = data.get(key) if isinstance(data, dict) else None
     return data
@@ -118,7 +118,7 @@ def _at(data: Any, path: Keys) -> Any:
 def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, Any]) -> None:
     """Note pydantic's errors as mistakes, and remove the wrong values from the sections."""
     for error in errors:
-        path: Keys = error["loc"]
+        path: KeyPath = error["loc"]
         if path[:2] in (STEPS, TEXTS):
             path = path[:3]  # pydantic adds a mark where a key, not its value, is wrong
         if error["type"] == "extra_forbidden":
@@ -128,18 +128,18 @@ def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, 
         _remove(sections, path)
 
 
-def _note_unknown(checked: Checked, path: Keys) -> None:
+def _note_unknown(checked: Checked, path: KeyPath) -> None:
     message, meant = explain(path) if len(checked.mistakes) < _ENOUGH else ("unknown key", [])
     checked.invalid += meant
     _note(checked, path, message)
 
 
-def _note(checked: Checked, path: Keys, message: str) -> None:
+def _note(checked: Checked, path: KeyPath, message: str) -> None:
     checked.mistakes.append(Mistake(path, message))
     checked.invalid.append(path)
 
 
-def _remove(data: Any, path: Keys) -> None:
+def _remove(data: Any, path: KeyPath) -> None:
     """Remove the value at `path`; for an item of a list, remove the list."""
     keys = list(itertools.takewhile(lambda key: isinstance(key, str), path))
     for key in keys[:-1]:
@@ -147,7 +147,7 @@ def _remove(data: Any, path: Keys) -> None:
     data.pop(keys[-1], None)
 
 
-def message_of(error: ErrorDetails, path: Keys) -> str:
+def message_of(error: ErrorDetails, path: KeyPath) -> str:
     """Return Hippodrome's message for an error of pydantic at this path."""
     if "ctx" in error and isinstance(error["ctx"].get("error"), ValueError):
         return str(error["ctx"]["error"])

@@ -21,7 +21,7 @@ from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
 from protocol import players
 from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
-from protocol.values import Keys, path_text
+from protocol.values import KeyPath, path_text
 
 if TYPE_CHECKING:
     from hippodrome.config.yaml_file import ParsedFile
@@ -35,7 +35,7 @@ class ConfigSource:
     parsed: ParsedFile
     adapted: Adapted
 
-    def diagnostic(self, path: Keys, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
+    def diagnostic(self, path: KeyPath, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
         """Return a mistake or remark on the value at this path of Hippodrome's form.
 
         Without `line`, it names the line of the value.
@@ -47,11 +47,11 @@ class ConfigSource:
         """Return a remark for each value that was translated from HIPPO's form."""
         return in_order(self._diagnostic(path, message, None, True) for path, message in self.adapted.remarks)
 
-    def names(self, path: Keys) -> bool:
+    def names(self, path: KeyPath) -> bool:
         """Return whether the file gives a value for this path of Hippodrome's form."""
         return self.adapted.origin(path) in self.parsed.lines
 
-    def _diagnostic(self, origin: Keys, message: str, line: int | None, remark: bool) -> Diagnostic:
+    def _diagnostic(self, origin: KeyPath, message: str, line: int | None, remark: bool) -> Diagnostic:
         if (
             origin == ("trial", RATE_CHANGE)
             and origin not in self.parsed.lines

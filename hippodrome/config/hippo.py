@@ -16,7 +16,7 @@ from hippodrome.config.unknown_keys import meant_for
 from hippodrome.model import ids
 from hippodrome.model.step_order import FINAL
 from protocol.trial import HIGHEST_RATE, RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
-from protocol.values import Keys, Plain, flag, is_blank, number_in, path_text, show
+from protocol.values import KeyPath, Plain, flag, is_blank, number_in, path_text, show
 
 CLOSING_PAGE = "hippodrome-the-end"
 """The last page of a study without pages (`step_files.CLOSING`)."""
@@ -25,11 +25,11 @@ SSL_NO_EFFECT = "no effect: servers get the certificate of the installation"
 
 _CPU, _MEMORY = 2, 10  # vCPUs and GB: the defaults of HIPPO's updateProject.py
 _SSL = ("sslBucket", "fullchain", "privkey")
-_SPELLINGS: dict[Keys, str] = {
+_SPELLINGS: dict[KeyPath, str] = {
     ("project", "step"): "steps",  # in HIPPO's documentation
     ("project", "team_members"): "teamMembers",  # in HIPPO's update_project_master_list
 }
-_GENERATED: dict[Keys, str] = {
+_GENERATED: dict[KeyPath, str] = {
     ("project", "ecsTask"): "the task definition is named after the stack and the project's id",
     ("project", "bucket"): "the bucket is the installation's; project.awsSetup.bucket may name it",
     ("project", "awsSetup", "containerName"): "the container is named by Hippodrome",
@@ -50,28 +50,28 @@ class Adapted:
 
     values: dict[str, Any]
     remarks: list[Remark] = field(default_factory=list)
-    origins: dict[Keys, Keys] = field(default_factory=dict)
+    origins: dict[KeyPath, KeyPath] = field(default_factory=dict)
 
-    def origin(self, path: Keys) -> Keys:
+    def origin(self, path: KeyPath) -> KeyPath:
         """Return the path in the original document."""
         for end in range(len(path), 0, -1):
             if path[:end] in self.origins:
                 return (*self.origins[path[:end]], *path[end:])
         return path
 
-    def at(self, path: Keys) -> Any:
+    def at(self, path: KeyPath) -> Any:
         """Return the value at the path; None if there is none."""
         found: Any = self.values
         for key in path:
             found = found.get(key) if isinstance(found, dict) else None
         return found
 
-    def section(self, path: Keys) -> dict[str, Any]:
+    def section(self, path: KeyPath) -> dict[str, Any]:
         """Return the section at the path; {}, which is no part of the document, if there is none."""
         found = self.at(path)
         return found if isinstance(found, dict) else {}
 
-    def remark(self, path: Keys, message: str) -> None:
+    def remark(self, path: KeyPath, message: str) -> None:
         self.remarks.append(Remark(self.origin(path), message))
 
 
@@ -358,7 +358,7 @@ def _unknown(adapted: Adapted) -> None:
                 adapted.remark(path, "no effect: Hippodrome has no such key")
 
 
-def _is_mistake(adapted: Adapted, path: Keys) -> bool:
+def _is_mistake(adapted: Adapted, path: KeyPath) -> bool:
     """Whether an unknown key was most likely meant for a known key without a value. If the known key has a value, the
     unknown one may be a similar key of the agent."""
     meant = meant_for(path)
@@ -366,7 +366,7 @@ def _is_mistake(adapted: Adapted, path: Keys) -> bool:
     return meant is not None and (misplaced or len(meant) == 1 or is_blank(adapted.at(meant)))
 
 
-def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
+def _give_to_agent(adapted: Adapted, path: KeyPath, value: Any) -> None:
     """Move an unknown key of `trial` to `trial.options`, for the agent."""
     trial = adapted.section(("trial",))
     options = {} if is_blank(trial.get("options")) else trial["options"]
@@ -380,7 +380,7 @@ def _give_to_agent(adapted: Adapted, path: Keys, value: Any) -> None:
     adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)")
 
 
-def _own_control(adapted: Adapted, path: Keys) -> None:
+def _own_control(adapted: Adapted, path: KeyPath) -> None:
     """Remove one of the project's own controls if it is neither true nor false."""
     ui = adapted.section(path[:-1])
     value = ui[str(path[-1])]

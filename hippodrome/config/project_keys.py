@@ -24,7 +24,7 @@ from protocol.similar import did_you_mean
 from protocol.trial import TrialSection
 from protocol.trial_keys import names
 from protocol.trial_sections import SceneSection, Ui
-from protocol.values import Keys, Plain, as_text, number_in, show, step_file
+from protocol.values import KeyPath, Plain, as_text, number_in, show, step_file
 
 MAX_STEPS = 500
 MAX_HOSTS = 50
@@ -353,22 +353,22 @@ class Root(Model):
     project: ProjectKeys = ProjectKeys()
 
 
-SECTIONS: dict[Keys, type[Model]] = {
+SECTIONS: dict[KeyPath, type[Model]] = {
     ("project",): ProjectKeys,
     ("project", "awsSetup"): AwsSetupKeys,
     ("project", "events"): EventsKeys,
     ("project", "ssl"): SslKeys,
 }
-TRIAL_SECTIONS: dict[Keys, type[TrialSection | Ui | SceneSection]] = {
+TRIAL_SECTIONS: dict[KeyPath, type[TrialSection | Ui | SceneSection]] = {
     ("trial",): TrialSection,
     ("trial", "ui"): Ui,
     ("trial", "scene"): SceneSection,
 }
-NAMES: dict[Keys, frozenset[str]] = {
+NAMES: dict[KeyPath, frozenset[str]] = {
     **{path: names(section) for path, section in TRIAL_SECTIONS.items()},
     **{path: model.names() for path, model in SECTIONS.items()},
     (): frozenset({"project", "trial"}),
 }
 """The keys of each section, as they stand in the file."""
-STEPS: Keys = ("project", "steps")
-TEXTS: Keys = ("project", "texts")
+STEPS: KeyPath = ("project", "steps")
+TEXTS: KeyPath = ("project", "texts")

@@ -13,15 +13,15 @@ from hippodrome.config.folder import ConfigSource, read_source
 from hippodrome.config.hippo import SSL_NO_EFFECT
 from hippodrome.config.project_keys import STEPS
 from protocol import keyboard
-from protocol.values import Keys, printable
+from protocol.values import KeyPath, printable
 
-START: Keys = ("project", "events", "startServerStep")
+START: KeyPath = ("project", "events", "startServerStep")
 
 IDLE = frozenset({"noop", "no-op", "no_op", "nothing", "none", "idle", "stay", "wait", "still", "stop", "pass"})
 """Names of an action that does nothing."""
 
-UI: Keys = ("trial", "ui")
-KEYS: Keys = ("trial", "keys")
+UI: KeyPath = ("trial", "ui")
+KEYS: KeyPath = ("trial", "keys")
 ARROWS = ("left", "right", "up", "down")
 PARTS = frozenset({*ARROWS, "fire"})
 """Keys that are combined with others: "up" and "right" are the action "upright" (`trial/core/controls.py`)."""

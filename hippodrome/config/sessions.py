@@ -10,14 +10,14 @@ from hippodrome.config.diagnostics import Mistake, Remark
 from hippodrome.config.each_value import Checked
 from protocol.players import HUMAN, by_group
 from protocol.trial import SESSION_KEYS, TrialSection
-from protocol.values import Keys, printable
+from protocol.values import KeyPath, printable
 
-PLAYERS: Keys = ("project", "players")
-MATCHING: Keys = ("project", "matching")
-SEATS: Keys = ("project", "seats")
-WHO_PLAYS: Keys = ("trial", "players")
+PLAYERS: KeyPath = ("project", "players")
+MATCHING: KeyPath = ("project", "matching")
+SEATS: KeyPath = ("project", "seats")
+WHO_PLAYS: KeyPath = ("trial", "players")
 
-OF_SESSIONS: tuple[Keys, ...] = (
+OF_SESSIONS: tuple[KeyPath, ...] = (
     MATCHING,
     SEATS,
     ("project", "patience"),
@@ -92,7 +92,7 @@ def _empty_places(checked: Checked) -> Iterator[Mistake]:
     """`afterPatience: policies` needs `substitute`. (`protocol/trial_rules.py` checks `afterAbsent: policy`.)"""
     trial = checked.trial
     needs = checked.project.after_patience == "policies" and trial.after_absent != "policy"
-    path: Keys = ("trial", "substitute")
+    path: KeyPath = ("trial", "substitute")
     if needs and trial.substitute is None and checked.valid(("project", "afterPatience"), path):
         message = "afterPatience: policies needs a policy that plays in the empty places, such as substitute: random"
         yield Mistake(path, f"missing; {message}")

@@ -11,7 +11,7 @@ from hippodrome.config.each_value import Checked
 from hippodrome.config.english import is_not_english, words_of
 from hippodrome.config.project_keys import TEXTS
 from hippodrome.model.texts import ENGLISH, LANGUAGE, is_language, places, texts_of
-from protocol.values import Keys, show
+from protocol.values import KeyPath, show
 
 _BRACES = re.compile(r"\{[^{}]*\}")
 _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
@@ -85,7 +85,7 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
     missing = [name for name in needed if name not in own or _is_untouched(name, own[name])]
     if missing:
         language = foreign[0]
-        path: Keys = TEXTS if own else ("project",)
+        path: KeyPath = TEXTS if own else ("project",)
         shown = ", ".join(missing[:_SHOWN]) + (" …" if len(missing) > _SHOWN else "")
         which = f"{len(missing)} of Hippodrome's texts stay" if len(missing) > 1 else "one of Hippodrome's texts stays"
         message = f"the study is in another language ({language}), and {which} English: {shown}"

@@ -6,7 +6,7 @@ from hippodrome.config.project_keys import NAMES, STEPS, TEXTS
 from hippodrome.model.step_order import FINAL
 from hippodrome.model.texts import ENGLISH
 from protocol.similar import SIMILAR, nearest
-from protocol.values import Keys, path_text
+from protocol.values import KeyPath, path_text
 
 _LIKELY, _LIKELY_ELSEWHERE = 0.8, 0.9
 """How similar an unknown key must be to a known one to be most likely a typing error: for a key of the same section,
@@ -21,7 +21,7 @@ _AROUND_TEXTS = ((), TEXTS[:-1])
 """The sections in which texts stand if they are not indented far enough."""
 
 
-def explain(path: Keys) -> tuple[str, list[Keys]]:
+def explain(path: KeyPath) -> tuple[str, list[KeyPath]]:
     """Return the message about an unknown key, and the path of the key that was probably meant.
 
     The path is in a list, which is empty if no known key is similar enough.
@@ -41,7 +41,7 @@ def explain(path: Keys) -> tuple[str, list[Keys]]:
     return f"unknown key; {which}" + (f"; {own}" if own else ""), []
 
 
-def meant_for(path: Keys) -> Keys | None:
+def meant_for(path: KeyPath) -> KeyPath | None:
     """Return the path of the key that was most likely meant by an unknown key; None if no known key is similar enough.
 
     The unknown key is a known key in the wrong section, or has a typing error.
@@ -51,7 +51,7 @@ def meant_for(path: Keys) -> Keys | None:
     return _similar(path, _LIKELY, _LIKELY_ELSEWHERE) if home is None else (*home, key)
 
 
-def _similar(path: Keys, here: float, elsewhere: float) -> Keys | None:
+def _similar(path: KeyPath, here: float, elsewhere: float) -> KeyPath | None:
     """The path of the known key that is most similar to an unknown one; None if no known key is similar enough.
 
     `here` is how similar a key of the same section must be, and `elsewhere` a key of another section.
@@ -63,7 +63,7 @@ def _similar(path: Keys, here: float, elsewhere: float) -> Keys | None:
     return None
 
 
-def _home(key: str, section: Keys) -> Keys | None:
+def _home(key: str, section: KeyPath) -> KeyPath | None:
     """The section to which a key belongs that stands in `section`; None if no section has this key."""
     if key == FINAL or key.isdecimal():
         return STEPS

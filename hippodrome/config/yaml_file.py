@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import yaml
 
 from hippodrome.config.diagnostics import Mistake
-from protocol.values import Keys, Plain, printable
+from protocol.values import KeyPath, Plain, printable
 
 LIMIT_BYTES = 256 * 1024
 LIMIT_DEPTH = 16
@@ -56,10 +56,10 @@ class ParsedFile:
     """A YAML file: its values, the line of each path of keys (lines count from 1), and the mistakes in its YAML."""
 
     values: dict[str, Value] = field(default_factory=dict)
-    lines: dict[Keys, int] = field(default_factory=dict)
+    lines: dict[KeyPath, int] = field(default_factory=dict)
     mistakes: list[Mistake] = field(default_factory=list)
 
-    def line(self, path: Keys) -> int:
+    def line(self, path: KeyPath) -> int:
         """Return the line of `path`, or of the nearest section around it that is in the file; 1 if there is none."""
         for end in range(len(path), 0, -1):
             if path[:end] in self.lines:
@@ -167,7 +167,7 @@ class _Reader:
         self.file.values = self._map(root, ())
         return self.file
 
-    def _value(self, node: yaml.Node, path: Keys) -> Value:
+    def _value(self, node: yaml.Node, path: KeyPath) -> Value:
         self.left -= 1
         if self.left < 0:
             raise UnreadableConfig("the file holds too many values; do not repeat large parts with aliases (*name)")
@@ -179,12 +179,12 @@ class _Reader:
             return self._list(node, path)
         return _scalar(node)
 
-    def _allowed(self, node: yaml.Node, path: Keys) -> bool:
+    def _allowed(self, node: yaml.Node, path: KeyPath) -> bool:
         if node.tag not in _KNOWN_TAGS:
             self._mistake(path, node, "tags (! and !!) are not allowed; write the plain value, in quotes if it has a !")
         return node.tag in _KNOWN_TAGS
 
-    def _list(self, node: yaml.SequenceNode, path: Keys) -> list[Value]:
+    def _list(self, node: yaml.SequenceNode, path: KeyPath) -> list[Value]:
         items: list[Value] = []
         for index, item in enumerate(node.value):
             here = (*path, index)
@@ -192,7 +192,7 @@ class _Reader:
             items.append(self._value(item, here) if self._allowed(item, here) else None)
         return items
 
-    def _map(self, node: yaml.MappingNode, path: Keys) -> dict[str, Value]:
+    def _map(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, Value]:
         values: dict[str, Value] = {}
         for key, value in self._pairs(node, path):
             here = (*path, key.value)
@@ -205,7 +205,7 @@ class _Reader:
                 values[key.value] = self._value(value, here)
         return values
 
-    def _pairs(self, node: yaml.MappingNode, path: Keys) -> Iterator[tuple[yaml.ScalarNode, yaml.Node]]:
+    def _pairs(self, node: yaml.MappingNode, path: KeyPath) -> Iterator[tuple[yaml.ScalarNode, yaml.Node]]:
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 self._mistake(path, key, "a key must be a plain word or number, not a list or a map")
@@ -214,7 +214,7 @@ class _Reader:
             else:
                 yield key, value
 
-    def _mistake(self, path: Keys, node: yaml.Node, message: str) -> None:
+    def _mistake(self, path: KeyPath, node: yaml.Node, message: str) -> None:
         self.file.mistakes.append(Mistake(path, message, node.start_mark.line + 1))
 
 

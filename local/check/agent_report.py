@@ -19,7 +19,7 @@ from local.check.remedies import remedy
 from local.check.wording import short
 from protocol import environment as variables
 from protocol.players import HUMAN
-from protocol.values import Keys, printable
+from protocol.values import KeyPath, printable
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
@@ -206,7 +206,7 @@ class AgentReport:
         plays, substitute = trial.players_of(self._group).get(player, player), trial.substitute
         return substitute if plays == HUMAN and substitute else plays
 
-    def _player(self, player: str) -> Keys:
+    def _player(self, player: str) -> KeyPath:
         """The key of config.yml that says who plays this player, or who substitutes for the human."""
         if self._config.trial.players_of(self._group).get(player) == HUMAN:
             return ("trial", "substitute")
@@ -373,7 +373,7 @@ class AgentReport:
         )
         return Diagnostic(file, line, "", message, remark)
 
-    def _in_config(self, path: Keys, message: str, remark: bool = False) -> Diagnostic:
+    def _in_config(self, path: KeyPath, message: str, remark: bool = False) -> Diagnostic:
         return read_source(self._folder).diagnostic(path, message, remark=remark)
 
     def _stack(self) -> str:
