@@ -324,8 +324,8 @@ def _restore_numbers(state: ExportState, folder: Path, write: bool) -> None:
     if not path.exists():
         if (folder / manifest.NAME).exists():
             raise Problem(
-                f"{folder} holds data with numbers for names, and its {path.relative_to(folder)} is missing.",
-                "Put the file back, or name another folder: people will have other numbers there.",
+                f"{folder} holds data with numbers in place of ids, but {path.relative_to(folder)} is missing there.",
+                "Put the file back, or name another folder. In another folder people get other numbers.",
             )
         return
     if not write:

@@ -26,7 +26,7 @@ def project_id(given: str | None) -> str | None:
 
     found = id_in(Path(given))
     if found is None:
-        raise Problem(f"No config.yml in {given} names a project's id.", "Name the project's folder, or its id.")
+        raise Problem(f"{given} has no config.yml with a project id.", "Name the project's folder, or its id.")
     return found
 
 

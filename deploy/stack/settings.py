@@ -147,7 +147,7 @@ class StackSettings:
 def _check_site(site: str) -> None:
     if len(site) > SITE_LENGTH:
         raise Problem(
-            f"The site's address would have {len(site)} characters ({site}); AWS gives certificates for {SITE_LENGTH}.",
+            f"The site's address would have {len(site)} characters ({site}); AWS's certificates allow {SITE_LENGTH}.",
             "Choose a shorter --site or --domain.",
         )
 

@@ -191,7 +191,7 @@ class AgentCalls(Calls):
             result = self._agent.step(asked)
             action = asked if result.action is None else result.action
             if result.terminated or result.truncated or (action, result.reward) != (step.action, step.reward):
-                raise Diverged("it plays differently now")
+                raise Diverged("the environment plays differently now")
             if self.callbacks:
                 self._tell_step(action, result)
             info = result.info

@@ -170,12 +170,12 @@ class JointCalls(Calls):
             for word in step.feedback:
                 self._feedback(word)
             if not step.players:
-                raise Diverged("it was played with one player")
+                raise Diverged("the earlier server had one player")
             taken = {name: part.action for name, part in step.players.items() if part.action is not None}
             joint = self._agent.step({**call.default_actions, **taken})
             rewards = {player: part.reward for player, part in step.players.items()}
             if joint.over or joint.rewards != rewards:
-                raise Diverged("it plays differently now")
+                raise Diverged("the environment plays differently now")
             if self.callbacks:
                 self._tell_step(taken, joint)
             observed.add(number, joint)

@@ -93,7 +93,7 @@ def _array(content: Any) -> Any:
     written, shape, data = content
     dtype = np.dtype(str(written))
     if dtype.kind not in _KINDS:
-        raise CodecError(f"An array of {dtype} is never sent.")
+        raise CodecError(f"An array of {dtype} cannot be read: no server sends one.")
     array = np.frombuffer(base64.b64decode(data), dtype.newbyteorder("<")).astype(dtype).reshape(shape)
     if list(array.shape) != shape:
         raise CodecError("The shape of an array is a list of whole numbers.")
