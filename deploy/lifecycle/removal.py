@@ -105,7 +105,10 @@ class Removal:
     # -- steps
 
     def _prepare_stack(self, described: Mapping[str, Any]) -> None:
-        """Wait for the stack's present operation. Raises `Problem` if it is protected or its policy is a boundary."""
+        """Wait for the stack's present operation, unless that creates it.
+
+        Raises `Problem` if the stack is protected, or if one of its policies is a permissions boundary.
+        """
         self._stack.must_not_be_protected(described)
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
             policies.must_be_no_boundary(self.account, arn)

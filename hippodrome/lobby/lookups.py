@@ -19,13 +19,13 @@ from hippodrome.ports import Platform
 from hippodrome.storage.repository import Repository
 
 FORMED_LATE = timedelta(seconds=4)
-"""If a confirmed session was proposed longer ago, requests of other participants form it, too."""
+"""If a confirmed session was proposed longer ago than this, requests of other participants form it, too."""
 FORMED_AT_ONCE = 10
-"""How many sessions of others one request forms at most."""
+"""The most sessions of other participants that one request forms."""
 LOOKED_AT = 5
-"""How many open sessions' servers a request reads, if its session is the first that waits for a server."""
+"""The most open sessions whose servers a request reads, if its own session is the first that waits for a server."""
 LOOKED_AT_IN_NEED = 50
-"""How many open sessions' servers such a request reads, if the server that its session waits for has ended."""
+"""The most open sessions whose servers a request reads, if the server that its own session waits for has ended."""
 
 
 class Lookups:
@@ -45,7 +45,10 @@ class Lookups:
         servers: StartedAhead,
         chosen: Sequence[Sequence[str]] = (),
     ) -> LobbyRun:
-        """Return a run that may form the sessions of these confirmed proposals. AWS calls: two reads per member."""
+        """Return a run that may form the sessions of these confirmed proposals. AWS calls: two reads per member.
+
+        `servers` is the result of the method `servers`. `chosen` is as in `rules.decide`.
+        """
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), sessions.open_for(project, self._platform.settings)
         return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
@@ -68,8 +71,8 @@ class Lookups:
         """Read the records of the servers that this participant's request may give to sessions.
 
         The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
-        started ahead. Then it has the record of that server. If no other session has waited for longer, it also has the
-        records of some open sessions' servers, and of more of them if the session's own server has ended.
+        started ahead. Then it has the record of that server, and the records of open sessions' servers: of some
+        (`LOOKED_AT`) if no other session has waited for longer, of more (`LOOKED_AT_IN_NEED`) if that server has ended.
         """
         formed = known.formed_of(label)
         own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)

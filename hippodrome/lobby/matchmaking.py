@@ -100,7 +100,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
 def _short_sessions(
     free: Sequence[Waiting], over: Sequence[Waiting], sessions: Iterable[Sequence[Waiting]], project: Project
 ) -> list[Sequence[Waiting]]:
-    """A session for each participant in `over` who is in no session yet: with others who are free, or alone."""
+    """A session for each participant in `over` without one, at most `PROPOSED_AT_ONCE`: with free ones, or alone."""
     taken = {one.label for members in sessions for one in members}
     found: list[Sequence[Waiting]] = []
     for one in over:

@@ -158,7 +158,7 @@ class GymSession:
         return arrays.steps_reply(request.kind, held.handle, observations, take(held, batch, count))
 
     def end(self) -> None:
-        """Close all environments. Exceptions that they raise are ignored."""
+        """Close all environments. Errors that they raise (`GymError`) are ignored."""
         while self._held:
             _, held = self._held.popitem()
             try:
