@@ -239,7 +239,10 @@ def example_documents() -> dict[str, bytes]:
 
 
 def cold_start() -> Iterator[Row]:
-    """Measure the time from the first import to the first page, in turns with botocore and the same calls."""
+    """Measure the time from the first import to the first page, and beside it that of botocore with the same calls.
+
+    Fresh processes of each kind take turns, so that load on the machine slows down all kinds.
+    """
     documents = example_documents()
     with moto_server() as server:
         for key, body in documents.items():

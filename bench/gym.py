@@ -142,7 +142,7 @@ def cpu(pid: int) -> float:
 
 @contextlib.contextmanager
 def pinned() -> Iterator[None]:
-    """Give processes that are started within the block the last core; this process gets the other ones after it."""
+    """Let processes that are started within the block run on the last core; then let this process run on the others."""
     os.sched_setaffinity(0, CORES[-1:])
     try:
         yield
@@ -336,7 +336,7 @@ _MAKE = frame('{"method":"make","params":{"env_id":"CartPole-v1"}}')
 
 
 def _grown(pid: int, url: str, count: int = IDLE, then: Callable[[FrameConnection], Any] = lambda _: None) -> float:
-    """Return the KB of memory that each of `count` connections adds to a server, after `then` was called with it."""
+    """Return the KB by which a server grows with each of `count` connections. `then` is called with each of them."""
     opened = [FrameConnection(url)]  # the memory of what the first one loads is not counted
     then(opened[0])
     before = memory(pid)

@@ -94,7 +94,7 @@ class Partner:
 class ServerLoad:
     """The figures of one server: what it delivered and cost.
 
-    `share` is that of the frames that were due, `cpu` is in ms per frame, memory in MB.
+    `share` is the share of the due frames that it delivered. `cpu` is in ms per frame, memory in MB.
     """
 
     share: float

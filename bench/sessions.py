@@ -85,7 +85,7 @@ class Together:
 
     @property
     def at_best(self) -> list[float]:
-        """Their waits if each ready server were given to the next session at once, in the order of arrival."""
+        """The times that they would wait if each ready server went at once to the next session, in order of arrival."""
         found = (from_json(body, Server) for key, (body, _, _) in self._documents.items() if key.startswith(RECORDS))
         ready = sorted((one.ready - EPOCH).total_seconds() for one in found if one.ready)
         there = sorted(one.lobby for one in self.came if one.lobby is not None and one.matched is not None)

@@ -232,7 +232,7 @@ def judged_core(found: Sequence[TogetherLoad]) -> Iterator[Row]:
 
 @dataclass
 class PairSeen:
-    """The figures of what two participants saw. Times are milliseconds."""
+    """What two participants saw, in figures. Times are milliseconds."""
 
     shares: list[float]  # by participant: the share of the ticks that were due
     waits: list[list[float]]  # by participant: the times from a key event to its effect
@@ -275,7 +275,7 @@ def look(browser: Any) -> PairSeen:
 def apart(one: Sequence[Sequence[float]], other: Sequence[Sequence[float]]) -> list[int]:
     """Return, at each draw of either page, how many ticks lie between the pictures of the two.
 
-    A draw is its ms and its tick. Draws before both pages have drawn are left out.
+    A draw is its time in ms and its tick. Draws before both pages have drawn are left out.
     """
     shown: list[int | None] = [None, None]
     found = []

@@ -41,7 +41,7 @@ class RandomKeys:
 
     def move(self) -> list[dict[str, Any]]:
         """Return the next messages to the server: some release keys, others press keys or take an action, and a few are
-        words.
+        words of feedback.
         """
         random = self._random
         field, keys = ("key", self._mapped_keys) if self._mapped_keys else ("action", self._keys)

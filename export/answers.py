@@ -253,7 +253,7 @@ def _membership(participant: ExportedParticipant) -> list[Any]:
 
 
 def _distinct(*columns: Column) -> list[Column]:
-    """The columns with a number after a name that comes again: `clean` may make two fields' names equal."""
+    """The columns. A name that an earlier column has gets a number: `clean` may make two fields' names equal."""
     names: set[str] = set()
     made = []
     for column in columns:

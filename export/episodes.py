@@ -15,7 +15,7 @@ from export.recording_columns import as_number, as_whole, humans_of, players_of,
 
 
 class Spec(NamedTuple):
-    """The properties of a recording. All recordings of one dataset have the same."""
+    """The properties of a recording. All recordings of one dataset have the same properties."""
 
     step: str
     actions: tuple[str, ...]
@@ -60,7 +60,7 @@ def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Ite
 def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
     """Yield for each episode of a recording its rows of the kinds `reset` and `step`, and why it ended.
 
-    Episodes that end before the first step are left out. In a session the rows have the values of the dataset's human.
+    Episodes that end before the first step are left out. The rows of a session have the values of `spec.human`.
     """
     import pyarrow.parquet as pq
 

@@ -101,7 +101,7 @@ def _is_session(key: str) -> bool:
 
 
 def units(project: str, listed: Iterable[Listed]) -> Iterator[Unit]:
-    """Group the listing by participant and session. In `listed` all files of one must stand together."""
+    """Group the listing by participant and session. In `listed` all files of one of them must be adjacent."""
     user, items = "", list[Item]()
     for line in listed:
         item = keys.read(project, line)

@@ -33,7 +33,7 @@ class Scrub:
         return clean(self._pattern.sub(self._replace, text) if self._pattern else text)
 
     def value(self, value: Any) -> Any:
-        """Return a JSON value with all its texts and keys as by `text`."""
+        """Return a JSON value with `text` applied to each of its texts and keys."""
         if isinstance(value, str):
             return self.text(value)
         if isinstance(value, Mapping):

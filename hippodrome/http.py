@@ -49,7 +49,7 @@ class Request:
     query: tuple[tuple[str, str], ...] | None  # None: malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
-    own_path: bool = True  # whether clients see this `path`, too
+    own_path: bool = True  # whether `path` is also the path that clients see
     binary: bool = True  # the gateway decodes responses in base64; a REST API does so only if it is told to
 
     @classmethod

@@ -140,7 +140,11 @@ PATIENT = {
 
 
 def reaches(action: str, kind: FaultKind) -> list[Reach]:
-    """Return the reaches that such a fault can have. botocore retries no body, and no error that it takes as final."""
+    """Return the reaches that such a fault can have.
+
+    `Reach.ATTEMPT` is left out where botocore does not try again: for a body that breaks off, and for an error that it
+    takes as final.
+    """
     single = kind is FaultKind.BROKEN or (kind is FaultKind.NOT_NOW and action != "route53:ChangeResourceRecordSets")
     spell = [Reach.SPELL] if (action, kind) in PATIENT else []
     return [*([] if single else [Reach.ATTEMPT]), Reach.CALL, *spell]
@@ -180,7 +184,7 @@ class AwsFaultInjector:
         self._config: Any = None
 
     def invocation(self, function: str) -> None:
-        """Begin an invocation of this function: a spell is over, and `waited` is 0 again."""
+        """Begin an invocation of this function. A fault of reach `SPELL` is over, and `waited` is 0 again."""
         self._function, self._spell, self.waited = function, "", 0.0
 
     def wait(self, seconds: float) -> None:

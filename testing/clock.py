@@ -12,7 +12,7 @@ EPOCH = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
 
 
 class Clock:
-    """Keeps the seconds since the beginning, and makes calls that are due; those of one second in the order of `after`."""
+    """Keeps the seconds since the beginning, and makes calls that are due; equally due calls in the order of `after`."""
 
     def __init__(self, began: datetime = EPOCH) -> None:
         self.seconds = 0.0

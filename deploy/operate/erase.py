@@ -190,7 +190,7 @@ def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) ->
 
 
 def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
-    """Warn that a running session's server will be stopped, on which other participants play, too."""
+    """Warn that the servers of sessions will be stopped on which other participants still play."""
     playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
     if playing:
         screen.warning(

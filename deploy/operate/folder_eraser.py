@@ -74,7 +74,7 @@ class FolderEraser:
             self._lobby.erase(note)
             self._release_slot()
             self._folder.delete(self._own(), note)
-            self._folder.remove_unfinished()  # also of a run that was killed
+            self._folder.remove_unfinished()  # files that a killed run was writing
             spool = DataFolder(self._state / self._folder.root.name / "spool")
             spool.delete(spool.versions(participant_folder(self._project, self._user)), note)
             done.rewritten, done.mentioned = self._sessions.rewritten, self._mentioned()

@@ -94,7 +94,7 @@ def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
 
 
 def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
-    """Ask for this month's bill. If there is none, return None, and add the reason to the look's problems."""
+    """Ask for this month's bill. If there is none, return None, and add the reason to `look.problems`."""
     today = datetime.now(UTC).date()
     bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
     if why:

@@ -149,7 +149,7 @@ class EcsTasks:
         return str(found[0]) if found else None
 
     def list(self) -> Iterator[RunningTask]:
-        """Yield the tasks in the installation's cluster and in participants' own, except those told to stop."""
+        """Yield the tasks of the installation's cluster and participants' own clusters, except those told to stop."""
         for cluster in itertools.chain([self._need("CLUSTER")], self.clusters()):
             yield from self._list(cluster)
 

@@ -51,7 +51,7 @@ class Issued:
 
     @property
     def document(self) -> bytes:
-        """`privkey.pem`: the ACME directory, the key and the chain. PEM readers skip text outside the blocks."""
+        """The content of `privkey.pem`: a line with the ACME directory (readers of PEM skip it), the key, the chain."""
         return f"{_ORIGIN}{self.stored.directory}\n{self.key}{self.chain}".encode()
 
 

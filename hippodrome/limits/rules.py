@@ -101,10 +101,11 @@ def counts(parts: Sequence[ParticipantSlots]) -> list[int]:
 
 
 def first_shard(label: str, limit: int) -> int:
-    """Return the shard in which a participant looks for a slot first. It has a share of the limit.
+    """Return the shard in which a participant looks for a slot first. Its share of the limit is at least one slot.
 
-    A participant may hold two slots: if `next_step` crashed between taking the slot and writing `participant.json`, and
-    the limit changed before they came back. Then too few others are admitted, never too many.
+    Another limit may mean another shard. So a participant holds two slots if `next_step` crashed between taking the
+    first slot and writing `participant.json`, and the limit changed before they came back. Then too few others are
+    admitted, never too many.
     """
     return hashlib.sha256(label.encode()).digest()[0] % min(SHARDS, limit)
 

@@ -28,7 +28,7 @@ class Release(NamedTuple):
 
 
 class Slots:
-    """The slots of all projects. Each running function has one, which remembers full studies for `FULL_FOR`."""
+    """The slots of all projects. Each running function has one `Slots`, which remembers full studies for `FULL_FOR`."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform

@@ -93,12 +93,12 @@ class Entries:
     outdated: tuple[str, ...] = ()  # the keys of old entries, which may be deleted
 
     def with_waiting(self, one: Waiting) -> Entries:
-        """Return the listing with this participant added, who waits now."""
+        """Return the listing with this participant, who waits now, added."""
         left = {label: each for label, each in self.left.items() if label != one.label}
         return replace(self, waiting={**self.waiting, one.label: one}, left=left)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
-        """Return the listing with this confirmation added, which has just been written."""
+        """Return the listing with this confirmation, which has just been written, added."""
         labels = self.confirmed.get(proposal_id, frozenset()) | {label}
         return replace(self, confirmed={**self.confirmed, proposal_id: labels})
 
@@ -151,7 +151,7 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
 
 
 def _earlier(one: Waiting, other: Waiting) -> Waiting:
-    """One entry of two of a participant who opened two pages at once: the earlier `joined`, and the later `seen`."""
+    """Join the two entries of a participant who opened two pages at once: the earlier `joined`, the later `seen`."""
     first = min(one, other, key=lambda each: each.joined)
     return replace(first, seen=max(one.seen, other.seen))
 

@@ -52,7 +52,7 @@ from protocol.answer import UNMATCHED
 SEEN_ANEW = timedelta(seconds=1)
 """A request writes its participant's entry again only if the entry is older than this."""
 DELETED_AT_ONCE = 5
-"""How many old entries one request deletes at most."""
+"""The most old entries that one request deletes."""
 ReadAnswers = Callable[[], Mapping[str, Any]]
 
 
@@ -90,7 +90,7 @@ class _Asker:
 
 
 class Lobby:
-    """The lobbies of all projects. Each running function has one."""
+    """The lobbies of all projects. Each running function has one `Lobby`."""
 
     def __init__(self, platform: Platform, repository: Repository) -> None:
         self._platform = platform

@@ -21,7 +21,7 @@ from hippodrome.storage.errors import RetryLater
 from protocol.keys import groups_folder, groups_key, questions_folder, waiting_key
 
 FORGOTTEN = timedelta(minutes=5)
-"""Older questions and answers are deleted. Nobody needs them: a question is asked again after seconds."""
+"""Older questions and answers are deleted. Nobody needs them: a question is asked again after some seconds."""
 
 
 class Matcher:

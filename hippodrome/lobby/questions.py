@@ -22,7 +22,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import Record, from_json, to_json
 
 WAITED_STEPS = 5
-"""The seconds to a multiple of which waiting times are rounded down. A question is asked again as often."""
+"""Waiting times in a question are rounded down to a multiple of so many seconds. After so many, it is asked again."""
 ANSWERED_WITHIN = timedelta(seconds=10)
 """A question without an answer is asked again after this time: servers look every two seconds, `match` has five."""
 MAX_WAITING = 200

@@ -96,7 +96,7 @@ def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now:
 
 
 def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
-    """Whether its time is over, a member has left, or a member who has not confirmed is not present any more."""
+    """Whether the proposal's time is over, a member has left, or one who has not confirmed is no longer present."""
     if now - proposal.at >= CONFIRMED_WITHIN:
         return True
     labels = entries.confirmed.get(proposal.id, frozenset())

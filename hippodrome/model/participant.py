@@ -22,7 +22,7 @@ from protocol.answer import Answer
 from protocol.keys import participant_folder
 
 REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
-MAX_COMPARED = 10  # such a form is compared with no more of the latest answers; each costs a read
+MAX_COMPARED = 10  # the most answers with which such a form is compared; each costs a read
 
 
 class Participant(Record, frozen=True):

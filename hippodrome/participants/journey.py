@@ -45,7 +45,7 @@ LINK = "…/next?projectId=your-project&userId=…"
 
 
 class Journey:
-    """Handles the requests of `next_step`. Each running function has one; it caches projects and pages."""
+    """Handles the requests of `next_step`. Each running function has one `Journey`, which caches projects and pages."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform
@@ -237,7 +237,7 @@ def _verify_invitation(request: Request, project: Project, user_id: str | None, 
 
 def _preview_response(request: Request, project: Project, kind: PreviewKind) -> Response:
     """The response to a preview: nothing of the study, and no id."""
-    if kind is PreviewKind.PREFETCH:  # unless it is 2xx, browsers ask again when the link is opened
+    if kind is PreviewKind.PREFETCH:  # browsers drop it, as it is not 2xx, and ask again when the link is opened
         return Response(403, "", {"Cache-Control": "no-store"})
     texts = Texts(project.texts)
     text = texts["preview" if kind is PreviewKind.HIT else "openInBrowser"]

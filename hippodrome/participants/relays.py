@@ -38,7 +38,7 @@ NO_PROOF = (
 
 
 class Relays:
-    """Implements `send_start_server_message` and `send_stop_server_message`. Each running function has one."""
+    """Implements `send_start_server_message` and `send_stop_server_message`. Each running function has one `Relays`."""
 
     def __init__(self, platform: Platform) -> None:
         self._platform = platform

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 LIMIT = 2_000_000  # characters of a rendered page
 VALUES_READ = frozenset({"participant", "answers"})  # the values that cost reads of the participant's documents
-_WIDE = re.compile(r"%(?:\([^)]*\))?[^a-z%]*([0-9]{4}|\*)")  # a place in a text for `%` with a width beyond 999
+_WIDE = re.compile(r"%(?:\([^)]*\))?[^a-z%]*([0-9]{4}|\*)")  # a placeholder of `%` formatting with a width beyond 999
 
 
 class FragmentError(Exception):

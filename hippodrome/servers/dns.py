@@ -80,7 +80,10 @@ class DnsRecords:
         return again + failed + [event for event, record in named if record.name in unregistered]
 
     def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
-        """Look up addresses again in `RETRY_PAUSE`, by messages; return the events without a further try."""
+        """Send messages to look the addresses up again after `RETRY_PAUSE`; return the events to deliver again instead.
+
+        These are the events without an interface, and those whose address was looked up `MAX_ADDRESS_CHECKS` times.
+        """
         soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
             seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)

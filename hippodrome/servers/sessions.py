@@ -51,11 +51,11 @@ class Sessions:
         return project is not None and project.has_sessions
 
     def stop_of(self, message: StopServer) -> StopServer | None:
-        """Return the stop message for a session's server that follows from a participant's own; None if none follows.
+        """Return the stop message for the session's server that follows from this message of one of its members.
 
-        None follows as long as other members play, or if the participant is no member yet. Deletes the participant's
-        entries in the lobby, so that nobody is matched with them. The participant counts as one who has reached the
-        stop step: the message is published before the answer that leads there is stored.
+        The result is None as long as other members play, or if the participant is no member yet. Deletes the
+        participant's entries in the lobby, so that nobody is matched with them. The participant counts as one who has
+        reached the stop step: the message is published before the answer that leads there is stored.
         """
         project = self._services.project_cache.project(message.project_id)
         if project is None:

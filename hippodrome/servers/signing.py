@@ -125,9 +125,10 @@ class SigningRequest(msgspec.Struct, frozen=True):
 class ServerAccess:
     """The facts about a server that decide which documents it may read and create. Pure.
 
-    `name` is the server's own, in ECS and in its credential. Until a warm server is assigned, only `name`, `project_id`
-    and `certificate` are set. `user_id` may be a session's id; then `members` are the ids of the session's members,
-    once it is formed.
+    `name` is the name under which ECS runs the server, and for which its credential is made. `label` and `attempt` are
+    its owner's; the name of an assigned warm server has others. Until a warm server is assigned, only `name`,
+    `project_id` and `certificate` are set. `user_id` may be a session's id; then `members` are the ids of the session's
+    members, once it is formed.
     """
 
     name: str
@@ -247,7 +248,7 @@ def credential_nonce(record: Server, attempt: int) -> str | None:
 
 
 class Signing:
-    """Answers the requests of servers. Each running function has one."""
+    """Answers the requests of servers. Each running function has one `Signing`."""
 
     def __init__(self, platform: SigningPlatform) -> None:
         self._platform = platform

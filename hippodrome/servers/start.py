@@ -137,7 +137,7 @@ class Start:
         logger.info("server starting", extra={"server": record.name})
 
     def _create_or_find(self, project: Project, message: StartServer) -> Versioned | None:
-        """Create or find the record of the attempt to start; None if there is nothing to start, or nothing more."""
+        """Create or find the record of the attempt to start; None if this attempt has started or may not start."""
         new = self._new_record(project, message.user_id, message.attempt)
         try:
             if message.attempt > 1:

@@ -130,7 +130,10 @@ class Sweep:
             return {}, []
 
     def _running_servers(self, tasks: Iterable[RunningTask]) -> RunningServers:
-        """Count the running servers. If a record is at a later attempt than its task, the age is a lower bound."""
+        """Count the running servers, and find the age of the oldest.
+
+        If a record is already at a later attempt than its task, the server is older than this says.
+        """
         now = self._platform.now()
         ages = [now - owner.server.requested for task in tasks if (owner := self._owners.get(task.name))]
         return RunningServers(len(ages), max(ages, default=timedelta()))

@@ -115,7 +115,7 @@ class ActivityLog:
     # What this process writes
 
     def set_steps(self, steps: Iterable[str]) -> None:
-        """Set the keys of the steps, in order. The participant who answers the last but one comes to the end."""
+        """Set the keys of the steps, in order. A participant who answers the last step but one comes to the end."""
         keys = list(steps)
         self._last_step = keys[-2] if len(keys) > 1 else ""
 
@@ -264,7 +264,7 @@ class ActivityLog:
                 watched.assign(folder)
 
     def _catch_up(self, folder: str) -> None:
-        """Show the new lines of this folder's server, so that they stand before the one that follows."""
+        """Show the new lines of this folder's server, before the caller shows its own line about the folder."""
         with self._looking:
             for watched in self._watched.values():
                 if watched.folder == folder:

@@ -37,7 +37,7 @@ DOMAIN = "localhost"
 _OURS = ("queue", "tasks", "timers")  # folders in which no other process has unfinished files
 _KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
-LOOK = 0.5  # seconds between looks whether the data still exist
+LOOK = 0.5  # seconds after which it looks again whether the data still exist
 START_RETRY_SECONDS = 5.0  # seconds for which `start` tries again what this machine refuses
 
 HANDLERS: Mapping[str, Handler] = {
@@ -186,7 +186,7 @@ class LocalPlatform:
         return frozenset(name for name in wanted if files.exists(folder / name))
 
     def _begin_again(self, kept: Mapping[str, Document | None], *, servers: bool) -> None:
-        """Publish the study again. `servers`: their records were deleted, so they are ended."""
+        """Publish the study again. `servers`: whether the servers' records were deleted; then the servers are ended."""
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
         for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid

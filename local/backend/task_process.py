@@ -267,7 +267,7 @@ class TaskProcess:
         if note.isdecimal():
             return int(note)
         if self._child and self._child.returncode is not None and self._child.returncode >= 0:
-            return self._child.returncode  # the shell exits with the server's code, and could not write its note
+            return self._child.returncode  # it is the server's code; the shell could not write its note
         return KILLED if self.task.pid else None  # the shell was killed with it
 
     def _clear(self) -> None:

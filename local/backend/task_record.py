@@ -98,7 +98,7 @@ class TaskFolder:
             self.file(name, kind).unlink(missing_ok=True)
 
     def file(self, name: str, kind: str = "json") -> Path:
-        """Return the path of a task's record ("json") or of a note."""
+        """Return the path of a task's record (`kind` "json") or of a note of its shell ("pid" or "exit")."""
         return self.path / f"{name}.{kind}"
 
 

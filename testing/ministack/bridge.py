@@ -82,7 +82,7 @@ def internet() -> None:
 
 
 def account() -> None:
-    """Give the account a new one's quotas and scan findings of images, and let Docker count as missing."""
+    """Give the account the quotas of a new account, and images without findings; let Docker count as missing."""
     import botocore.handlers
     from botocore.awsrequest import AWSResponse
 

@@ -442,7 +442,7 @@ class MinistackInstallation:
         return str(address["PublicIp"])
 
     def ended(self, task: Mapping[str, Any], stop_code: str = "UserInitiated", exit_code: int | None = 0) -> None:
-        """Send the event that the task has stopped. The event names an interface that does not exist any more."""
+        """Send the event that the task has stopped. It names a network interface that does not exist, as ECS's may."""
         self._tell(task, "STOPPED", "eni-gone", stop_code=stop_code, exit_code=exit_code)
 
     def _tell(self, task: Mapping[str, Any], status: str, interface: str, **more: Any) -> None:

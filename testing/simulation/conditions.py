@@ -75,5 +75,5 @@ def propagation(chance: random.Random, conditions: Conditions, seed: int, second
 
 @cache
 def _is_slow(seed: int, among: int, span: int) -> bool:
-    """Return whether Route 53 is slow in this span; one span among so many is."""
+    """Return whether Route 53 is slow in this span. Of each `among` spans in a row, one is slow."""
     return random.Random(f"{seed} slow zone {span // among}").randrange(among) == span % among

@@ -43,7 +43,7 @@ class SimulatedJourney:
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
 
     def people(self, world: SimulatedWorld) -> list[SimulatedParticipant]:
-        """Make all participants of the journey. They come at the same time, but read for different times."""
+        """Make all participants of the journey. They come at the same time, but take different times to read."""
         if self.group:
             return [
                 SimulatedMember(world, number, habits=habits, play=self.play)

@@ -145,7 +145,7 @@ class SimulatedFunction:
 
 
 def enter(owner: object) -> None:
-    """Give `lambdas.installed` the objects of this container; no objects if the owner is no container."""
+    """Let `lambdas.installed` use the objects of this container; if the owner is no container, it gets no objects."""
     if isinstance(owner, Container):
         installed._platform, installed._made = owner.platform, owner.made
     else:

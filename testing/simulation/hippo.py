@@ -29,7 +29,7 @@ from testing.tasks import Life
 
 TRIES, PAUSE = 3, 20.0  # tries of RunTask, and looks for the address; seconds between them
 ATTEMPTS = 5  # attempts of botocore's legacy mode
-AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function again that has raised an exception
+AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function that has raised an exception again
 ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
 RULES = 300  # rules of an event bus: EventBridge quotas
 ASSUMED = (
@@ -60,7 +60,7 @@ class Hippo:
         self._rules: set[int] = set()
 
     def start(self, number: int) -> None:
-        """Do what one participant's `start_server` does, with Lambda's further invocations of it. To be spawned."""
+        """Do what HIPPO's `start_server` does for one participant; repeat it as Lambda does. Spawn it, since it waits."""
         made = HippoStart(self.clock.seconds)
         self.starts.append(made)
         for pause in (*AGAIN, None):
@@ -132,7 +132,7 @@ class Hippo:
 
 
 class TooMany(Exception):
-    """A quota of a number was exceeded, not one of a rate."""
+    """A quota on how many things there may be was exceeded. `Throttled` is about quotas on calls per second."""
 
 
 # The calls of one participant

@@ -21,7 +21,7 @@ TAKES = (0.05, 1.0)  # seconds from the call of `match` until its answer is stor
 
 
 class SimMatching:
-    """All servers that have no members yet. They look once for all of them, since only the first answer counts."""
+    """Answers `match` for all servers without members at once, since only the first answer to a question counts."""
 
     def __init__(self, platform: SimPlatform, project_id: str) -> None:
         self._platform, self._project_id = platform, project_id

@@ -40,7 +40,7 @@ class SimulatedMember(SimulatedParticipant):
     def __init__(self, world: SimulatedWorld, number: int, *, habits: Habits | None = None, **person: Any) -> None:
         super().__init__(world, number, **person)
         self.habits = habits or Habits()
-        self.asked_at: list[datetime] = []  # when they sent each request, but for beacons
+        self.asked_at: list[datetime] = []  # when they sent each request that is no beacon
         self.lobby: float | None = None  # the second at which they came to the lobby
         self.matched: float | None = None  # the second at which their page first left the state `lobby`
         self.first_picture: float | None = None  # the second at which they saw it

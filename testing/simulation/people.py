@@ -14,7 +14,7 @@ from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import SimulatedWorld
 
-READ, PLAY = 20.0, 60.0  # seconds: for a page, on average (half of it to one and a half times); in the game
+READ, PLAY = 20.0, 60.0  # mean seconds for a page (each takes 0.5 to 1.5 times as many); seconds of the game
 MAX_TRIES = 4  # requests of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
@@ -53,7 +53,7 @@ class SimulatedVisit:
 
 
 class SimulatedParticipant:
-    """One participant with a browser, who goes through the study. `walk` is to be spawned."""
+    """One participant with a browser, who goes through the study. Spawn `walk`, since it waits (`GreenletClock.spawn`)."""
 
     def __init__(
         self, world: SimulatedWorld, number: int, *, read: float = READ, play: float = PLAY, leaves_at: str = ""
@@ -67,7 +67,7 @@ class SimulatedParticipant:
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
     def walk(self) -> None:
-        """Go from the link to the last page, or give up. To be spawned, once."""
+        """Go from the link to the last page, or give up. Spawn it, and only once."""
         try:
             self._walk()
         finally:
@@ -180,7 +180,10 @@ class SimulatedParticipant:
                 state = fresh or state
 
     def _is_over(self) -> bool:
-        """Return whether the game is over, if the server has ended. Who plays alone learns it from the server."""
+        """Return whether the game is over, after the server has failed or ended.
+
+        It is not over for a participant who plays alone: `_play_on` would have returned `done`.
+        """
         return False
 
     def _play_on(self, state: dict[str, Any]) -> str:

@@ -53,7 +53,7 @@ class SimTrial:
         return _parsed(found[0]) if found else None
 
     def connect(self, user: str, token: str) -> bool:
-        """Let a member in who has the member's token; return whether the participant was let in."""
+        """Let the participant in if they show the token of a member; return whether they were let in."""
         session = self.session
         if session is None or session.member(user) is None:
             return False
@@ -126,7 +126,7 @@ class SimTrial:
 
 
 def is_lost(task: TimedTask) -> bool:
-    """Return whether the players have lost their server. After Spot's warning it goes on until its container ends."""
+    """Return whether the players have lost their server. After Spot's warning a server goes on until its container ends."""
     warned = task.stop_code == "SpotInterruption"
     return task.last is not Life.RUNNING or (task.desired is Life.STOPPED and not warned)
 

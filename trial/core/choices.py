@@ -118,7 +118,10 @@ class Choices:
             controls.release(name)
 
     def _choose(self, player: str, name: str, held: bool | None, on: bool) -> None:
-        """Turn by turn: take a button that a human presses, or a key that goes down or up. Raises CommandRefused."""
+        """Turn by turn: take a human's choice. Raises CommandRefused.
+
+        `held` is None for a button that is pressed, True for a key that goes down, and False for a key that goes up.
+        """
         assert self.turns is not None
         controls = self.controls[player]
         if not controls.knows(name):

@@ -70,7 +70,7 @@ class Controls:
         return name in self._index or name in DIRECTIONS or name in self._key_names
 
     def keep(self, name: str) -> None:
-        """Choose an action that acts until another one is chosen. NOOP and unknown names only end the one before."""
+        """Choose an action that acts until another is chosen. NOOP and unknown names only end the earlier action."""
         self._press = self._index.get(name) if name != NOOP else None
         self._press_left = math.inf if self._press is not None else 0
 

@@ -36,7 +36,10 @@ class SendMessage:
 
 @dataclass(frozen=True, slots=True)
 class SendState:
-    """Send the trial's state; it replaces a state that still waits to be sent. `frame_rate`: the game's from now on."""
+    """Send the trial's state; it replaces a state that still waits to be sent.
+
+    `frame_rate` is the game's frame rate from now on.
+    """
 
     connection: Hashable
     text: str
@@ -99,7 +102,7 @@ class ResetCall(Call):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class ReplayCall(Call):
-    """Take all steps of an episode again that an earlier server has recorded. The call returns a `Replayed`."""
+    """Take again all steps that an earlier server has recorded of an episode. The call returns a `Replayed`."""
 
     unfinished: UnfinishedEpisode
     default_actions: Mapping[str, int]

@@ -76,7 +76,7 @@ class Ending:
             progress.ended.append(Break(progress.episode, "shutdown"))
 
     def write_last(self, progress: TrialProgress, participants: Participants, *, broken: bool) -> None:
-        """Write the last lines, and ask the shell to store the answer; none if the game is `broken` or not over."""
+        """Write the last lines, and ask the shell to store the answer. A `broken` or unfinished game has no answer."""
         self.all_written = True
         if self.closing and not progress.over and not progress.on_break:
             self._emit(records.shutdown(progress, self._message_log.messages))

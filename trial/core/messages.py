@@ -141,7 +141,7 @@ def is_feedback(command: str | None) -> bool:
 
 
 def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
-    """Read a later message. `words` are the project's own words (`words_of`). Raises NotAMessage or BadMessage."""
+    """Read a message after the hello. `words` are the project's (`words_of`). Raises NotAMessage or BadMessage."""
     return message_of(object_of(data), words)
 
 
@@ -284,9 +284,10 @@ def state(
 ) -> str:
     """Build the message with the state of the trial. Times are seconds; a time of None is left out.
 
-    `starts_in`: the time until the game follows the episode's first picture. `time_left`: the time of play that is left
-    in the episode. `next_in`: the time until the break ends. `to_act`: turn by turn, whether it is the client's turn;
-    `turn_ends_in`: the time until that turn ends. `session`: in a session, the fields about its members.
+    `starts_in`: the time for which the episode's first picture is still shown before the game goes on. `time_left`: the
+    time of play that is left in the episode. `next_in`: the time until the break ends. `to_act`: turn by turn, whether
+    it is the client's turn; `turn_ends_in`: the time until that turn ends. `session`: in a session, the fields about
+    its members.
     """
     scores = _scores(score, episode_score, next_in)
     turn, times = _turn(to_act, turn_ends_in), seconds(startsIn=starts_in, timeLeft=time_left)

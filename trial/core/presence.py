@@ -45,7 +45,7 @@ class _Countdown:
             self.until = now + seconds
 
     def stop(self, now: float, least: float = 0.0) -> None:
-        """Stop, and keep the seconds that are left. A countdown that has run uses up at least `least` seconds."""
+        """Stop it, if it runs, and keep the seconds that are left: at least `least` fewer than `left` was before."""
         if self.until is not None:
             self.left, self.until = max(0.0, min(self.until - now, self.left - least)), None
 
@@ -154,7 +154,7 @@ class Presence:
         return "returned" if returned else "joined"
 
     def go(self, player: str, now: float) -> bool:
-        """Mark a member as gone, whose connection is closed. Return False if they were away already."""
+        """Mark a member whose connection is closed as gone. Return False if they were away already."""
         self._give_time_back(now)
         member = self._members[player]
         member.connected = False
@@ -162,12 +162,12 @@ class Presence:
         return not member.stalled and not member.hidden
 
     def stalls(self, player: str, now: float) -> bool:
-        """Mark a member as away whose page has stopped answering. Return False if they were away already."""
+        """Mark a member whose page has stopped answering as away. Return False if they were away already."""
         member = self._members[player]
         return self._mark_away(member, now, stalled=True, hidden=member.hidden)
 
     def hides(self, player: str, now: float) -> bool:
-        """Mark a member as away who looks at another tab or application. Return False if they were away already."""
+        """Mark a member who looks at another tab or application as away. Return False if they were away already."""
         member = self._members[player]
         return self._mark_away(member, now, stalled=member.stalled, hidden=True)
 

@@ -153,14 +153,14 @@ class TrialSession:
             self._record(player, "left")
 
     def stalls(self, player: str, now: float) -> bool:
-        """Count a member as gone whose page has stopped answering. Return False if they were gone already."""
+        """Count a member whose page has stopped answering as gone. Return False if they were gone already."""
         was_here = self.presence.stalls(player, now)
         if was_here:
             self._record_away(player)
         return was_here
 
     def answers_again(self, player: str, now: float) -> None:
-        """Count a member as here again whose page answers, if it had stopped answering."""
+        """Count a member whose page answers as here again, if it had stopped answering."""
         if self.presence.answers_again(player):
             self.come(player, now)
 
@@ -193,7 +193,7 @@ class TrialSession:
         self._record(player, "left")
 
     def start(self, player: str, now: float) -> None:
-        """Let a member go on, from a page or after a pause, who has sent `start`."""
+        """Let a member who has sent `start` go on, from a page or after a pause."""
         self.presence.goes_on(player, now)
 
     def stop(self, player: str) -> None:
@@ -260,7 +260,7 @@ class TrialSession:
 
     @property
     def settled(self) -> bool:
-        """Whether the game is on and no member's presence has changed since that was decided, as at most steps."""
+        """Whether the game is on, and no member's presence has changed since that was decided: true at most steps."""
         return self._settled == self.presence.version and self._progress.playing
 
     def _begin(self) -> None:

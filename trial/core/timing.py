@@ -31,7 +31,7 @@ class StateTimes(NamedTuple):
     """The time until the break ends; infinite if the participant ends it."""
     turn_ends_in: float | None = None
     starts_in: float | None = None
-    """The time until the game follows the first picture."""
+    """The time for which the first picture is still shown before the game goes on."""
     time_left: float | None = None
     """The time of play that is left in the episode."""
     session: Mapping[str, Any] | None = None
@@ -122,7 +122,7 @@ class Timing:
         return self._step_due(progress, now) if progress.turns is None else self._turn_over(progress, now)
 
     def _rest(self) -> None:
-        """Let the next step be due at once when steps are taken again."""
+        """Forget when the next step is due, since none is taken now. When the game goes on, a step is due at once."""
         self._pacer.rest()
         self._due = self._last_step = None
 

@@ -10,7 +10,7 @@ from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame
 _RETRY_AFTER = 16  # frames; then a coding that was too large is tried again
 _MEASURE_AFTER = 8  # JPEG sizes sent as lossless frames; then a JPEG is encoded again, to know its size
 _GROWN = 1.25  # if a JPEG is this many times as large as the one before, the lossless codings are tried again
-_SAVINGS = 4  # raw pictures; a key frame is sent once differences would have saved as many bytes
+_SAVINGS = 4  # once differences would have saved the bytes of so many raw pictures, a key frame is sent
 
 
 class Encoder:
@@ -46,11 +46,11 @@ class Encoder:
         self._unmeasured = 0  # bytes of lossless frames since that JPEG
         self._jpegs_left = 0  # JPEGs to send until the lossless codings are tried again
         self._keys_first = 0  # frames for which a key frame is tried before a difference
-        self._saved = 0  # bytes that differences would have saved since they became small
+        self._saved = 0  # bytes that differences would have saved over JPEGs, since differences became small
 
     @property
     def exact(self) -> bool:
-        """Whether the client has the picture that was sent last without loss."""
+        """Whether the client has the last picture without loss, from one exact frame or from all of its rows."""
         return self._exact is self._shown
 
     def encode(self, frame: Frame, frame_id: int) -> bytes:

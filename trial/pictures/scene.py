@@ -176,7 +176,10 @@ class _SceneBuilder:
             self._given[name] = dict(given)
 
     def _has_room(self, text: Any) -> bool:
-        """Whether the scene has room for this text. Texts without room are not checked, which would delay the game."""
+        """Count this text if the scene has room for it; return whether it has.
+
+        The caller leaves out a text without room, and does not check it: to check very many would delay the game.
+        """
         letters = 0 if text is None else len(text if isinstance(text, str) else str(text))
         if letters > MAX_TEXT:
             return True  # `checked_object` refuses it

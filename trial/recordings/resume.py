@@ -97,7 +97,8 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
 
 
 def _step(line: Mapping[str, Any], words: tuple[Word, ...]) -> RecordedStep:
-    # The action that the agent was asked to take. The line has it, unless the agent reported another one (`agent`).
+    # What the agent was asked to take if no key acted: the line's action, unless the agent reported its own (`by` is
+    # `agent`). Then it is a program's advice, which the line has, or the idle action.
     advice = line.get("advice") if line.get("by") in (None, "agent") else line["action"]
     parts = line.get("players") or {}
     players = {

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from trial.server.watchdog import Watchdog
 from trial.settings import TrialSettings
 
-_LOOK_AGAIN_SECONDS = 5.0  # until an idle server that still stores something is looked at again
+_LOOK_AGAIN_SECONDS = 5.0  # the pause before the next look at an idle server that still stores something
 
 
 class Lifetime:

@@ -182,7 +182,7 @@ class TrialLoop:
         self._apply(self.core.receive(connection, message, self._loop.time()))
 
     def acknowledges_again(self, connection: Connection, frame_id: int) -> None:
-        """Note that a client acknowledges frames again, after it had stopped: it has acknowledged this one."""
+        """Note that a client that had stopped acknowledging frames has acknowledged this one."""
         self._do(self.core.receive, connection, Message(ack=frame_id))
 
     # ---- programs

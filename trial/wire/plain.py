@@ -26,7 +26,7 @@ _NEVER_RECORDED = ("userId", "token")
 
 
 def parse(data: str | bytes, words: Collection[str] = ()) -> Message:
-    """Read a message after the first. Raises NotAMessage, and BadMessage for a wrong value of a known field.
+    """Read a message after the hello. Raises NotAMessage, and BadMessage for a wrong value of a known field.
 
     `words` are the feedback words of the project's own controls. Empty fields count as left out. Unknown commands and
     fields become `Message.fields`, which are recorded.

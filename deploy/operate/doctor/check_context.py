@@ -50,7 +50,7 @@ class CheckContext:
 
     @cached_property
     def warm(self) -> int:
-        """The number of warm servers that these projects keep. When one is assigned, another is started."""
+        """The number of warm servers that these projects keep. They run beside the servers that participants use."""
         return sum(p.warm_servers for p in self.projects)
 
     @cached_property

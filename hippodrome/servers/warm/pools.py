@@ -31,7 +31,7 @@ ATTEMPT = 1  # the only attempt of a warm server
 
 
 class Pools:
-    """The pools of all projects. Each running function has one."""
+    """The pools of all projects. Each running function has one `Pools`."""
 
     def __init__(self, platform: Platform, project_cache: ProjectCache) -> None:
         self._platform = platform

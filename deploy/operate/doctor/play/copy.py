@@ -118,9 +118,9 @@ def page_files(documents: Documents, of: Project) -> dict[str, str]:
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:
-    """Return the ids of copies that killed rehearsals have left.
+    """Return the ids of the copies that rehearsals have left behind because they were killed.
 
-    Copies of rehearsals that may still run are left out.
+    Copies that are younger than `OLD` are left out: their rehearsals may still run.
     """
     ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
     return [one for one in ids if _age(documents, one, now) > OLD]

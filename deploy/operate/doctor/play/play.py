@@ -127,7 +127,7 @@ class Play:
         self.transcript.good("study", f"A copy of a registered study, with {pages} pages of its own, was registered.")
 
     def _remove_old_copies(self) -> None:
-        """Remove the copies that killed rehearsals have left."""
+        """Remove the copies that earlier rehearsals left behind because they were killed."""
         context = self._context
         for project_id in left_behind(context.platform.documents, datetime.now(UTC)):
             self._progress("removing what an earlier rehearsal has left")
