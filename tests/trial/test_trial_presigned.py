@@ -224,11 +224,13 @@ async def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(t
     assert town.store(record).create(key, b"the recording") is False
 
 
-async def test_another_recording_with_the_same_name_is_stored_under_a_number(town, tmp_path):
+@pytest.mark.parametrize("statuses", [[], [503, 403]])
+async def test_another_recording_with_the_same_name_is_stored_under_a_number(town, tmp_path, statuses):
     record, path = town.start(), tmp_path / "recording"
     folder = f"{FOLDER}/trials/{record.name}"
     town.documents.put(f"{folder}/3-trial.jsonl.gz", b"that of an earlier process")
     path.write_bytes(b"the recording")
+    town.failing = list(statuses)  # S3 refuses the first requests
     await store_file(town.store(record), f"{folder}/3-trial.jsonl.gz", path)
     assert town.body(f"{folder}/3-trial.jsonl.gz") == b"that of an earlier process"
     assert town.body(f"{folder}/3-trial-2.jsonl.gz") == b"the recording"

@@ -26,6 +26,8 @@ _TRANSIENT = (400, 403, 408, 409, 429)
 """Statuses after which a request is tried again, as after 500 and above. S3 answers 403 if a presigned request has
 expired, and 400 if the credentials of its signer have (`ExpiredToken`) or if no data came on a connection for a while
 (`RequestTimeout`): S3 API Reference, "Error responses"."""
+_UNCERTAIN = (500, 502, 504)
+"""Statuses of a PUT that may have created the document."""
 
 Reply = tuple[int, bytes]
 """The status and the body of an HTTP answer."""
@@ -54,7 +56,7 @@ class PresignedStore:
         self._credential = credential
         self._pause = pause
         self._gets: dict[str, Mapping[str, Any]] = {}  # presigned GETs that may still be valid, by key
-        self._unconfirmed: set[str] = set()  # keys of documents whose last PUT has failed
+        self._unconfirmed: set[str] = set()  # keys of documents that a PUT without a result may have created
 
     def get(self, key: str) -> bytes | None:
         """Return the document; None if there is none. Retries transient errors for some seconds. Raises StoreError."""
@@ -86,18 +88,21 @@ class PresignedStore:
 
         Errors are not retried here, since the callers do so (`spool.retry_forever`). S3 may create a document although
         its answer is lost, and then refuses the next request for the same key. This call returns True then: a task on
-        Fargate runs one process, so no other process creates this server's recordings.
+        Fargate runs one process, so no other process creates this server's recordings. A request that is refused (403,
+        503) has created nothing: a document that exists all the same is another one.
         """
         size = data.stat().st_size if isinstance(data, Path) else len(data)
         request = self._signed({"method": "PUT", "key": key, "size": size})
-        sent_before = key in self._unconfirmed
         try:
             status = _put(request, data)
-            if status not in (200, 412):
-                raise _UnexpectedStatus(status)
         except StoreError:
             self._unconfirmed.add(key)
             raise
+        if status in _UNCERTAIN:
+            self._unconfirmed.add(key)
+        if status not in (200, 412):
+            raise _UnexpectedStatus(status)
+        sent_before = key in self._unconfirmed
         self._unconfirmed.discard(key)
         return status == 200 or sent_before
 
