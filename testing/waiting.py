@@ -8,9 +8,10 @@ from collections.abc import Callable
 from typing import TypeVar
 
 T = TypeVar("T")
+PATIENCE = 60.0  # seconds: a machine may have much else to do
 
 
-def until(look: Callable[[], T], seconds: float = 20) -> T:
+def until(look: Callable[[], T], seconds: float = PATIENCE) -> T:
     """Return the first true result of `look`. Raises AssertionError with the last result after so many seconds."""
     end = time.monotonic() + seconds
     while not (found := look()):
@@ -19,7 +20,7 @@ def until(look: Callable[[], T], seconds: float = 20) -> T:
     return found
 
 
-async def until_async(look: Callable[[], T], seconds: float = 20) -> T:
+async def until_async(look: Callable[[], T], seconds: float = PATIENCE) -> T:
     """Do as `until` does, while the event loop goes on."""
     end = time.monotonic() + seconds
     while not (found := look()):

@@ -131,7 +131,7 @@ def test_each_forked_process_has_its_own_variables_and_memory(begin: Any) -> Non
 
 def test_all_output_of_a_forked_process_is_read_and_its_end_awaited(begin: Any) -> None:
     process = begin("3", stderr=subprocess.STDOUT)
-    assert process.communicate(timeout=20)[0] == "out\nerr\n"
+    assert process.communicate(timeout=60)[0] == "out\nerr\n"
     assert process.returncode == 3
     silent = begin(stderr=subprocess.STDOUT)
     with pytest.raises(subprocess.TimeoutExpired):
@@ -147,7 +147,7 @@ with open("second.py", "w") as file:
 before = sorted(os.environ)
 second = preloaded.start("second", cwd=os.getcwd(), env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 assert isinstance(second, preloaded.Forked)
-said, _ = second.communicate(timeout=20)
+said, _ = second.communicate(timeout=60)
 print(json.dumps([said, f"{os.getppid()} {before}\\n", second.returncode]))
 """
 
@@ -158,13 +158,13 @@ def test_a_forked_process_starts_others_by_the_same_forking_process(tmp_path: Pa
     env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT)}
     options: Any = {"cwd": tmp_path, "env": env, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     process = preloaded.start("starts", starts=True, **options)
-    said, _ = process.communicate(timeout=20)
+    said, _ = process.communicate(timeout=60)
     assert process.returncode == 0, said
     second, own, code = json.loads(said)
     assert (second, code) == (own, 5)
     assert preloaded._ASKS not in own
     again = preloaded.start("starts", starts=True, **options)
-    assert json.loads(again.communicate(timeout=20)[0])[1] == own, "who asked has gone, and the next one asks too"
+    assert json.loads(again.communicate(timeout=60)[0])[1] == own, "who asked has gone, and the next one asks too"
 
 
 PART = "import os; WORD, PID, WIDTH = {word!r}, os.getpid(), os.environ['COLUMNS']"
@@ -183,7 +183,7 @@ def test_of_a_copy_of_the_project_the_present_code_is_loaded(tmp_path: Path, mon
             "whole", ["x"], cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, copied=True
         )
         assert isinstance(process, preloaded.Forked)
-        said = process.communicate(timeout=20)[0].split()
+        said = process.communicate(timeout=60)[0].split()
         assert (said[:2], said[3:]) == ([word or "first", width], ["False", "['x']"])
         loaded_by.append(said[2])
     assert loaded_by[0] == loaded_by[1], "it is loaded once"

@@ -359,7 +359,7 @@ def test_a_participant_whose_documents_were_deleted_gets_another_server(local: M
     for record in (here.data / "_servers").iterdir():
         record.unlink()
     walker.answer(word="one")
-    state = walker.until("ready", 15)
+    state = walker.until("ready")
     assert state["token"] != before["token"]
     assert len(here.servers()) == 1
     walker.play(state)

@@ -94,7 +94,7 @@ def test_hippos_front_end_plays_a_whole_study_by_names_below_localhost(local: Ma
             await play(page)
 
     asyncio.run(game())
-    until(lambda: "bye" in end.ask()["page"], 15)
+    until(lambda: "bye" in end.ask()["page"])
     assert "end" in end.ask("POST", {"word": "thanks"})["page"]
     answers = one.data / f"quick/users/{end.user_id}/answers"
     assert sorted(file.name for file in answers.iterdir()) == ["1.json", "2.json", "3.json"]

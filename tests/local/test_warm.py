@@ -13,7 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 
 from local.rehearsal.study_process import servers_of
-from testing.waiting import until
+from testing.waiting import PATIENCE, until
 from tests.local.conftest import Local
 from tests.local.walk import Walker, at_the_game
 
@@ -27,7 +27,7 @@ def ready(here: Local, number: int) -> None:
 
 def wait_for(here: Local, number: int) -> None:
     """Wait until so many servers have a process."""
-    until(lambda: len(here.servers()) == number, 15)
+    until(lambda: len(here.servers()) == number)
 
 
 def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_place(local: Make) -> None:
@@ -35,7 +35,7 @@ def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_plac
     ready(here, 1)
     (waiting,) = here.servers()
     walker = at_the_game(here.url)
-    state = walker.until("ready", seconds=20)
+    state = walker.until("ready")
     assert waiting in here.servers()
     assert [process.environ()["SERVER"] for process in servers_of(here.data, {"P1"})].count(waiting) >= 1
     assert walker.play(state)["score"] == 30
@@ -60,7 +60,7 @@ def test_a_warm_server_admits_only_its_participant(local: Make) -> None:
     here = local(warm=1).run()
     ready(here, 1)
     walker = at_the_game(here.url)
-    state = walker.until("ready", seconds=20)
+    state = walker.until("ready")
     other = Walker(here.url, "quick", "P2")
     with other.connect(state) as game, pytest.raises(ConnectionClosedError) as closed:
         deque(game, maxlen=0)
@@ -76,12 +76,12 @@ def test_warm_servers_are_replaced_whether_lost_while_waiting_or_in_play(local: 
         os.kill(process.pid, signal.SIGKILL)
     ready(here, 2)
     walker = at_the_game(here.url)
-    state = walker.until("ready", seconds=20)
+    state = walker.until("ready")
     ready(here, 3)
     with walker.connect(state) as game:
         game.send(json.dumps({"command": "start"}))
         for _ in range(60):
-            game.recv(timeout=20)
+            game.recv(timeout=PATIENCE)
         for process in servers_of(here.data, {"P1"}):
             os.kill(process.pid, signal.SIGKILL)
         here.let_go_on()
@@ -100,7 +100,7 @@ def test_a_changed_agent_replaces_the_warm_servers(local: Make) -> None:
     wait_for(here, 1)
     assert here.servers() != [before]
     walker = at_the_game(here.url)
-    assert walker.play(walker.until("ready", seconds=20))["score"] == 40
+    assert walker.play(walker.until("ready"))["score"] == 40
 
 
 def test_no_warm_server_is_left_when_the_run_ends_or_the_study_is_closed(local: Make) -> None:

@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import ClientConnection, connect
 
 from testing.visitors import hidden
+from testing.waiting import PATIENCE
 
 
 class Walker:
@@ -39,7 +40,7 @@ class Walker:
         sent = self.http.post(self.link, data={**hidden(self.page()), **answers}, headers={"accept": "text/html"})
         assert sent.status_code == 303, sent.text
 
-    def until(self, wanted: str, seconds: float = 40, *, attempt: int | None = None) -> dict[str, Any]:
+    def until(self, wanted: str, seconds: float = PATIENCE, *, attempt: int | None = None) -> dict[str, Any]:
         """Wait until the game's server (of this attempt, if given) is in that state."""
         until = time.monotonic() + seconds
         while (state := self.state()).get("state") != wanted or attempt not in (None, state.get("attempt")):

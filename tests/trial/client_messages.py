@@ -10,6 +10,8 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
+from testing.waiting import PATIENCE
+
 
 class TakesMessages:
     """A client that receives its messages one by one, in `take`."""
@@ -20,7 +22,7 @@ class TakesMessages:
         """Receive one message, and keep what it says."""
         raise NotImplementedError
 
-    async def until(self, true: Any, seconds: float = 15) -> None:
+    async def until(self, true: Any, seconds: float = PATIENCE) -> None:
         """Take messages until `true()` is true; TimeoutError after `seconds`."""
         async with asyncio.timeout(seconds):
             while not true():
@@ -44,7 +46,7 @@ class TakesMessages:
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await task
 
-    async def closed(self, seconds: float = 15) -> int | None:
+    async def closed(self, seconds: float = PATIENCE) -> int | None:
         """Take messages until the connection is closed; return the code."""
         with contextlib.suppress(ConnectionClosed):
             await self.until(lambda: False, seconds)

@@ -242,7 +242,7 @@ async def test_a_killed_process_of_the_same_server_leaves_a_recording_that_the_n
         first.process.kill()
     again = launch_session(launch)
     folder = first.store / f"study/sessions/{SID}/trials/pair-1"
-    until(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")), 15)
+    until(lambda: list(folder.glob("*.gz")) and not list(folder.glob("*.part")))
     (lines,) = recordings(again.store).values()
     assert steps(lines)
 

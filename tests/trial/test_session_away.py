@@ -28,13 +28,13 @@ async def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledg
         await until_both_play(anna, bert)
         await anna.until(lambda: len(anna.frames) > 5)
         anna.acks = False
-        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "away"), 20)
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "away"), 60)
         assert bert.state["state"] == "paused"
         held = len(bert.frames)
         await anna.until(lambda: people_seen_by(anna).get("left") == "away")
         await anna.say(ack=anna.frames[-1][1])
         anna.acks = True
-        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "here"), 20)
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "here"), 60)
         await bert.until(lambda: bert.state["state"] == "playing" and len(bert.frames) > held + 5)
 
 
@@ -44,7 +44,7 @@ async def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back
     async with member(server, "bert") as bert:
         async with member(server, "anna") as anna:
             await until_both_play(anna, bert)
-        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "policy"), 20)
+        await asyncio.wait_for(bert.until(lambda: people_seen_by(bert).get("left") == "policy"), 60)
         await bert.until(lambda: bert.state["state"] == "playing")
         seen = len(bert.frames)
         await bert.until(lambda: len(bert.frames) > seen + 5)

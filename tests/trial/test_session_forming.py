@@ -60,7 +60,7 @@ async def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_fo
 
 def test_the_server_looks_for_the_session_by_itself(launch):
     server = launch_formed(launch, SPARE_SECONDS="0.1")
-    until(lambda: "the members of the session are known now: 2 of 2" in server.log_text(), 15)
+    until(lambda: "the members of the session are known now: 2 of 2" in server.log_text())
 
 
 def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
@@ -129,7 +129,7 @@ async def test_the_policies_of_all_groups_are_loaded_before_the_group_is_known(l
     players = {"left": "human", "right": "human"}
     groups = {"0": {**players, "third": "random"}, "1": {**players, "third": "agent:Third"}}
     server = launch_session(launch, agent=two_players() + THIRD, trial={"players": groups})
-    until(lambda: "the agent is ready" in server.log_text(), 15)
+    until(lambda: "the agent is ready" in server.log_text())
     assert "the third player's policy is made" in server.log_text()
     form(server.store, document(group=1))
     await both_play(server)
@@ -206,7 +206,7 @@ async def test_the_idle_time_begins_when_the_session_is_formed_not_at_the_handov
     time.sleep(0.5)
     put(server.store, handover_key("study", "warm-1"), Handover(SID, None, "pair-1").to_json())
     await make_the_server_look(server)
-    until(lambda: "assigned to a session now" in server.log_text(), 15)
+    until(lambda: "assigned to a session now" in server.log_text())
     time.sleep(1.5)
     assert server.process.poll() is None
     form(server.store)

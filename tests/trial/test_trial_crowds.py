@@ -156,7 +156,7 @@ async def test_a_connection_that_says_nothing_before_tls_is_cut_off(launch, open
     async with open_client(f"wss://localhost:{server.port}/", ssl=trusted) as client:
         await client.play()
     for connection in crowd:
-        connection.settimeout(15)
+        connection.settimeout(60)
         with contextlib.suppress(ConnectionError):
             while connection.recv(4096):
                 pass

@@ -382,7 +382,7 @@ def test_a_change_of_agent_py_within_a_second_is_loaded(launch, grid, tmp_path):
         file.write_text(f"import sys\nsys.stderr.write('the {word} agent\\n')\n" + grid())
         os.utime(file, (1_000_000_000, 1_000_000_000))
         server = launch(None, PYTHONDONTWRITEBYTECODE="")
-        until(lambda server=server: "agent\n" in server.log_text(), 15)
+        until(lambda server=server: "agent\n" in server.log_text())
         assert f"the {word} agent" in server.log_text()
         server.process.kill()
         server.process.wait()

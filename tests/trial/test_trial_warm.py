@@ -17,7 +17,7 @@ from protocol import handover
 from protocol.exits import NO_AGENT
 from protocol.handover import BadHandover, Handover
 from protocol.keys import handover_key
-from testing.waiting import until_async
+from testing.waiting import PATIENCE, until_async
 from trial.server import assignment
 from trial.server.watchdog import Watchdog
 from trial.settings import SettingsError, TrialSettings
@@ -220,7 +220,7 @@ class SlowStore:
 
     def get(self, key):
         self.looks += 1
-        return self.answers.get(timeout=10)
+        return self.answers.get(timeout=PATIENCE)
 
 
 async def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_look_finds_nothing():
@@ -232,7 +232,7 @@ async def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_l
 
     search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
     searching = asyncio.create_task(search.run(hand_over))
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(PATIENCE):
         await until_async(lambda: store.looks)
         first = asyncio.create_task(search.look())
         await asyncio.sleep(0.01)

@@ -16,7 +16,7 @@ from trial.programs.watch import MAX_PROGRAMS, Watchers
 from trial.recordings import resume
 
 PROOF = "?token=the-secret-token"
-ANSWER_SECONDS = 15
+ANSWER_SECONDS = 60
 
 
 @contextlib.asynccontextmanager

@@ -257,7 +257,7 @@ def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
     command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
     if moment != "before":  # no process could write it in that case
-        until((here.state / "tasks" / f"{NAME}.pid").exists, 10)
+        until((here.state / "tasks" / f"{NAME}.pid").exists)
 
 
 def test_after_a_kill_before_the_server_started_the_task_can_be_requested_again(here: Here) -> None:
@@ -287,7 +287,7 @@ def test_after_a_kill_the_started_server_is_found(here: Here, moment: str) -> No
 @pytest.mark.parametrize("moment", ["after", "end"])
 def test_servers_that_ended_between_two_processes_are_reported_with_their_exit_code(here: Here, moment: str) -> None:
     _begin_and_be_killed(here, moment, seconds=0.2)
-    until(lambda: not here.processes(), 10)
+    until(lambda: not here.processes())
     here.tasks().start()
     assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
 

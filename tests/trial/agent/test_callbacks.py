@@ -250,7 +250,7 @@ def test_the_game_does_not_wait_for_a_slow_callback_and_skips_others(caplog):
         (1, None, 4),
     ]
     callbacks.stepped({}, {}, {}, {})
-    until(lambda: not callbacks.busy, 10)
+    until(lambda: not callbacks.busy)
     assert [(line["step"], line["value"]) for line in recorded_lines(callbacks)] == [(6, 6)]
     callbacks.close()
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from testing.waiting import PATIENCE
 from trial.agent.worker import Worker
 from trial.core.effects import AgentTimeout
 
@@ -32,7 +33,7 @@ def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
         worker.submit(lambda: "quick", 30.0, hear("quick"))
         worker.submit(free.wait, 30.0, hear("slow"))
         worker.submit(lambda: "after it", 0.05, hear("late"))
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE):
             await given_up.wait()
             free.set()
             while worker.busy:
@@ -83,7 +84,7 @@ def test_a_failure_while_one_result_is_taken_loses_no_other() -> None:
         free.set()
         worker.close()
         worker._thread.join()  # all three results are there before the loop hears of the first
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE):
             while worker.busy:
                 await asyncio.sleep(0.001)
         return heard, wrong

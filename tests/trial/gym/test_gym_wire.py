@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from testing.waiting import PATIENCE
 from tests.trial.gym.served import serving
 
 pytestmark = pytest.mark.xdist_group("gym-server")
@@ -37,7 +38,7 @@ class Wire:
     """A client that sends bytes, and reads frames."""
 
     def __init__(self, port: int, query: str = "?form=gymnasium") -> None:
-        self.socket = socket.create_connection(("127.0.0.1", port), timeout=10)
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [f"GET /gym{query} HTTP/1.1", "Host: localhost", "Upgrade: websocket", "Connection: Upgrade"]
         lines += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", "", ""]
@@ -240,7 +241,7 @@ WRONG_HANDSHAKES = {
 def test_a_wrong_handshake_is_answered_and_ends_nothing_else(port: int, name: str) -> None:
     target, more = WRONG_HANDSHAKES[name]
     with contextlib.closing(Wire(port)) as other:
-        with socket.create_connection(("127.0.0.1", port), timeout=10) as raw:
+        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as raw:
             key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
             upgrade = "Host: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             raw.sendall(f"GET {target} HTTP/1.1\r\n{upgrade}{key}{more}\r\n".encode())

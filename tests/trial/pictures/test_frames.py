@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from testing.exploration import examples
+from testing.waiting import PATIENCE
 from trial.pictures import frames
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
@@ -336,11 +337,11 @@ def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[in
                 monkeypatch.undo()
             connection.put_picture(frame, number)
             connection.send_now()
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(PATIENCE):
                 while len(websocket.sent) <= number:
                     await asyncio.sleep(0.001)
         if websocket.sent[-1][0] == JPEG:
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(PATIENCE):
                 decoder = Decoder()
                 while not any(np.array_equal(decoder.decode(data)[1], sequence[-1]) for data in websocket.sent):
                     await asyncio.sleep(0.01)

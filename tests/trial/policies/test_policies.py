@@ -19,7 +19,7 @@ from onnx import TensorProto, helper
 
 from protocol.players import ONNXRUNTIME
 from testing import onnx_files
-from testing.waiting import until_async
+from testing.waiting import PATIENCE, until_async
 from trial.core.seeds import policy_seed
 from trial.policies.load import load
 from trial.policies.policy import PolicyError
@@ -440,7 +440,7 @@ async def policy_thread() -> AsyncIterator[tuple[PolicyByObservation, PolicyThre
     policy, answers = PolicyByObservation(), list[Any]()
     thread = PolicyThread(policy, lambda *answer: answers.append(answer), name="policy player_1")
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE):
             yield policy, thread, answers
     finally:
         thread.close()

@@ -17,6 +17,7 @@ from websockets.frames import Frame as RawFrame
 from websockets.frames import Opcode
 from websockets.typing import Subprotocol
 
+from testing.waiting import PATIENCE
 from trial.pictures.frames import Decoder, Frame
 from trial.wire.connection import SUBPROTOCOLS, Connection
 from trial.wire.inbound import MESSAGES_A_SECOND, Inbound
@@ -55,7 +56,7 @@ async def linked() -> AsyncIterator[tuple[Connection, Any]]:
             f"ws://127.0.0.1:{server.sockets[0].getsockname()[1]}", subprotocols=names[:1], compression=None
         ) as client,
     ):
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE):
             yield await made.get(), client
 
 
