@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 FRESH = timedelta(seconds=10)  # the age at which the cached master list is read again
 PAGE_FRESH = timedelta(minutes=5)  # the age at which a cached page is read again; at once after a registration
 MAX_DOCUMENTS = 200  # if the cache has so many, it is emptied
+MAX_BYTES = 100_000_000  # of all documents: the function has 1 GB, and a study may have many large pictures
 
 
 class _Cached(NamedTuple):
@@ -94,7 +95,8 @@ class ProjectCache:
         if found is None:
             self._cached.pop(key, None)  # a missing document is not cached
             return None
-        if len(self._cached) >= MAX_DOCUMENTS:
+        size = sum(len(each.document.body) for each in list(self._cached.values()))  # other threads change the cache
+        if len(self._cached) >= MAX_DOCUMENTS or size + len(found.body) > MAX_BYTES:
             self._cached.clear()
         self._cached[key] = _Cached(found, now, version)
         return found

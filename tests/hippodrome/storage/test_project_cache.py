@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+
 from hippodrome.model.project import MASTER_LIST, MasterList, write_list
+from hippodrome.storage import project_cache
 from hippodrome.storage.project_cache import ProjectCache
 from testing.fake_platform import FakePlatform
 from testing.studies import study
@@ -29,3 +32,19 @@ def test_a_request_uses_the_list_that_it_has_read_even_if_another_request_keeps_
     platform = FakePlatform()
     platform.documents.put(MASTER_LIST, write_list(MasterList([study(id="new")])))
     assert Raced(platform).project("new") is not None
+
+
+def test_the_cached_documents_take_no_more_than_the_memory_that_they_may_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A study with many large pictures must not fill a function's memory."""
+    monkeypatch.setattr(project_cache, "MAX_BYTES", 100)
+    platform = FakePlatform()
+    for name in ("a", "b", "c"):
+        platform.documents.put(f"maze/steps/{name}.png", bytes(40))
+    get, asked = platform.documents.get, list[str]()
+    monkeypatch.setattr(platform.documents, "get", lambda key, *known: asked.append(key[-5:]) or get(key, *known))
+    cache = ProjectCache(platform)
+    for name in ("a", "b", "a", "b", "c", "c", "a"):
+        found = cache.document(f"maze/steps/{name}.png")
+        assert found is not None
+        assert found.body == bytes(40)
+    assert asked == ["a.png", "b.png", "c.png", "a.png"]
