@@ -51,7 +51,13 @@ def players(value: object) -> dict[str, Any]:
         raise ValueError(f'must be a map: indented lines such as "player_0: human" below it, not {show(value)}')
     if not by_group(value):
         return _players(value, "")
-    return {str(int(group)): _players(item, f"group {group}: ") for group, item in value.items()}
+    found: dict[str, Any] = {}
+    for group, item in value.items():
+        number = str(int(group))
+        if number in found:
+            raise ValueError(f"must name each group once, but names group {number} also as {group}")
+        found[number] = _players(item, f"group {group}: ")
+    return found
 
 
 def _players(value: dict[Any, Any], where: str) -> dict[str, str]:

@@ -42,6 +42,11 @@ def test_a_missing_policy_file_is_named_with_the_existing_ones(folder: Path) -> 
     assert read(folder, text).trial.players == {"0": {"left": "human", "right": "sample:policies/small/partner.onnx"}}
 
 
+def test_a_group_that_is_named_twice_is_refused(folder: Path) -> None:
+    text = small(trial="players: {0: {left: human}, '00': {left: random, right: human}}\n")
+    assert only_mistake(folder, text) == "trial.players: must name each group once, but names group 0 also as 00"
+
+
 def test_a_study_without_a_game_needs_no_pages_of_one(folder: Path) -> None:
     text = "project: {id: paper, steps: {1: consent, 2: survey}}\ntrial: {instructions: nowhere}"
     assert read(folder, text).game_pages == ()
