@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from jinja2 import ChainableUndefined, Environment
+from markupsafe import Markup
 
 from hippodrome.participants.fragments import prepare
 from hippodrome.participants.sandbox import FragmentError, records_mentioned
@@ -409,12 +411,59 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("2 ** 65", True),
         ("65 ** 2", False),
         ("100 ** 0.5", False),
+        ("[['x' * 20]] * 1000000", True),
+        ("'x' + 'y'", False),
+        ("('x' * 1000000) + ('y' * 1000001)", True),
+        ("('x' * 1000000).encode() + ('y' * 1000001).encode()", True),
         ("'%999d' % 1", False),
-        ("'%1000d' % 1", True),
+        ("'%1000000000d' % 1", True),
+        ("'%.1000000000f' % 1", True),
         ("'%*d' % (9, 1)", True),
+        ("'%.*f' % (9, 1)", True),
         ("'%(x)999d' % {'x': 1}", False),
-        ("'%(x)1000d' % {'x': 1}", True),
+        ("'%(x)1000000000d' % {'x': 1}", True),
+        ("'%(a(b)c)-1000000000d' % {'a(b)c': 1}", True),
+        ("'%%(a(b)c) in 2026: %d' % 7", False),
+        ("('%s' * 1000) % (('y' * 1000000,) * 1000)", True),
+        ("'%1000000000s'|format('x')", True),
+        ("'%(n)s'|format(n=3)", False),
+        ("'%05d'|format(7)", False),
         ("1000 % 7", False),
+        ("'x'|center(80)", False),
+        ("'x'|center(10 ** 9)", True),
+        ("'x'|center(width=10 ** 9)", True),
+        ("['x']|map('center', 10 ** 9)|list", True),
+        ("(['x'] * 2000)|map('center', 1000000)|join", True),
+        ("'x'.center(80)", False),
+        ("'x'.center(10 ** 9)", True),
+        ("'x'['ljust'](10 ** 9)", True),
+        ("('x'|safe).rjust(10 ** 9)", True),
+        ("'1'.zfill(10 ** 9)", True),
+        ("'1'.encode().ljust(10 ** 9)", True),
+        ("(1).to_bytes(10 ** 9, 'big')", True),
+        ("('\t' * 1000000).expandtabs(1000)", True),
+        ("'{:>9.2f} {x}'.format(1.5, x='y')", False),
+        ("'{:1000000000}'.format(1)", True),
+        ("('{:1000000000}'|safe).format(1)", True),
+        ("'{x:1000000000}'.format_map({'x': 1})", True),
+        ("'{:{}}'.format(1, 10 ** 9)", True),
+        ("('{0}' * 1000).format('y' * 1000000)", True),
+        ("'a b'|replace(' ', '<br>')", False),
+        ("('x' * 1000000)|replace('x', 'y' * 1000000)", True),
+        ("('x' * 1000000).replace('x', 'y' * 1000000)", True),
+        ("('x' * 1000).translate({120: 'y' * 1000000})", True),
+        ("['a', 'b']|join(', ')", False),
+        ("''.join(['y' * 1000000] * 20)", True),
+        ("['y' * 1000000, 'y' * 1000000]|join", False),
+        ("('x' * 1000000)|join('y' * 1000000)", True),
+        ("{'a': [1]}|tojson(indent=2)", False),
+        ("[1]|tojson(indent=10 ** 9)", True),
+        ("'a'|indent(10 ** 9)", True),
+        ("[1]|batch(10 ** 9, 'x')|list", True),
+        ("1|round(10 ** 9, 'ceil')", True),
+        ("''|default(10 ** 9)", False),
+        ("lipsum(2)", False),
+        ("lipsum(10 ** 6)", True),
     ],
 )
 def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: bool) -> None:
@@ -424,6 +473,27 @@ def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: 
             page.render({})
     else:
         assert page.render({}) == "done"
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "{% set ns.text = ns.text ~ ns.text %}",
+        "{% set ns.text = ns.text + ns.text %}",
+        "{% set text %}{{ ns.text }}{{ ns.text }}{% endset %}{% set ns.text = text %}",
+    ],
+)
+def test_a_text_is_not_doubled_into_a_huge_one(step: str) -> None:
+    page = prepare(f"{{% set ns = namespace(text='x') %}}{{% for a in range(40) %}}{step}{{% endfor %}}")
+    with pytest.raises(FragmentError, match="SecurityError"):
+        page.render({})
+
+
+@given(st.lists(st.sampled_from(["<", Markup("<b>"), 1, None, [1, "<"], ""]), min_size=2))
+def test_texts_are_put_together_as_jinja_does_it(values: list[Any]) -> None:
+    jinja = Environment(autoescape=True, undefined=ChainableUndefined)
+    source = "{{ unknown ~ " + " ~ ".join(f"values[{at}]" for at in range(len(values))) + " }}"
+    assert prepare(source).render({"values": values}) == jinja.from_string(source).render({"values": values})
 
 
 def test_a_page_may_have_two_million_characters() -> None:
