@@ -25,7 +25,7 @@ class ServerServices:
         self.slots = Slots(platform)
         self.pools = Pools(platform, self.project_cache)
         self.handovers = Handovers(platform, self.repository, self.slots, self.pools)
-        self.written: dict[tuple[str, int], Versioned] = {}  # records in state `naming`, by label and attempt
+        self.written: dict[tuple[str, int], Versioned] = {}  # records as last written in `naming`, by label and attempt
         self._failures: list[Cause] = []
 
     def note_failure(self, cause: Cause) -> None:
