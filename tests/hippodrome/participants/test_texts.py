@@ -30,6 +30,7 @@ NO_WORDS = {
     "Digit",
     "Key",
     "Space",
+    "Meta",
     "Unreachable",
     "Arial",
     "Accept",
