@@ -299,7 +299,7 @@ def batched_steps() -> Iterator[Row]:
         batch = arrays.batch_of(actions, [at * at % 3 % 2 for at in range(MANY)])
         request = frame(arrays.step_request(arrays.STEP_MANY, made["handle"], MANY, actions, batch))
         found, step = [], []
-        for turn in range(3 * ROUNDS):  # many short ones, of which some may find the machine quiet
+        for turn in range(3 * ROUNDS):  # many short measurements, since some of them may find the machine quiet
             found.append(drive(pid, [(connection, lambda _: request)], REQUESTS // 20))
             if turn % 3 == 0:
                 step.append(alone())

@@ -37,7 +37,7 @@ from trial.recordings import recording
 
 RATE = 30  # frames a second
 SETTLE = 2.0  # seconds of play before the measurement
-SECONDS = 8.0  # of play that are measured
+SECONDS = 8.0  # the seconds of play that are measured
 MAX_CPU = 1.2  # the goal for a frame of the example: ms of processor time
 TRIALS = 32  # trials that one core has to serve
 MAX_MEMORY = 45.0  # the goal for the memory of each trial: MB

@@ -39,7 +39,7 @@ class MotoServer:
         self.env = {
             **inherited,
             "AWS_ACCESS_KEY_ID": "testing",
-            "AWS_SECRET_ACCESS_KEY": "testing",  # moto accepts any
+            "AWS_SECRET_ACCESS_KEY": "testing",  # moto accepts any key
             "AWS_REGION": "us-east-1",
             "AWS_DEFAULT_REGION": "us-east-1",
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",

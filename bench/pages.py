@@ -26,7 +26,7 @@ from testing.aws_events import FORM
 from testing.visitors import body_of, hidden, sent
 
 PEOPLE = 200  # participants at once
-SECONDS = 120  # after which the measurement fails
+SECONDS = 120  # after so many seconds the measurement fails
 GAME_PAGE = 40 * 1024  # bytes, compressed
 GAME_PAGE_BOUND = "ours: the size of the game page over the network"
 

@@ -34,7 +34,7 @@ from testing.simulation.world import PROJECT, SimulatedWorld
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
 SMALLER, SMALLER_WITHIN = 340, 20.0  # as many per second: for worse conditions, and for crowds that come several times
 SEEDS = range(2026, 2029)  # one for each crowd: in a single crowd, a slow span of Route 53 decides the p95
-HOURS = 2.0  # after which a crowd must have finished, and its servers must be gone
+HOURS = 2.0  # hours after which a crowd must have finished, and its servers must be gone
 PAIRS: Project = msgspec.structs.replace(PROJECT, players=2, patience=300.0)
 FOURS: Project = msgspec.structs.replace(PAIRS, players=4)
 POINTS = 30  # about so many faults of each journey are tried; `make hunt` tries all
@@ -54,7 +54,7 @@ class Together:
 
     world: SimulatedWorld
     came: Sequence[SimulatedMember]
-    seconds: float  # of real time that the simulation took
+    seconds: float  # the seconds of real time that the simulation took
 
     @property
     def project(self) -> Project:

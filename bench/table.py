@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 RESULTS = Path(__file__).with_name("results.json")
-INFORMATION, COMPARED, BOUND = "information", "compared", "bound"  # kinds of rows
+INFORMATION, COMPARED, BOUND = "information", "compared", "bound"  # the kinds of rows
 Row = dict[str, Any]
 Measure = Callable[[], Iterator[Row]]
 

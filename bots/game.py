@@ -83,12 +83,12 @@ class GameConnection:
         self._images: set[str] = set()  # hashes of the images that the bot has asked for
         self._keys: RandomKeys | None = None  # None until the server has sent the controls
         self._state = ""
-        self._turns = False  # the game is played turn by turn
-        self._to_act = True  # it is this player's turn
-        self._first = True  # no frame has come yet
+        self._turns = False  # whether the game is played turn by turn
+        self._to_act = True  # whether it is this player's turn
+        self._first = True  # whether no frame has come yet
         self._last_frame: float | None = None  # time.monotonic() of the last frame while playing
         self._may_stop = False
-        self._break_seconds = 0.0  # that the server has announced, in which nothing is played
+        self._break_seconds = 0.0  # of breaks, as the server has announced them: nothing is played then
 
     async def run(self, hello: dict[str, Any]) -> None:
         """Play until the server closes.

@@ -16,8 +16,8 @@ class PlayedStep:
     members: int = 1  # participants who play together, with this bot
     unmatched: bool = False  # the lobby found no other participants, so the bot did not play
     outcome: str = ""  # `outcome` of the server's last message in a game of several participants, or "unmatched"
-    frames: int = 0  # received, without the first frame of each connection
-    frame_rate: int = 0  # as the server says
+    frames: int = 0  # frames received, without the first of each connection
+    frame_rate: int = 0  # the frame rate that the server announced
     seconds: float = 0.0  # of playing: the times between two frames, added up
     timed_frames: int = 0  # received in `seconds`
     bytes: int = 0  # of frames, scenes and images

@@ -13,7 +13,7 @@ from typing import Any
 
 from bots.report import BotReport, PlayedStep
 
-MAX_BYTES = 512 * 1024**2  # of an unpacked recording: the study's agent writes it, and bots play only for seconds
+MAX_BYTES = 512 * 1024**2  # unpacked; a recording of a few seconds is only larger if the study's agent errs
 ANYWHERE = ("presence", "ping")  # kinds of lines of a session that may stand anywhere, also after an episode's end
 PIECE = 1024**2  # bytes unpacked at once
 
@@ -23,11 +23,11 @@ class StoredRecording:
     """One recording in the data folder."""
 
     name: str
-    complete: bool = False  # it begins with a header and has its end
-    step: str = ""  # of the study
-    steps: int = 0  # of the environment
-    pictures: int = 0  # that a browser could show: one for each step and each reset
-    counted: bool = False  # `Verification` has counted it, for this bot or another of the session
+    complete: bool = False  # whether it begins with a header and has its end
+    step: str = ""  # the step of the study
+    steps: int = 0  # the environment's steps
+    pictures: int = 0  # the pictures that a browser could show: one for each step and each reset
+    counted: bool = False  # whether `Verification` has counted it, for this bot or another of the session
 
 
 def read_recording(path: Path) -> StoredRecording:
@@ -77,15 +77,15 @@ def _lines(path: Path, unpack: Any) -> Iterator[bytes]:
 class Verification:
     """What was found in the data of what bots sent and played, and what is missing."""
 
-    answers: int = 0  # to pages, stored exactly as the bots sent them
+    answers: int = 0  # answers to pages that are stored exactly as the bots sent them
     answers_sent: int = 0
     games: int = 0  # answers of games found
     games_played: int = 0
     recordings: int = 0
-    steps: int = 0  # of environments, in the recordings
+    steps: int = 0  # the environments' steps, in the recordings
     codes: int = 0  # final pages that show the stored completion code
     starts: list[float] = field(default_factory=list)  # seconds from request to ready
-    sessions: dict[str, int] = field(default_factory=dict)  # how many of the bots played in each, by its id
+    sessions: dict[str, int] = field(default_factory=dict)  # by session id: how many of the bots played in it
     missing: list[str] = field(default_factory=list)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_MINUTES_FROM = 90  # seconds; shorter durations are in seconds
+_MINUTES_FROM = 90  # seconds; shorter durations are shown in seconds
 
 
 def count(number: int, noun: str) -> str:

@@ -60,7 +60,7 @@ class ChangedPage(NamedTuple):
     """A step with answers from another page than its present one: steps were changed while participants took part."""
 
     step: str
-    page: str  # the present one
+    page: str  # the present page
     others: Mapping[str, int]  # the number of answers from each other page
 
 
@@ -291,7 +291,7 @@ def _kind(value: Any) -> str:
     if isinstance(value, bool):
         return "truth"
     if isinstance(value, int):
-        return "whole" if -(2**53) <= value <= 2**53 else "other"  # the column may be one of floats
+        return "whole" if -(2**53) <= value <= 2**53 else "other"  # a column of floats keeps no larger ones
     if isinstance(value, float):
         return "number"
     return "texts" if isinstance(value, list) and all(isinstance(item, str) for item in value) else "other"

@@ -176,7 +176,7 @@ class Fetcher:
                     self._document(item, owner, file)
             except FileGone:
                 continue  # the next run lists its new version, if there is one
-            if isinstance(owner, ExportedParticipant):  # the files after these are read with their content
+            if isinstance(owner, ExportedParticipant):  # the participant's later files are read with what these say
                 if item.kind is KeyKind.PARTICIPANT:
                     owner = owner._replace(document=file.document or {})
                 elif item.kind is KeyKind.MEMBERSHIP:

@@ -23,7 +23,7 @@ class FieldKind(StrEnum):
 
     NUMBER = "number"
     LIST = "list"
-    TEXT = "text"  # and all other kinds
+    TEXT = "text"  # text, and the kinds that are not listed
 
 
 def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str], FieldKind]:

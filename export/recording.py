@@ -30,7 +30,7 @@ class Converted:
 
     frames: int = 0
     rows: int = 0
-    complete: bool = False  # its last line is the end of an episode
+    complete: bool = False  # whether its last line is the end of an episode
     callbacks: int = 0  # lines that callbacks have recorded
     episodes: list[dict[str, Any]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)  # sentences
@@ -90,7 +90,7 @@ def convert(
         writer.add_key_value_metadata({"hippodrome": json.dumps(metadata)})
     done.problems[:] = _summed(done.problems + rows.problems)
     if done.callbacks and done.episodes:
-        done.episodes[0]["callbacks"] = done.callbacks  # of the whole file
+        done.episodes[0]["callbacks"] = done.callbacks  # the number for the whole file
     for episode in done.episodes:
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
         episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}

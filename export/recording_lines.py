@@ -64,7 +64,7 @@ def _unpacked(source: Path, problems: list[str]) -> Iterator[bytes]:
                     return
                 yield piece
                 packed = unpack.unused_data if unpack.eof else unpack.unconsumed_tail
-        while begun and not unpack.eof:  # the rest, which did not fit into the last piece
+        while begun and not unpack.eof:  # the end may not have fitted into the last piece
             piece = unpack.decompress(b"", 4 * _PIECE)
             if not piece:
                 break

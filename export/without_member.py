@@ -89,7 +89,8 @@ class _Erased:
 
     def _is_theirs(self, line: Mapping[str, Any]) -> bool:
         kind = line.get("kind")
-        if kind == "presence":  # a line with a `seed` stays: to repeat the game, the policy in their place needs it
+        if kind == "presence":
+            # A line with a `seed` stays: whoever repeats the game needs it for the policy that replaced the member.
             return self._is(line.get("player")) and "seed" not in line
         if kind == "ping":
             trips = line.get("roundTrip")

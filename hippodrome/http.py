@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
-MAX_QUERY_FIELDS = 64  # a query with more is malformed
-MIN_GZIP_LENGTH = 1000  # characters
+MAX_QUERY_FIELDS = 64  # a query with more fields is malformed
+MIN_GZIP_LENGTH = 1000  # characters; shorter responses are not compressed
 
 # HIPPO's front end is served from another origin. No cookie protects anything here, so any origin is allowed.
 CORS = {
@@ -46,7 +46,7 @@ class Request:
 
     method: str
     path: str
-    query: tuple[tuple[str, str], ...] | None  # None: malformed
+    query: tuple[tuple[str, str], ...] | None  # None: the query is malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
     own_path: bool = True  # whether `path` is also the path that clients see

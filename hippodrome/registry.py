@@ -29,8 +29,8 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.secret import SecretCache
 
 TRIES = 20
-MAX_SIGNED = 5_000  # links in one call
-ALONE = (  # functions look up a participant's session only in a project with several players
+MAX_SIGNED = 5_000  # the most links that one call signs
+ALONE = (  # because functions look up a participant's session only in a project with several players
     "project.players: the study is registered with players: {players}, and participants who play together would be "
     "separated; give a study for one participant another project.id"
 )
@@ -59,7 +59,7 @@ def _enter(platform: Platform, project: Project) -> Project:
         raise NotRegistered(problems)
     _set_participant_limit(platform, project)
     keys = SecretCache(platform.documents)
-    keys.get_or_create()  # the installation's secret must exist before anything is written that needs it
+    keys.get_or_create()  # the secret must exist before anything that needs it is written
     for _ in range(TRIES):
         found, listed = _master_list(platform)
         before = listed.find(project.id)
@@ -77,7 +77,7 @@ def _enter(platform: Platform, project: Project) -> Project:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
             continue
-        _set_participant_limit(platform, project)  # counts participants who have come since the first call
+        _set_participant_limit(platform, project)  # again, to count the participants who have come since
         logger.info("registered", extra={"project": project.id, "live": project.live})
         if entry.warm_servers or (before and before.warm_servers):
             _warm_up(platform, entry)

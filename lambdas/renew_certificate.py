@@ -19,7 +19,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
 
     Raises if an order fails; an alarm reports failed invocations.
     """
-    platform = cast(AwsPlatform, installed.platform())  # this function runs nowhere else
+    platform = cast(AwsPlatform, installed.platform())  # this function runs on AWS only
     domain = platform.settings.servers_domain
     left = context.get_remaining_time_in_millis() / 1000 if context else MAX_ORDER_SECONDS + MARGIN
     renewal = Renewal(

@@ -27,7 +27,7 @@ from local.web import server
 from local.web.access import origin_of
 
 ROOT = ".hippodrome"
-STARTER_SECONDS = 1.0  # after which it looks again whether the starter still runs
+STARTER_SECONDS = 1.0  # seconds between two looks whether the starter still runs
 
 
 def main(

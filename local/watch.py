@@ -40,7 +40,7 @@ class Watch:
         self._publish_all = publish
         self._published = published
         self._say = say
-        self._held_back = False  # the last change was not published
+        self._held_back = False  # whether the last change was not published
         self._refused = ""  # the error of this machine that kept a change from being published
         self._wrong: set[Diagnostic] = set()  # the problems of pages and agent.py at the last check
         self._closed = threading.Event()

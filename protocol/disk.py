@@ -84,7 +84,7 @@ def move(file: Path, path: Path) -> None:
         sync_folder(path.parent)
     except FileExistsError:
         raise
-    except OSError:  # another file system, or one without links
+    except OSError:  # the file system differs, or has no links
         create(path, file)
     remove_if_possible(file)
 

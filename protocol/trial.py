@@ -169,7 +169,7 @@ class TrialSection:
         600,
         10,
         "With pace: turns, the seconds that a policy has for its choice; then the idle action is taken.",
-        least=0.01,  # 0 would be no limit for other keys, and here each action would be late
+        least=0.01,  # elsewhere 0 means no limit; here it would make each action late
     )
     substitute: str | None = keyed.key(
         player_checks.policy,
@@ -209,7 +209,7 @@ class TrialSection:
     )
     seed: int | None = keyed.whole(
         0,
-        2**31 - MAX_EPISODES - 1,  # the last episode's seed too is below 2**31
+        2**31 - MAX_EPISODES - 1,  # so that the last episode's seed, too, is below 2**31
         None,
         "Seed of the first episode; each later episode has the next number. Default: a random seed for each episode.",
     )

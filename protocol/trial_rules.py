@@ -65,7 +65,7 @@ def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[Sectio
     """`actionSpace` has no name twice."""
     first: dict[str, int] = {}
     for index, action in enumerate(trial.action_space):
-        name = action.lower()  # as the trial server has it
+        name = action.lower()  # as the trial server writes names
         if first.setdefault(name, index) != index:
             sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
             yield SectionProblem(("actionSpace", index), sentence, ("actionSpace",))

@@ -24,7 +24,7 @@ _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 _STEP_FILE = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_ .-]{0,98}[A-Za-z0-9_-])?")
 _SURROGATE = re.compile("[\ud800-\udfff]")
-_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # ECS allows 8192 characters for all variables of a server
+_OPTIONS_LENGTH, _OPTIONS_DEPTH = 4096, 8  # characters, levels; ECS allows 8192 characters for all variables
 
 
 @dataclass(frozen=True, slots=True)

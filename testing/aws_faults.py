@@ -38,13 +38,13 @@ from hippodrome.aws.retry import retry_while_busy
 class FaultKind(StrEnum):
     """The kind of a fault."""
 
-    THROTTLED = "throttled"  # in the service's own words
+    THROTTLED = "throttled"  # the service's own error for too many calls
     INTERNAL = "internal error"  # 500, and nothing was done
-    NOT_NOW = "not now"  # the error of `NOT_NOW` that is particular to the operation
+    NOT_NOW = "not now"  # the operation's own error, from the table `NOT_NOW`
     CONNECT = "connect timeout"  # nothing was done
     CLOSED = "connection closed"  # a kept connection was closed; nothing was done
     READ = "reply lost"  # read timeout: the call was carried out, but the caller cannot know
-    BROKEN = "body breaks off"  # the body of a document that is read
+    BROKEN = "body breaks off"  # only a part of the body of a document comes
 
 
 class Reach(StrEnum):
@@ -175,10 +175,10 @@ class AwsFaultInjector:
     def begin(self, fault: AwsFault | None) -> None:
         """Count from 1 again, with this fault."""
         self.fault = fault
-        self.calls: list[MadeCall] = []  # so far
+        self.calls: list[MadeCall] = []  # the calls so far
         self.struck = 0  # HTTP requests that the fault has changed
         self.waited = 0.0  # seconds of timeouts and pauses since `invocation`
-        self._action = ""  # of the call under way
+        self._action = ""  # the action of the call under way
         self._attempts = 0
         self._function = self._spell = ""
         self._config: Any = None

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from local.backend.authority import SIGNS_CERTIFICATES, general_name
 
-_AGO = timedelta(hours=1)  # all certificates have been valid for so long
+_AGO = timedelta(hours=1)  # so long before now all certificates begin to be valid
 
 
 class CertificateAndKey(NamedTuple):

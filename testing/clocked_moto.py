@@ -67,7 +67,7 @@ MODULES = {
     "task_changed": task_changed,
     "update_project_master_list": update_project_master_list,
 }
-QUEUES = {"start": ("start_server", 1), "stop": ("stop_server", 100), "task": ("task_changed", 100)}  # and batch size
+QUEUES = {"start": ("start_server", 1), "stop": ("stop_server", 100), "task": ("task_changed", 100)}  # batch sizes
 HOP = 0.2  # seconds from a topic to its queue
 AGAIN = 90.0  # seconds until a message that failed is visible again; `VisibilityTimeout` in the template
 RECEIVES = 8  # deliveries until a message is a dead letter; `maxReceiveCount`
@@ -124,7 +124,7 @@ class TimedInstallation:
         world = self._stack.enter_context(self.world)
         self.injector = AwsFaultInjector()
         self._stack.enter_context(self.injector.installed())
-        # Gap: moto stamps documents with the machine's time. Bridge: with the installation's.
+        # Gap: moto stamps documents with the machine's time. Bridge: stamp them with the installation's.
         naive = lambda: self.clock.now().replace(tzinfo=None)  # noqa: E731
         self._stack.enter_context(mock.patch.object(moto.s3.models, "utcnow", naive))
         self._clients: dict[str, Any] = {}

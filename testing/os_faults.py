@@ -92,7 +92,7 @@ ERRORS: dict[str, tuple[int, ...]] = {
     "spawn": (errno.EAGAIN, errno.ENOMEM),
     "thread": (errno.EAGAIN,),
     "connect": (errno.EMFILE, errno.ENOMEM),
-    "process": (errno.EMFILE,),  # of /proc, which psutil reads
+    "process": (errno.EMFILE,),  # psutil reads /proc
 }
 _KINDS = (
     (re.compile(r"s[a-z0-9]{20}-\d+"), "SERVER"),

@@ -26,9 +26,9 @@ class DiskChange(NamedTuple):
     """One change of a file or folder in the record of a `Disk`."""
 
     kind: str  # "name", "bytes", "sync"
-    thing: int  # the number of the file or folder that changes; of "name" the folder that holds the name
+    thing: int  # the number of what changes: for "name" the folder that holds the name, otherwise the file or folder
     name: str = ""
-    to: int | None = None  # of "name": the file or folder that has the name from now on; None if none has
+    to: int | None = None  # for "name": the number of what has the name from now on; None if nothing has
     body: bytes = b""
 
 

@@ -183,7 +183,7 @@ def popen(command: Sequence[str], **options: Any) -> Forked | subprocess.Popen[s
     tries_agent = [sys.executable, "-P", "-m", AGENT]
     if command[: len(tries_agent)] != tries_agent:
         return subprocess.Popen(command, **options)
-    assert options.pop("stdin") == subprocess.DEVNULL  # as all of them have
+    assert options.pop("stdin") == subprocess.DEVNULL  # every caller passes it
     return start(AGENT, command[len(tries_agent) :], safe_path=True, **options)
 
 

@@ -60,7 +60,7 @@ class StrictS3(FakePlatform):
     @contextmanager
     def serving(self) -> Iterator[StrictS3]:
         """Answer requests within the block."""
-        installed.use(self)  # `sign_requests` needs nothing that this platform lacks
+        installed.use(self)  # this platform has all that `sign_requests` needs
         thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         thread.start()
         try:

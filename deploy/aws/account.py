@@ -98,9 +98,9 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
         found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
         credentials = core.get_credentials()
-    except botocore.exceptions.MissingDependencyException:  # botocore's only one here: the package awscrt
+    except botocore.exceptions.MissingDependencyException:  # awscrt, the only package that botocore can miss here
         raise _of_aws_login(profile or os.environ.get("AWS_PROFILE") or "default") from None
-    except botocore.exceptions.ProfileNotFound as error:  # of --profile or of AWS_PROFILE
+    except botocore.exceptions.ProfileNotFound as error:  # --profile or AWS_PROFILE names a profile that does not exist
         known = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
         raise Problem(
             f"There is no AWS profile named {error.kwargs['profile']}.",
@@ -177,7 +177,7 @@ class Installation:
             "BUCKET": self["Bucket"],
             "HOSTED_ZONE_ID": self["HostedZoneId"],
             "ROOT_DOMAIN": self["RootDomain"],
-            "SERVERS_HOST": self.outputs.get("ServersHost", ""),  # older stacks have none
+            "SERVERS_HOST": self.outputs.get("ServersHost", ""),  # older stacks lack this output
             "MAX_RUNTIME": self["MaxRuntime"],
             "CLUSTER": self["Cluster"],
             "SUBNET": self["Subnets"],

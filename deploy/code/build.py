@@ -32,9 +32,9 @@ DATA = {  # module → folders that it reads at run time, as paths below the pro
 # runs the zips). Powertools' Logger imports its HTTP resolvers in one place, for pydantic models, which we do not log.
 PRUNED = {"aws-lambda-powertools": ("aws_lambda_powertools.event_handler",)}
 
-# IN_RUNTIME of deploy.code.packages, by the names of modules.
+# The modules of the distributions that `IN_RUNTIME` of deploy.code.packages names.
 _RUNTIME = {"boto3", "botocore", "dateutil", "jmespath", "s3transfer", "six", "urllib3"}
-_DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip can hold
+_DATE = (1980, 1, 1, 0, 0, 0)  # the earliest time that a zip can hold
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Function:
             for name, body in sorted(files.items()):
                 entry = zipfile.ZipInfo(name, _DATE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
-                entry.create_system = 3  # Unix, wherever it is built
+                entry.create_system = 3  # Unix, whatever system builds the zip
                 entry.external_attr = 0o100644 << 16
                 archive.writestr(entry, body)
         return packed.getvalue()

@@ -311,7 +311,7 @@ class WheelCache:
         try:
             parcel.replace(place)
         except OSError:
-            if not any(place.glob("*.whl")):  # else another process was faster
+            if not any(place.glob("*.whl")):  # otherwise another process has made it
                 raise
         self._wheels[pin.name] = Wheel(place / path.name)
 

@@ -20,7 +20,7 @@ _WRONG_KEYS = {
 DENIED = {
     "AccessDenied",
     "AccessDeniedException",
-    "AuthorizationError",  # of SNS
+    "AuthorizationError",  # SNS's code for a call that is not allowed
     "UnauthorizedOperation",
     "403",
 }

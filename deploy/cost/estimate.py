@@ -16,24 +16,24 @@ from console.formatting import count
 from deploy.cost.prices import HOURS, Prices, Range, Usd
 
 BENCH_STEPS = 5  # steps of the example study
-S3_READS = Range(4, 4, 13)  # GET of a participant: in a running study; high: alone, with stale caches
-S3_WRITES = 13  # PUT and LIST of a participant
-TRIAL_READS, TRIAL_WRITES = 2, 2  # of the trial server: its certificate; a recording and the answer
+S3_READS = Range(4, 4, 13)  # GETs of a participant; high: of one who comes alone, with stale caches
+S3_WRITES = 13  # PUTs and LISTs of a participant
+TRIAL_READS, TRIAL_WRITES = 2, 2  # of a trial server: it reads its certificate, and writes a recording and the answer
 SIGNED = Range(4, 6, 20)  # presigned requests of a server: certificate, answer, recordings; more after a loss
 PUBLISHES = 2
 LOBBY_POLLS = Range(5, 15)  # requests of a page in the lobby, every two seconds, for `patience` seconds at most
 POLLS = Range(2, 12, 60)  # requests of the waiting page, every two to four seconds
 WORKERS = Range(4, 7, 12)  # invocations of the functions behind queues, for a server: start, task changes, stop
-NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; the high value is for a cold start each time
+NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; high: with a cold start each time
 WORKER_SECONDS = Range(0.2, 0.5, 2.0)
 SWEEP_SECONDS = Range(0.3, 0.7, 2.0)
-NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # infra/template.yml
-PAGE_KB = 14  # with gzip, the largest page of the example: `python -m bench pages`
+NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # the functions' memory in infra/template.yml
+PAGE_KB = 14  # the largest page of the example, with gzip, by `python -m bench pages`
 PAGE_LOADS = Range(1.0, 1.5, 3.0)
-FRAME_KB = Range(0.4, 0.5, 77.0)  # `python -m bench trial`: Ms. Pac-Man; a JPEG of a scrolling texture, 600 x 400
+FRAME_KB = Range(0.4, 0.5, 77.0)  # `python -m bench trial`: Ms. Pac-Man; high: a JPEG of a scrolling texture, 600 x 400
 PLAYED = Range(0.4, 0.6, 1.0)  # the share of a server's time in which it sends frames
 RECORDED_KB = Range(0.02, 0.06, 0.2)  # of a step, with gzip, without pictures; each frame counts as a step
-PICTURE_KB = Range(1.0, 4.0, 30.0)  # with `recordObservations`
+PICTURE_KB = Range(1.0, 4.0, 30.0)  # of a step's picture, with `recordObservations`
 ANSWERS_KB = 5
 LOG_KB = Range(15, 40, 150)  # of functions, servers and the access log
 MONTHS_KEPT = Range(1, 12, 36)  # how long answers and recordings are kept
@@ -156,7 +156,7 @@ def _functions(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
 
 def _small_things(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
-    # Each poll of the waiting page reads once more, each presigned request twice.
+    # Each poll of the waiting page is one more read, each presigned request two more.
     reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + SIGNED * 2) * servers + POLLS * study.clients
     writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers)
     # A poll in the lobby reads the membership and the decisions, lists the entries (which costs as much as a write),

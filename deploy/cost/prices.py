@@ -58,7 +58,7 @@ class Price(NamedTuple):
     usd: float
     unit: str
     source: str
-    twice: bool = True  # confirmed in a second place
+    twice: bool = True  # whether a second place confirms the price
 
 
 class Prices(NamedTuple):

@@ -130,7 +130,7 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
         screen.success(f"{uploaded} of {len(prepared.functions)} functions uploaded.")
         _suggest_python(prepared.functions[0].python)
     _delete_old_change_sets(prepared)
-    cooldown.wait(account, stack)  # CloudFormation refuses names that are taken already when it makes the change set
+    cooldown.wait(account, stack)  # CloudFormation refuses a name in use as soon as it makes the change set
     with change_set(prepared, keep=True) as made:
         if not made.changes:
             return _unchanged(account, stack, began)

@@ -104,7 +104,7 @@ class Plan:
     changes: Sequence[Change] = ()
     parameters: Mapping[str, tuple[str, str]] = field(
         default_factory=dict
-    )  # that change: name → (present value, new value)
+    )  # the parameters that change: name → (present value, new value)
     seconds: float = 0.0
     findings: Sequence[Finding] = ()  # what would make it fail, or is worth a look
     site: str = ""  # the host name that participants will open, if it is new

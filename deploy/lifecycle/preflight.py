@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
 FEW = 20  # servers at once; if the quota allows fewer, the advice is to ask AWS for more
-USUAL = 1.0  # vCPU of a server, if there is no study that says
+USUAL = 1.0  # vCPU of a server, if no study says how many
 
 
 class AccountCheck(NamedTuple):
@@ -340,7 +340,7 @@ def make_ecs_role(account: Account) -> bool:
     try:
         account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
     except ClientError as error:
-        # InvalidInput: it exists. If these credentials may not make it, it may exist all the same.
+        # InvalidInput: the role exists. If these credentials may not make it, it may exist all the same.
         if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
             raise
         return False

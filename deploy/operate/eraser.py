@@ -242,7 +242,7 @@ class Eraser:
             StopServer(self.project, each.user_id, None, Reason.STOPPED) for each in found.records if not each.is_closed
         ]
         if stops:
-            with functions_log():  # the following steps do whatever fails here
+            with functions_log():  # the following steps do again what fails here
                 Termination(ServerServices(self._platform)).stop(stops)
 
     def _wait(self) -> None:
@@ -303,7 +303,7 @@ class Eraser:
         """Wait until all presigned requests of the server are invalid. It gets no new ones: its record is deleted."""
         from hippodrome.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
-        # A server gets presigned requests until so many seconds after its end.
+        # A server gets presigned requests until STORE_AFTER_CLOSE after its end. If that is over, the wait is shorter.
         signed = STORE_AFTER_CLOSE.total_seconds()
         if record.closed is not None:
             signed -= (self._platform.now() - record.closed).total_seconds()

@@ -80,7 +80,7 @@ class ProjectReceipt:
     def _nameless(self, key: str) -> str:
         """Remove the participant's id from the key, and the server's label, which is computed from the id."""
         rest = key.removeprefix(participant_folder(self.project, self.user))
-        if key.startswith(sessions_folder(self.project)):  # a session's id does not depend on its members
+        if key.startswith(sessions_folder(self.project)):  # a session's id is random, and names no member
             return "/".join("{userId}" if self.user in part else part for part in key.split("/"))
         if key.startswith(entries.FOLDER):
             return f"{entries.folder(self.project)}{{participant}}"

@@ -97,7 +97,7 @@ class Snapshot:
     projects: list[tuple[Project, ParticipantCounts]] = field(default_factory=list)
     servers: list[Server] = field(default_factory=list)  # open ones
     members: dict[str, int] = field(default_factory=dict)  # server's name → number of its session's members
-    recent: list[Server] = field(default_factory=list)  # records written in the last day, or server's life
+    recent: list[Server] = field(default_factory=list)  # records written in the last day, or in a server's longest life
     tasks: int | None = None  # the number of tasks that run on ECS
     spent: Spent = field(default_factory=Spent)
     queues: list[StackQueue] = field(default_factory=list)

@@ -95,7 +95,7 @@ def of_domain(account: Account, zone: str, domain: str) -> list[Validation]:
         for page in pages.paginate(HostedZoneId=zone, StartRecordName=f"{domain}."):
             for record in page["ResourceRecordSets"]:
                 if _plain(record["Name"]) != domain and not _plain(record["Name"]).endswith(f".{domain}"):
-                    return found  # a name's own subdomains come after it (API reference, ListResourceRecordSets)
+                    return found  # the listing has passed the domain: its subdomains follow it directly
                 values = [_plain(item["Value"]) for item in record.get("ResourceRecords", ())]
                 one = Validation(zone, _plain(record["Name"]), values[0] if len(values) == 1 else "")
                 if record["Type"] == "CNAME" and one.domain == domain and one.value.endswith(_ACM):

@@ -68,7 +68,7 @@ class Report:
     decision: Decision
     stored: StoredCertificate | None
     now: datetime
-    wanted: str = ""  # the ACME directory at which a new one was, or would be, ordered
+    wanted: str = ""  # the ACME directory at which a new certificate was, or would be, ordered
 
     @property
     def ordered(self) -> bool:

@@ -91,7 +91,7 @@ class StackDeletion:
             return found
 
         title = "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes"
-        # ACM's list and its refusals need not agree at once.
+        # ACM's list of uses and its refusals to delete need not agree at once.
         if left := self._until_none(users, title, IN_USE, disagreeing=DISAGREEING):
             raise Problem(
                 f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by {', '.join(left)}.",

@@ -135,7 +135,7 @@ def _list(account: Account, listing: Listing) -> Iterator[str]:
     outer, _, inner = listing.path.partition(".")
     for page in pages:
         for item in page.get(outer) or ():
-            if not (isinstance(item, dict) and str(item.get("State", "")).lower() == "deleted"):  # of VPC endpoints
+            if not (isinstance(item, dict) and str(item.get("State", "")).lower() == "deleted"):  # VPC endpoints
                 yield str(item[inner] if inner else item)
 
 

@@ -101,6 +101,6 @@ def _read(table: str) -> dict[str, Listing]:
 
 _ALL = _read(_TABLE)
 BY_KIND = {listing.kind: listing for listing in _ALL.values()}
-LISTINGS = {type_: one for type_, one in _ALL.items() if type_ != "AWS::ECS::TaskDefinition"}  # which `register` makes
+LISTINGS = {type_: one for type_, one in _ALL.items() if type_ != "AWS::ECS::TaskDefinition"}  # `register` makes those
 KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
 """The key types for ListCertificates, which lists only RSA_1024 and RSA_2048 without them (ACM API reference)."""

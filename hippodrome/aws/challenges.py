@@ -20,7 +20,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.certificates.rules import FailureReason, OrderFailed
 
-TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
+TTL = 60  # seconds. Never change it: DELETE must name a record's TTL, so earlier records could not be deleted.
 POLL_PAUSE = 3.0  # seconds between two calls of GetChange; a change is usually INSYNC within 30 seconds
 
 
@@ -41,7 +41,7 @@ class Route53Challenges:
         except ClientError as error:
             if errors.code(error) == "NoSuchHostedZone":
                 raise OrderFailed(FailureReason.DNS, "the hosted zone does not exist any more") from error
-            if errors.code(error) == "InvalidChangeBatch":  # such as a CNAME of that name, or a name outside the zone
+            if errors.code(error) == "InvalidChangeBatch":  # such as: a CNAME has that name already
                 raise OrderFailed(FailureReason.DNS, f"Route 53 refuses the TXT record {name}") from error
             raise
         while self._client().get_change(Id=change)["ChangeInfo"]["Status"] != "INSYNC":

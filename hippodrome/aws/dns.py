@@ -30,7 +30,7 @@ from hippodrome.aws.retry import retry_while_busy
 from hippodrome.model import ids
 from hippodrome.ports import DnsRecord, RefusedDnsRecords, ServiceBusy
 
-TTL = 60  # seconds. A record written with another TTL could not be deleted any more: DELETE must name it exactly.
+TTL = 60  # seconds. Never change it: DELETE must name a record's TTL, so earlier records could not be deleted.
 BATCH = 400  # records in a batch
 
 _Changes = list[dict[str, Any]]

@@ -20,7 +20,7 @@ from hippodrome.aws import errors
 from hippodrome.ports import Conflict, Document, Entry
 
 MAX_WRITES = 4  # attempts at a write that S3 answers with 409
-PAUSE = 0.05  # seconds; doubled after each 409, half of it random
+PAUSE = 0.05  # seconds until the second attempt; doubled after each 409, and half of each pause is random
 
 CONTENT_TYPES = {
     "json": "application/json",

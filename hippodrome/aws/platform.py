@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT = 2  # seconds
 READ_TIMEOUT = 5  # seconds; ECS and EC2 get twice as long
-ATTEMPTS = 3  # in all, with botocore's backoff between them (at most 1 s, then 2 s)
+ATTEMPTS = 3  # of a call in all, with botocore's backoff between them (at most 1 s, then 2 s)
 
-MAX_THREADS = 16  # of a function that handles a batch
+MAX_THREADS = 16  # the most threads of a function that handles a batch
 
 _SLOW_SERVICES = {"ecs", "ec2"}
 T = TypeVar("T")

@@ -17,8 +17,8 @@ from hippodrome.ports import ServiceBusy
 
 T = TypeVar("T")
 MAX_TRIES = 20
-FIRST, LONGEST = 0.5, 4.0  # seconds: the interval after the first try, and the longest; a wait is a random part of it
-MAX_SECONDS = 30.0  # of all tries and waits together
+FIRST, LONGEST = 0.5, 4.0  # seconds: the first interval, and the longest; each wait is a random part of one
+MAX_SECONDS = 30.0  # the most that all tries and waits take together
 
 
 def retry_while_busy(

@@ -33,7 +33,7 @@ from hippodrome.ports import Address, NoCapacity, Refused, RunningTask, TaskRequ
 from protocol import environment
 
 CONTAINER = "trial"  # the name of the container in the task definition
-MAX_OVERRIDES = 8192  # characters
+MAX_OVERRIDES = 8192  # the most characters of a task's overrides
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
 NO_CONTAINER_INSIGHTS = [{"name": "containerInsights", "value": "disabled"}]
 """The setting of participants' own clusters. It overrides the account's (API Reference, ClusterSetting): Container
@@ -128,7 +128,7 @@ class EcsTasks:
                 missing = set(_INTERFACE.findall(errors.message(error)))
                 existing = [interface for interface in wanted if interface not in missing]
                 if len(existing) == len(wanted):
-                    raise  # no id in the message is one of ours
+                    raise  # the message names none of these interfaces, so a repetition would fail too
                 wanted = existing
             else:
                 public = ((i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in found)
@@ -244,7 +244,7 @@ def client_token(request: TaskRequest) -> str:
 
 
 def _described(ecs: Any, cluster: str, arns: Sequence[str]) -> Iterator[RunningTask]:
-    if not arns:  # DescribeTasks takes 1 to 100; ListTasks gives at most 100 a page
+    if not arns:  # DescribeTasks refuses an empty list; it takes 100, the most that ListTasks gives in a page
         return
     for task in ecs.describe_tasks(cluster=cluster, tasks=arns)["tasks"]:
         name = task.get("startedBy", "")
@@ -263,7 +263,7 @@ def _run_error(error: Exception, request: TaskRequest) -> Exception:
         return NoCapacity(text)
     settling = name == "ClusterNotFoundException" or "capacity provider" in text.lower()
     if settling and ids.parse_server_name(request.cluster):
-        return error  # a participant's own cluster, created a moment ago
+        return error  # the participant's own cluster was created a moment ago, so a later try succeeds
     return Refused(f"{name}: {text}")
 
 

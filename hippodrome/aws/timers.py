@@ -18,7 +18,7 @@ from botocore.exceptions import ClientError
 from hippodrome.aws import errors
 from hippodrome.ports import Message
 
-MIN_DELAY = timedelta(seconds=20)  # long enough for the request to arrive before that time
+MIN_DELAY = timedelta(seconds=20)  # a timer's time is at least so far ahead, so that the request comes before it
 MAX_TRIES = 3  # of both calls together: another function may create or delete the timer between the two
 
 
@@ -80,7 +80,7 @@ class SchedulerTimers:
                 "Arn": self._need("STOP_SERVER_TOPIC_ARN"),
                 "RoleArn": self._need("SCHEDULE_ROLE_ARN"),
                 "Input": json.dumps(dict(message)),
-                # The stop message must arrive: Scheduler's largest values.
+                # Scheduler's largest values, because the stop message must arrive.
                 "RetryPolicy": {"MaximumEventAgeInSeconds": 86_400, "MaximumRetryAttempts": 185},
             },
         }

@@ -137,7 +137,7 @@ class Renewal:
                 self._repair(stored, wanted)
             return RenewalOutcome(decision, stored)
         try:
-            self._remove_challenges(wanted.domain, self._state()[0].challenges)  # of a run that was killed
+            self._remove_challenges(wanted.domain, self._state()[0].challenges)  # left by a run that was killed
             issued = self._order(wanted, token)
             self._tell(OrderStage.STORE)
             self._store(issued, before)
@@ -160,7 +160,7 @@ class Renewal:
             return CertificateRecord(), None
         try:
             return from_json(found.body, CertificateRecord), found
-        except ValueError as error:  # edited by hand; the certificate itself has the names and the dates
+        except ValueError as error:  # someone has edited it; the certificate has the names and the dates
             self._note(f"{self._location.state} cannot be read and is written anew", error)
             return CertificateRecord(), found
 
@@ -191,7 +191,7 @@ class Renewal:
         for _ in range(MAX_TRIES):
             state, known = self._state()
             stored, before = self._stored()
-            if state.claim == token:  # our own write, whose reply was lost
+            if state.claim == token:  # an earlier try has written it, and its reply was lost
                 return Decision(Verdict.ORDER, "claimed"), before, stored
             decision = self._decide(state, stored, wanted)
             if decision.verdict is not Verdict.ORDER:
@@ -282,7 +282,7 @@ class Renewal:
         from hippodrome.certificates.order import read_or_expired, read_stored  # noqa: PLC0415 - its import is slow
 
         stored = read_stored(found.body)
-        if stored is None:  # put there by the administrator
+        if stored is None:  # the administrator put the certificate there
             chain = self._documents.get(self._location.fullchain)
             stored = read_or_expired(chain.body if chain else b"")
         return stored, found
@@ -303,7 +303,7 @@ class Renewal:
         from hippodrome.certificates.order import chain_of  # noqa: PLC0415 - its import is slow
 
         for _ in range(MAX_TRIES):
-            known = self._documents.get(self._location.fullchain)  # before the key, so that a newer chain conflicts
+            known = self._documents.get(self._location.fullchain)  # read first, so that a newer chain conflicts
             source = self._documents.get(self._location.privkey)
             chain = chain_of(source.body) if source else None
             if chain is None or (known and known.body == chain):

@@ -45,7 +45,7 @@ STAGING = "https://acme-staging-v02.api.letsencrypt.org/directory"
 RENEW_BEFORE = timedelta(days=30)
 SHORT_LIVED = timedelta(days=10)
 CLAIM = timedelta(minutes=15)  # how long a claim counts: no order takes longer than the longest timeout in Lambda
-# The wait after 1, 2, 3 and more failed orders. The last one is less than a day, so that a daily timer tries every day.
+# The waits after one failed order, two, three, and more. The last is less than a day, so a daily timer tries every day.
 BACKOFF = (timedelta(minutes=1), timedelta(minutes=10), timedelta(minutes=100), timedelta(hours=20))
 HOUR = timedelta(hours=1)
 MAX_VALIDATIONS_PER_HOUR = 4  # one less than Let's Encrypt allows

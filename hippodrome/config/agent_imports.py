@@ -107,7 +107,7 @@ def missing_of_loaded(folder: Path, config: Config, names: Iterable[str]) -> lis
     `names` are the top-level modules that were loaded while the agent played, such as pygame, with which Gymnasium
     draws CartPole.
     """
-    if missing(folder):  # these packages may load the modules, and are reported already
+    if missing(folder):  # the missing packages may be what loads them, and are reported already
         return []
     image = _image(folder)
     imported = {module.partition(".")[0] for _, _, module in _imports(folder, _all)}

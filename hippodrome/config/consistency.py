@@ -101,7 +101,7 @@ def _starts_nothing(checked: Checked) -> bool:
     return known and not checked.game_steps and checked.project.events.start_server_step is None
 
 
-_AWS_NEEDS = {  # bucket, region and rootDomain may be missing: those of the installation are used
+_AWS_NEEDS = {  # bucket, region and rootDomain may be missing: then the installation's count
     "cpu": "the vCPUs of a server, such as 1",
     "memory": "the memory of a server in GB, such as 4",
 }

@@ -25,8 +25,8 @@ from protocol.trial_keys import names
 from protocol.trial_sections import Ui
 from protocol.values import KeyPath, is_blank, show
 
-_EXAMPLES: dict[KeyPath, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # for sections whose keys are not in NAMES
-_ENOUGH = 200  # mistakes, after which unknown keys get no suggestions: finding them takes time
+_EXAMPLES: dict[KeyPath, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # of sections whose keys are not in NAMES
+_ENOUGH = 200  # after so many mistakes, unknown keys get no suggestions, because finding one takes time
 
 
 @dataclass(slots=True)
@@ -94,8 +94,8 @@ def _unknown_in_trial(trial: Any) -> Iterator[KeyPath]:
     for path, section in TRIAL_SECTIONS.items():
         given = _at({"trial": trial}, path)
         known = names(section) | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
-        # other keys of ui are the project's own controls
         unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
+        # A key of `ui` that is not similar to any known key is a control of the project's own.
         yield from (one for one in unknown if section is not Ui or meant_for(one) is not None)
 
 
@@ -120,7 +120,7 @@ def _take(errors: Sequence[ErrorDetails], checked: Checked, sections: dict[str, 
     for error in errors:
         path: KeyPath = error["loc"]
         if path[:2] in (STEPS, TEXTS):
-            path = path[:3]  # pydantic adds a mark where a key, not its value, is wrong
+            path = path[:3]  # if a key itself is wrong, pydantic adds a mark to the path
         if error["type"] == "extra_forbidden":
             _note_unknown(checked, path)
         else:

@@ -139,7 +139,8 @@ def _id(adapted: Adapted, name: str) -> None:
     blank = is_blank(given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
-    if blank and _flag(project.get("useAWS")):  # another folder may have this name; HIPPO refuses an empty id, too
+    # On AWS another project may have the folder's name as its id. HIPPO refuses an empty id, too.
+    if blank and _flag(project.get("useAWS")):
         return
     better = re.sub(r"[^A-Za-z0-9_-]+", "-", name if blank else text).strip("-_")
     if not ids.is_project_id(better):
@@ -182,7 +183,7 @@ def _steps(adapted: Adapted) -> None:
         return
     _drop_steps(adapted, [key for key in given if key.isdecimal() and int(key) == 0], "never shown, as in HIPPO Gym")
     numbers = sorted((key for key in given if key.isdecimal() and len(key) < 4), key=int)
-    if len(numbers) == int(numbers[-1] if numbers else 0):  # with a gap, another key may be a misspelt number
+    if len(numbers) == int(numbers[-1] if numbers else 0):  # if a number is missing, another key may be its misspelling
         others = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
         _drop_steps(adapted, others, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
     without = [key for key in numbers if is_blank(given[key])]
@@ -190,7 +191,7 @@ def _steps(adapted: Adapted) -> None:
     if not rest and not is_blank(given.get(FINAL)):
         _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
         adapted.remark((*STEPS, FINAL), "the study has this page only")
-    elif without and len(numbers) == int(numbers[-1]):  # steps with gaps stay, for the check to report
+    elif without and len(numbers) == int(numbers[-1]):  # if a number is missing, the check reports it
         unplayed = "game" not in given.values() and not is_blank(adapted.at(("trial", "game")))
         more = "; no step is game, so no participant plays: if this one is to be, write game" if unplayed else ""
         for key in without:

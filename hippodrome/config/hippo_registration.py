@@ -19,7 +19,7 @@ _KNOWN_TO_HIPPO = frozenset(
 )
 _UNKNOWN_TO_HIPPO = sorted(NAMES["project",] - _KNOWN_TO_HIPPO)
 """The keys of `project` that HIPPO's script does not know, so a registration by it keeps their earlier values."""
-_MAX_SHOWN = 300  # characters of such a value in a remark
+_MAX_SHOWN = 300  # the most characters of a key's value in a remark
 _STAYS = "stays, as it was registered before; write the key into config.yml to change it"
 _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, start() of the agent is given "none"'
 

@@ -181,7 +181,7 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
     source = read_source(folder)
     arrows = [
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
-    ]  # without `ui` in the file all arrows are shown
+    ]  # a file without `ui` gets no remark, although all arrows are shown
     own = [*texts.shown_as_they_are(config), *texts.left_in_english(config)]
     found = [*remarks(config), *own, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
     return [*config.remarks, *(source.diagnostic(path, message, remark=True) for path, message in found)]

@@ -17,7 +17,7 @@ _BRACES = re.compile(r"\{[^{}]*\}")
 _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
 _QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
-_SHOWN = 3  # names of texts in a remark
+_SHOWN = 3  # the most names of texts in a remark
 _SENTENCE = 3  # a text with at least so many words is not the same in two languages
 
 

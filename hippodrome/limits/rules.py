@@ -122,7 +122,7 @@ class ServerSlots(Record, frozen=True):
     """`_places/{projectId}.json`: the slots of servers, by label, and the seconds that ended servers have used."""
 
     slots: Mapping[str, ServerSlot] = msgspec.field(default_factory=dict, name="held")
-    used: int = 0  # seconds, of ended servers
+    used: int = 0  # the seconds of ended servers, added up
 
     @property
     def names(self) -> list[str]:
@@ -140,7 +140,8 @@ class ServerSlots(Record, frozen=True):
             return self
         others = {label: held for label, held in self.slots.items() if label != server.label}
         before_it = [held for held in others.values() if server.is_warm_server or not held.is_warm_server]
-        used = self.used + (mine.reserved if mine else 0)  # an earlier attempt that was never released used all of it
+        # If the slot of an earlier attempt was never released, all that it reserved counts as used.
+        used = self.used + (mine.reserved if mine else 0)
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
             return None
         hours = project.max_server_hours

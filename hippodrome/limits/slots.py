@@ -16,7 +16,7 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Platform
 from hippodrome.storage.compare_and_swap import SharedDocuments
 
-FULL_FOR = timedelta(seconds=10)  # for this time a function remembers, without a call, that a study is full
+FULL_FOR = timedelta(seconds=10)  # so long a function remembers that a study is full, and makes no call for it
 
 
 class Release(NamedTuple):

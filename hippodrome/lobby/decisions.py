@@ -82,7 +82,7 @@ class Formed(Record, frozen=True):
     at: datetime
     ahead: bool = False
     waits_for: OpenSession | None = None
-    players: int = 0  # with the empty places; 0 in documents of earlier versions
+    players: int = 0  # the number of players, empty places included; 0 in documents of earlier versions
 
     @property
     def labels(self) -> tuple[str, ...]:

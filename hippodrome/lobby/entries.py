@@ -89,7 +89,7 @@ class Entries:
     left: Mapping[str, Departure] = field(default_factory=dict)  # by label
     under_way: frozenset[str] = frozenset()
     done: frozenset[str] = frozenset()  # ids of sessions, and labels of unmatched participants
-    keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # of all entries of participants, by label
+    keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by label: the keys of the participant's entries
     outdated: tuple[str, ...] = ()  # the keys of old entries, which may be deleted
 
     def with_waiting(self, one: Waiting) -> Entries:
@@ -132,7 +132,7 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
         keys.setdefault(label, []).append(entry.key)
         if is_way:
             under_way.add(label)
-        elif kind == "yes" and is_session_id(text):  # the form of a proposal's id, too
+        elif kind == "yes" and is_session_id(text):  # a proposal's id has the form of a session's
             confirmed.setdefault(text, set()).add(label)
         elif kind == "left" and text.isdecimal():
             left[label] = Departure(int(text), entry.modified)

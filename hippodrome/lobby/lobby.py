@@ -180,7 +180,7 @@ class Lobby:
             )
 
         after = self._store.change(project, settle)
-        if label in after.labels():  # a message that came late: nothing else removes it
+        if label in after.labels():  # the message came late, and nothing else removes the participant
             self._documents.delete(way)
         for each in after.open:
             if each.by == label:
@@ -275,7 +275,7 @@ class Lobby:
             before = document
             return servers.given(document, now, open_for)
 
-        if settle(known) is known:  # mostly
+        if settle(known) is known:  # the usual case: nothing changes
             return _no_server_yet(formed, servers)
         after = self._change(project, known, settle)
         made = self._store.carry_out(project, _due(me.label, known, before, after), Entries())
@@ -305,7 +305,7 @@ class Lobby:
         own_key = lobby_entries.waiting_key(project.id, one)
         self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != own_key and ".yes." not in key)
-        self._store.delete(others)  # which say that they have left, are under way, or wait on another page
+        self._store.delete(others)  # entries that say they have left, are under way, or wait on another page
         return entries.with_waiting(one)
 
     def _confirm(self, project: Project, me: _Asker, proposal: Proposal, entries: Entries) -> Entries:

@@ -79,7 +79,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
     heads = [(found[0].order, trait) for trait, found in by_trait.items()]  # in the order of arrival, so it is a heap
     while heads:
         members: list[Waiting] = []
-        spent: list[str] = []  # traits of which this session may have no more
+        spent: list[str] = []  # the traits of which this session may have no further member
         count: dict[str, int] = {}
         while heads and len(members) < project.players:
             _, trait = heapq.heappop(heads)

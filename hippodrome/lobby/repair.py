@@ -46,14 +46,14 @@ class Repair:
         self._store.delete(entries.outdated)
         if project.asks_match:
             self._matcher.forget(project)
-        # The document was lost, and the requests that had read it have ended: they write no session any more.
+        # The decisions were lost. The requests that had read them have ended, so they write no session any more.
         may_finish = known.renewed is not None and self._platform.now() - known.renewed >= WRITTEN_WITHIN
         if may_finish:
             self._store.finish_sessions(project)
         self._store.carry_out(project, rules.without_done(known, entries.done).for_good(), entries)
         ahead = [*known.open, *(each.waits_for for each in known.formed if each.waits_for)]
         servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
-        entries = self._store.entries(project)  # with the marks of what has just been carried out
+        entries = self._store.entries(project)  # again, for the marks of what was just carried out
         run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=StartedAhead(servers))
         closed = {name: each.closed for name, each in servers.items() if each and each.closed}
         over = [name for name, since in closed.items() if run.now - since > CLOSED_FOR_GOOD]

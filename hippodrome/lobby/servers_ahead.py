@@ -71,7 +71,7 @@ def with_ready_servers(
     opened = list(document.open)
     usable = {each.id for each in opened if each.is_usable(each.players, now, open_for)}
     left = len({*usable, *(each.id for each in servers)} & set(ready))  # ready servers that no session has got yet
-    given: dict[tuple[str, ...], str] = {}  # by the labels of a session, the id of its server
+    given: dict[tuple[str, ...], str] = {}  # by the labels of a session's members: the id of its server
     for at, session in enumerate(sessions):
         players = servers[at].players
         fits = [n for n, each in enumerate(opened) if each.id in usable and each.players == players]

@@ -52,7 +52,7 @@ def new_session_id() -> str:
     return f"s.{secrets.token_hex(10)}"
 
 
-@functools.lru_cache(maxsize=1024)  # a request asks several times, and base32 is encoded in Python
+@functools.lru_cache(maxsize=1024)  # a request needs a label several times, and base32 is Python code
 def server_label(project_id: str, user_id: str) -> str:
     """Return the label of a participant's servers: a hash, because ids are personal data and DNS ignores case.
 

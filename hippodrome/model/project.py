@@ -107,7 +107,7 @@ class Project(Record, frozen=True):
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
     max_participants: int | None = None
     max_servers: int | None = None  # how many servers may run at once
-    max_server_hours: int | None = None  # of all servers together, ever
+    max_server_hours: int | None = None  # of all servers together, from the first registration on
     warm_servers: int = 0  # how many servers to keep started ahead of participants
     signed_links: bool = False
     players: int = 1  # participants of one session; 1: each participant has a server of their own

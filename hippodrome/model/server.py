@@ -97,7 +97,7 @@ class Server(Record, frozen=True):
     spot: bool = True
     task: str | None = None  # the task's id, once the task runs
     host: str | None = None  # the address in its DNS record, exactly as in the zone
-    port: int | None = None  # the port on which it should listen; once its task runs, the port on which it does
+    port: int | None = None  # the port on which it is to listen; once its task runs, the port on which it listens
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
@@ -326,7 +326,7 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
     It is written before the DNS record is created, so that each DNS record has an owner.
     """
-    port = address.port or server.port or LEGACY_PORT  # records of earlier versions have no port yet here
+    port = address.port or server.port or LEGACY_PORT  # neither has a port in records of earlier versions
     return msgspec.structs.replace(
         server, state=ServerState.NAMING, task=task, host=address.host, port=port, running=now
     )

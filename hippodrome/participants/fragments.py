@@ -41,7 +41,7 @@ _IGNORED = re.compile(r"\A[\0- ]+|[\t\r\n]")
 _NAMES_HOST = re.compile(r"//|https?:", re.IGNORECASE)
 _ORIGIN = re.compile(r"https?://[^/\s?#]+", re.IGNORECASE)
 
-_RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # no tags inside
+_RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # hold no tags
 _DROPPED = frozenset({"html", "head", "body", "form", "meta", "base"})
 ADDRESSES = {
     "img": ("src", "srcset"),
@@ -61,9 +61,9 @@ class Fragment:
     """A prepared step page, and the facts about it that the frame needs."""
 
     text: str
-    has_fields: bool = False  # inputs with names, whose values are sent
-    has_submit: bool = False  # a submit button of its own
-    has_heading: bool = False  # an <h1>
+    has_fields: bool = False  # whether it has inputs with names, whose values are sent
+    has_submit: bool = False  # whether it has a submit button of its own
+    has_heading: bool = False  # whether it has an <h1>
     title: str = ""
     lang: str = ""
 
@@ -95,7 +95,7 @@ class _Preparation:
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
         self._out: list[str] = []
-        self._seen: set[str] = set()  # of "field", "submit" and "h1"
+        self._seen: set[str] = set()  # which of "field", "submit" and "h1" the page has
         self._title = self._lang = ""
         self._drawings = 0  # open <svg> elements, whose <title> is their own
 

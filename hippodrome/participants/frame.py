@@ -277,7 +277,7 @@ def _plain(name: str, text: str) -> str:
     """
     if name.endswith(".css"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
-        text = re.sub(r" ?([{};>~]) ?|([:,]) ", r"\1\2", text)  # no quoted text of ours has these
+        text = re.sub(r" ?([{};>~]) ?|([:,]) ", r"\1\2", text)  # no quoted text in our files has such a part
     if name.endswith(".js"):
         text = re.sub(r"[ \t]// .*$", "", text, flags=re.MULTILINE)
     if name.endswith((".css", ".js")):

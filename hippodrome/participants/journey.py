@@ -116,7 +116,7 @@ class Journey:
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
         try:
             return self._show(request, project, user_id)
-        except StepAnswered:  # by this very request: the participant was not matched with others
+        except StepAnswered:  # by this very request, since the participant was not matched with others
             return self._show(request, project, user_id)
 
     def _show(self, request: Request, project: Project, user_id: str) -> Response:

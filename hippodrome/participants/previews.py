@@ -15,9 +15,9 @@ from hippodrome.http import Request
 
 NOT_ACCEPTED = "ASSIGNMENT_ID_NOT_AVAILABLE"
 """The `assignmentId` in MTurk's preview of a task that the worker has not accepted."""
-_PURPOSE = ("sec-purpose", "purpose", "x-purpose", "x-moz")  # headers
+_PURPOSE = ("sec-purpose", "purpose", "x-purpose", "x-moz")  # headers that say for what a browser fetches a page
 
-# User agents of programs that show a card for a link in a chat, or index pages. Not of Cubot, a maker of phones.
+# User agents of programs that show a card for a link in a chat, or index pages. "Cubot" is none: it makes phones.
 _PROGRAMS = re.compile(
     r"(?<!cu)bot\b|crawler|spider\b|facebookexternalhit|facebookcatalog|meta-external|whatsapp/"
     r"|slack-imgproxy|skypeuripreview|bingpreview|google-pagerenderer|googleother|google-inspectiontool"

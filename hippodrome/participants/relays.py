@@ -98,7 +98,7 @@ class Relays:
         if record is None:
             attempt = 1
         elif not record.is_closed:
-            attempt = record.attempt  # it is open: the message changes nothing
+            attempt = record.attempt  # the server is open, so the start message changes nothing
         elif (requestable := requestable_attempt(record)) is not None:
             attempt = requestable
         else:

@@ -53,7 +53,7 @@ class ServerStates:
             if record.is_closed:
                 state.update(_closed(record))
             elif step is not None and step.type.on_server and record.lacks(step.key):
-                state["state"] = ServerState.QUEUED  # the server is being stopped (`GameStep`), another one will start
+                state["state"] = ServerState.QUEUED  # `GameStep` has this server stopped, and another will start
             elif record.state is ServerState.READY and record.dns_record:
                 self._remember(record)
                 host = dns.browser_host(record.dns_record)

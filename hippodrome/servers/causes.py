@@ -19,7 +19,7 @@ from hippodrome.model.server import TaskStopped
 from hippodrome.ports import NoCapacity, Refused
 from protocol import exits
 
-_KILLED = 137  # by SIGKILL
+_KILLED = 137  # the exit code of a container that SIGKILL has ended
 
 
 class FailureCategory(StrEnum):
@@ -30,7 +30,7 @@ class FailureCategory(StrEnum):
     PROGRAM = "program"
     MEMORY = "memory"
     REFUSED = "refused"
-    AWS = "aws"  # AWS's side; worth attention only if there are many
+    AWS = "aws"  # something on AWS's side, worth attention only if it happens often
 
 
 class Cause(StrEnum):
@@ -175,7 +175,7 @@ _EXPLANATIONS = {
 }
 
 _TASK_PATTERNS = (  # the first match counts
-    (Cause.KILLED, re.compile(r"process was killed")),  # of local/backend/task_record.py, not of AWS
+    (Cause.KILLED, re.compile(r"process was killed")),  # written by local/backend/task_record.py, not by AWS
     (Cause.OUT_OF_MEMORY, re.compile(r"OutOfMemory", re.IGNORECASE)),
     (Cause.IMAGE, re.compile(r"CannotPull|pull image manifest", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"exec:|exec format|executable file|exec user process", re.IGNORECASE)),

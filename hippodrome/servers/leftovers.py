@@ -75,7 +75,7 @@ def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Leftov
     """
     if ids.parse_server_name(name) is None:
         return None
-    if owner is None:  # its participant was erased, since a server's record is written before it takes its slot
+    if owner is None:  # its participant was erased: a record is written before its server takes a slot
         return LeftoverReason.NO_RECORD
     return LeftoverReason.CLOSED if owner.closed is not None and now > owner.closed + LOST_AFTER else None
 

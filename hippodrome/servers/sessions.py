@@ -16,7 +16,7 @@ from hippodrome.model.project import Project
 from hippodrome.storage.repository import Repository
 from protocol.session import BadSession, SessionDocument
 
-if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and its zip holds all modules that it imports
+if TYPE_CHECKING:  # sign_requests needs `members_of` alone, and each further import would be in its zip
     from hippodrome.servers.services import ServerServices
 
 

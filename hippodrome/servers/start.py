@@ -63,7 +63,7 @@ class Start:
             project = before
         if of_session:
             project = self._for_session(project, message)
-        self._services.secrets.get_or_create()  # the secret must exist before anything is written that needs it
+        self._services.secrets.get_or_create()  # it must exist before anything that needs it is written
         stored = self._create_or_find(project, message)
         if stored is None:
             return
@@ -130,7 +130,7 @@ class Start:
             logger.error("the server cannot run", extra={"server": record.name, "why": type(error).__name__})
             present = self._repository.server(record.label)
             if present is None or not present.server.owns(record.name):
-                return  # another delivery was assigned a warm server, which holds the slot now
+                return  # another delivery of the message got a warm server, which holds the slot now
             reason = Reason.REFUSED if isinstance(error, Refused) else Reason.NO_CAPACITY
             Termination(self._services).clean_up_lost(stored, reason, causes.cause_of_refusal(error))
             return
@@ -218,8 +218,8 @@ def _owner_environment(project: Project, record: Server, settings: Settings) -> 
     deadline = record.deadline
     if record.is_warm_server:
         owner = {environment.WARM_SERVER: "on"}
-        # Whoever is assigned the server at the last moment still gets all of maxRuntime, and a session also the time to
-        # wait for its members.
+        # So much later, because whoever is assigned the server at the last moment still gets all of maxRuntime, and a
+        # session also the time to wait for its members.
         deadline += lifetime_asked_for(project, settings)
     elif record.is_of_session:
         owner = {environment.SESSION: record.user_id}

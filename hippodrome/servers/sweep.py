@@ -42,16 +42,16 @@ T = TypeVar("T")
 class SweepResult:
     """What one sweep did, counted."""
 
-    tasks: int = 0  # resources removed, from here to `clusters`
+    tasks: int = 0  # removed, like the names, timers and clusters below
     names: int = 0  # DNS records
     timers: int = 0
     clusters: int = 0
-    slots: int = 0  # slots released that ended servers still held
-    warm_servers: int = 0  # stopped because no pool lists them
-    sessions: int = 0  # stopped servers of sessions that were never formed, or that all members have left
+    slots: int = 0  # slots that ended servers still held, and that were released
+    warm_servers: int = 0  # warm servers that were stopped because no pool lists them
+    sessions: int = 0  # stopped servers of sessions that never formed, or that all members have left
     handovers: int = 0  # handover documents deleted
     overdue: int = 0  # servers stopped after their deadline
-    lost: int = 0  # servers cleaned up that had lost their task
+    lost: int = 0  # servers that had lost their task, and were cleaned up
     asked: int = 0  # servers for which a message was sent again
     failed: int = 0  # actions that failed
 
@@ -61,7 +61,7 @@ class RunningServers:
     """The number of this installation's servers that ran when a sweep began, and the age of the oldest."""
 
     count: int = 0
-    oldest: timedelta = timedelta()  # since that server was requested
+    oldest: timedelta = timedelta()  # the time since the oldest of them was requested
 
 
 class Sweep:

@@ -41,7 +41,7 @@ class ServerToClose(NamedTuple):
 
     stored: Versioned
     reason: Reason
-    cause: Cause | None = None  # if it failed
+    cause: Cause | None = None  # why it failed, if it did
     deprovisioning: bool = False  # its task is still DEPROVISIONING, so a cluster of its own cannot be deleted yet
 
 
@@ -177,7 +177,7 @@ class Termination:
         Raises `RetryLater` if its slot could not be freed, or what ECS raises if its cluster still holds a task.
         """
         closing, record = ServerToClose(stored, reason, cause), stored.server
-        if record.has_own_cluster:  # first: ECS refuses if the cluster holds a task that no listing shows yet
+        if record.has_own_cluster:  # done first: ECS refuses if the cluster holds a task that no listing shows yet
             self._platform.tasks.delete_cluster(record.cluster)
         self._delete_dns_records([stored])
         _, stuck = self._free_slots([(None, closing)])
@@ -188,14 +188,14 @@ class Termination:
     def _ended_server(self, event: TaskChanged) -> ServerToClose | None:
         """The server whose task has ended; None if we stopped the task, or if it is not the server's present task."""
         if event.stopped_reason.startswith(messages.STOP_REASON_PREFIX):
-            return None  # `stop` does the rest
+            return None  # `stop` has stopped the task, and does the rest
         stored = self._repository.owner(event.name)
         if stored is None:
             return None
         record, deprovisioning = stored.server, event.status != "STOPPED"
         over = record.is_closed or record.name != event.name
         if over and not deprovisioning and event.cluster == event.name:
-            self._platform.tasks.delete_cluster(event.cluster)  # which had to wait for STOPPED
+            self._platform.tasks.delete_cluster(event.cluster)  # it could not be deleted before the task was STOPPED
         if record.name != event.name or record.task not in (None, event.task):
             return None  # the task is an earlier attempt's, or the unwanted one of two tasks for one server
         ended = TaskStopped(event.stop_code, event.exit_code, f"{event.stopped_reason} {event.container_reason}")
@@ -235,7 +235,7 @@ class Termination:
         The timer is deleted last: if this is interrupted, the next sweep finds the timer and calls `after_close`.
         """
         record = closing.stored.server
-        if record.is_closed:  # an earlier `after_close` may have been interrupted
+        if record.is_closed:  # `after_close` again, since an earlier call may have been interrupted
             self.after_close(record)
             return
         if record.has_own_cluster and not closing.deprovisioning:

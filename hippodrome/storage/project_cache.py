@@ -55,7 +55,7 @@ class ProjectCache:
         found = self.document(MASTER_LIST, fresh)
         if found is None:
             return MasterList()
-        parsed = self._parsed  # read once: another thread may replace it
+        parsed = self._parsed  # read from the attribute once, since another thread may replace it
         if parsed is None or parsed[0] != found.etag:
             listed = read_list(found.body)
             for entry in listed.unreadable:

@@ -34,7 +34,7 @@ TRIES = 20  # for one change of the document
 class Secret(Record, frozen=True):
     """`_secret.json`. `projects` holds the secrets that earlier versions kept in the master list; they stay valid."""
 
-    secret: Annotated[str, msgspec.Meta(min_length=32)]  # an empty one would be known to everyone
+    secret: Annotated[str, msgspec.Meta(min_length=32)]  # everyone knows the empty text
     projects: Mapping[str, str] = msgspec.field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -55,7 +55,7 @@ class ActivityLog:
         """Whether browsers find servers by their names (`TLS=1`)."""
         self._lock = threading.Lock()
         self._states: dict[str, tuple[int, str]] = {}
-        self._shown: set[str] = set()  # keys of answers, and ids of sessions
+        self._shown: set[str] = set()  # the keys of answers and the ids of sessions that were shown
         self._last_step = ""
         self._held: dict[str, tuple[threading.Timer, str]] = {}  # lines that are held back, by participant
         self._looking = threading.RLock()

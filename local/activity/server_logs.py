@@ -36,7 +36,7 @@ class WatchedServer:
         """
         self.folder = folder
         self.user_id = folder.rpartition("/")[2]
-        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # of the participants
+        self._folders: tuple[str, ...] = () if is_session_id(self.user_id) else (folder,)  # participants' folders
         self._known = self._keys()
         self._returned: set[str] = set()
 

@@ -52,7 +52,7 @@ class FolderDocuments:
         except OSError as error:
             if error.errno != errno.EXDEV:
                 raise
-            self._scratch = self.folder / ".scratch"  # a link cannot cross file systems
+            self._scratch = self.folder / ".scratch"  # `state` is on another file system, and no link crosses it
             disk.make_folder(self._scratch)
             self._try()
 

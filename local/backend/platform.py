@@ -37,7 +37,7 @@ DOMAIN = "localhost"
 _OURS = ("queue", "tasks", "timers")  # folders in which no other process has unfinished files
 _KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
-LOOK = 0.5  # seconds after which it looks again whether the data still exist
+LOOK = 0.5  # seconds between two looks whether the data still exist
 START_RETRY_SECONDS = 5.0  # seconds for which `start` tries again what this machine refuses
 
 HANDLERS: Mapping[str, Handler] = {
@@ -158,7 +158,7 @@ class LocalPlatform:
             try:
                 kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
                 seen = self._existing()
-            except OSError as error:  # not known, so nothing counts as deleted
+            except OSError as error:  # what exists is not known, so nothing counts as deleted
                 self.retry.report(error)
                 continue
             deleted = known - seen
@@ -189,7 +189,7 @@ class LocalPlatform:
         """Publish the study again. `servers`: whether the servers' records were deleted; then the servers are ended."""
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
-        for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid
+        for key, document in kept.items():  # written as they were, so that open pages and completion codes stay valid
             if document:
                 with contextlib.suppress(Conflict):
                     self.documents.create(key, document.body)

@@ -85,16 +85,16 @@ class TaskProcess:
 
     def __init__(self, task: TaskRecord, shared: Shared) -> None:
         self.task = task
-        self.begun = threading.Event()  # there is a process, or there will be none
-        self.gone = threading.Event()  # the process is gone and its last event is sent
-        self.forgotten = threading.Event()  # its file is removed, and not written any more
-        self.silent = False  # it sends no events: the server's record was deleted, and a new server may have its name
-        self.unsaved = False  # the task has changed since it was saved
+        self.begun = threading.Event()  # set when there is a process, or will be none
+        self.gone = threading.Event()  # set when the process is gone and its last event is sent
+        self.forgotten = threading.Event()  # set when the record's file is removed: it is not written any more
+        self.silent = False  # no events are sent: the server's record was deleted, and a new server may have its name
+        self.unsaved = False  # whether the task has changed since it was saved
         self._shared = shared
         self._child: subprocess.Popen[bytes] | None = None
         self._ending: threading.Thread | None = None
         self._exit_code: int | None = None
-        self._over = False  # the process is gone; its last event may not have been sent yet
+        self._over = False  # whether the process is gone; its last event may not be sent yet
 
     @property
     def lives(self) -> bool:
@@ -220,7 +220,7 @@ class TaskProcess:
             self._send()
         elif self.unsaved:
             self._save()
-        if self.task.asked:  # by an earlier `make run` that was killed before the server had ended
+        if self.task.asked:  # an earlier `make run` told it to stop, and was killed before it had ended
             self.end(self.task.asked, time.monotonic() + self._shared.stop_timeout)
         if self.task.status == "PROVISIONING" and self._listens():
             self._send(status="RUNNING", started=now())
@@ -267,8 +267,8 @@ class TaskProcess:
         if note.isdecimal():
             return int(note)
         if self._child and self._child.returncode is not None and self._child.returncode >= 0:
-            return self._child.returncode  # it is the server's code; the shell could not write its note
-        return KILLED if self.task.pid else None  # the shell was killed with it
+            return self._child.returncode  # the server's code; the shell could not write its note
+        return KILLED if self.task.pid else None  # the shell was killed with the server, and wrote no note
 
     def _clear(self) -> None:
         """Move the recordings that are left, and remove the notes of the shell. Raises OSError."""
@@ -276,7 +276,7 @@ class TaskProcess:
             self._rescue()
             self._shared.files.remove_notes(self.task.name)
         finally:
-            self.gone.set()  # no caller waits until all that succeeds
+            self.gone.set()  # set even if a step above fails: no caller waits until all succeed
 
     # Its end
 
@@ -299,7 +299,7 @@ class TaskProcess:
         while not self.gone.is_set() and time.monotonic() < until:
             if self._terminate():
                 break
-            self.gone.wait(0.02)  # the shell has not started it yet
+            self.gone.wait(0.02)  # the shell has not started the server yet
 
     def _terminate(self) -> bool:
         """Send SIGTERM to the server; return False if there is no process of it. Raises OSError."""

@@ -30,16 +30,16 @@ class TaskRecord:
     cluster: str
     id: str
     created: str
-    pid: int | None = None  # of the shell, which leads the process group
+    pid: int | None = None  # the id of the shell, which leads the process group
     port: int | None = None
-    status: str = "PROVISIONING"  # ECS's word, as in the last event
+    status: str = "PROVISIONING"  # ECS's word for the state, as in the last event
     version: int = 0
     started: str | None = None
     stopped: str | None = None
     asked: str | None = None  # the reason for which it was asked to stop; None if it was not
-    folder: str = ""  # the participant's or session's, below data and spool; empty until a warm server is assigned
+    folder: str = ""  # of the participant or session, below data and spool; empty until a warm server is assigned
     server: str = ""  # the name of its folder of recordings; empty: its own name
-    handover_key: str = ""  # of a warm server's handover; stored as `warm_server`
+    handover_key: str = ""  # the key of a warm server's handover; stored as `warm_server`
     kept: bool = False  # whether its recordings belong in the data folder
     claim: str = ""  # a hash of its token, by which servers of the same name differ
 

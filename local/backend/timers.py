@@ -47,7 +47,7 @@ class FolderTimers:
         path = self._path(name)
         when = float(int(at.timestamp()))
         with self._changed:
-            heapq.heappush(self._queue, (when, name))  # before the file: it may exist even if writing it raises
+            heapq.heappush(self._queue, (when, name))  # before the file: it may be there even if writing it fails
             self._changed.notify()
             files.write_json(path, {"at": datetime.fromtimestamp(when, UTC).isoformat(), "message": dict(message)})
 
@@ -100,7 +100,7 @@ class FolderTimers:
             try:
                 self.fire(name, time.time())
             except Exception as error:  # noqa: BLE001 - the other timers go on
-                if not isinstance(error, OSError):  # `Retry` has reported those
+                if not isinstance(error, OSError):  # `Retry` has reported the system's errors
                     self._say(f"a timer failed and is tried again: {type(error).__name__}: {error}")
                 with self._changed:
                     heapq.heappush(self._queue, (time.time() + AGAIN, name))

@@ -262,7 +262,7 @@ def _main(report: Path) -> None:
         thread.join()
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(0)  # whatever threads the agent has left
+        os._exit(0)  # ends even if threads of the agent still run
 
 
 if __name__ == "__main__":

@@ -319,7 +319,7 @@ class AgentReport:
             return self._at(None, text.replace(f"{AGENT} has", "there is", 1))
         if self._config.project.has_sessions and "observations by player" in text:
             text += "; an environment with one player is for participants who play alone (project.players: 1)"
-        method = _SIGNATURE.match(text)  # the text is about this method, whichever was called
+        method = _SIGNATURE.match(text)  # the error is about the method that its text names, whichever was called
         if method:
             return self._at((self._label or AGENT, line_of(self._code / AGENT, method[1])), short(text))
         return self._at(place, short(text), whole="has no" in text)
@@ -330,7 +330,7 @@ class AgentReport:
         if not self._config.trial.action_space or count is None or names == count:
             return []
         if names > count and not self._report.get("foreign"):
-            return []  # step() in agent.py translates them
+            return []  # step() in agent.py translates the numbers
         message = f"has {names} names, but the environment has {count} actions"
         if names > count:
             message += "; take out the names of actions that it does not have, or let step() in agent.py translate them"

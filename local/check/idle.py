@@ -50,7 +50,7 @@ def actions_without_effect(
             after = picture()
             first = first or (before, after)
             if not same(before, first[0]) or (action == idle and not same(after, first[1])):
-                return None  # the game is not the same each time
+                return None  # the game is not the same each time, so nothing can be compared
             seen[action] = not same(before, after)
             if seen[action]:
                 still.discard(action)

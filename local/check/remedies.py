@@ -29,7 +29,7 @@ def remedy(kind: str, text: str) -> str:
 
     `kind` is the name of the exception's class.
     """
-    if kind == "DependencyNotInstalled":  # the text names the packages, as Gymnasium calls them
+    if kind == "DependencyNotInstalled":  # the error's text names the packages, as Gymnasium calls them
         return f"; here pip is {_PIP}"
     lacking = _NAME.search(text) or _ATTRIBUTE.search(text)
     if lacking and kind in ("ImportError", "AttributeError"):

@@ -55,7 +55,7 @@ def spans(text: str, *kinds: Marks) -> Iterator[Span]:
         opening = following[kind]
         closing = kind.closing.search(text, opening.end()) if opening else None
         if opening is None or closing is None:
-            following[kind] = None  # no later one is closed either
+            following[kind] = None  # as this one is not closed, no later one is
             continue
         at = closing.end()
         yield Span(opening.start(), opening.end(), closing.start(), at)

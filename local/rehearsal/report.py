@@ -17,9 +17,9 @@ from local.rehearsal.crashes import AgentCrash
 from local.rehearsal.study_process import Leftovers
 
 EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended early
-SHOWN_LINES = 10  # of each kind
-SHOWN_NAMES = 3  # of bots that found no others
-SHOWN_CRASHES = 3  # tracebacks of agent.py
+SHOWN_LINES = 10  # the most lines of each kind
+SHOWN_NAMES = 3  # the most names of bots that found no others
+SHOWN_CRASHES = 3  # the most tracebacks of agent.py
 
 
 def report(

@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
-_HOST = "127.0.0.1"  # for a request without a host
+_HOST = "127.0.0.1"  # the address of a request that names no host
 
 Scope = MutableMapping[str, Any]
 

@@ -21,7 +21,7 @@ PORT = 5000
 _PIECE = 16_384  # bytes that may wait here; so a trial server notices when its client is slow
 _HANDSHAKE_SECONDS = 10.0
 _BACKLOG = 100
-_PAUSE = 0.5  # seconds after a connection could not be accepted
+_PAUSE = 0.5  # seconds until the next try, after a connection could not be accepted
 
 Find = Callable[[str], int | None]
 
@@ -108,7 +108,7 @@ class Names:
             transport, _ = await self._loop.connect_accepted_socket(
                 lambda: protocol, accepted, ssl=self._context, ssl_handshake_timeout=_HANDSHAKE_SECONDS
             )
-        except OSError:  # no TLS, no such name, too slow
+        except OSError:  # no TLS, a name without a server, or a handshake that took too long
             return
         task = asyncio.current_task()
         assert task is not None

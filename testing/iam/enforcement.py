@@ -110,8 +110,8 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject places": {NEXT, REGISTER},
     "s3:GetObject _places": {START, TASK, STOP, SWEEP},
     "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # Warm servers: the pools (_spares), and the handover of each assigned server, which the function deletes that ends
-    # it.
+    # Warm servers: the pools (_spares), and the handover of each assigned server. The function that ends the server
+    # deletes its handover.
     "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
     "s3:PutObject spares": {START},
@@ -133,14 +133,14 @@ WHO_MAY: dict[str, set[str]] = {
     "ecs:TagResource": {START},
     "iam:PassRole TaskExecutionRole": {START},
     "ecs:CreateCluster": {START},
-    "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # as with timers
+    "ecs:DeleteCluster": {START, TASK, STOP, SWEEP},  # the functions that delete timers
     "ecs:StopTask": {TASK, STOP, SWEEP},  # task_changed: a task that runs too late
     "ecs:ListTasks": {STOP, SWEEP},  # stop_server: a task whose id is not known yet
     "ecs:DescribeTasks": {SWEEP},
     "ecs:ListClusters": {SWEEP},
     "ec2:DescribeNetworkInterfaces": {TASK},
     "route53:ChangeResourceRecordSets UPSERT A": {TASK},
-    "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # as with timers
+    "route53:ChangeResourceRecordSets DELETE A": {TASK, STOP, SWEEP},  # of a server that has ended
     "route53:GetChange": {TASK, RENEW},
     "route53:ListResourceRecordSets": {SWEEP},
 }

@@ -34,7 +34,7 @@ def certificates() -> None:
     """Put Pebble in the place of Let's Encrypt's authorities, and its DNS beside the zone."""
     from hippodrome.certificates import rules as certificate
 
-    # Before any module imports them.
+    # Changed here, before any module imports them.
     certificate.STAGING, certificate.PRODUCTION = SETTINGS["staging"], SETTINGS["production"]
     from hippodrome.aws.challenges import Route53Challenges
     from hippodrome.certificates import renewal

@@ -97,7 +97,7 @@ class Cloud:
         self.lobby_calls: Counter[str] = Counter()  # those of S3 for lobbies, sessions and memberships
         self.throttled: Counter[str] = Counter()
         self.conflicts: Counter[str] = Counter()  # conditional writes that were refused, by key
-        self.number = 0  # the functions' calls so far
+        self.number = 0  # the number of the functions' calls so far
         self.fault: FaultAt | None = None
         self.timeline: list[tuple[float, str]] = []
         self.invocations = 0  # invocations of all functions that run now

@@ -27,8 +27,8 @@ class Conditions:
     lost: float = 0.0  # events that never come
     no_spot: Callable[[float], bool] = field(default=lambda seconds: False)  # whether Spot is sold out at that second
     interrupted: float = 0.0  # Spot tasks that are interrupted
-    interrupted_after: tuple[float, float] = (5.0, 600.0)  # seconds that these have run before
-    untold: float = 0.5  # of these, the share whose events have no stopCode: aws/containers-roadmap issues 1565 and 797
+    interrupted_after: tuple[float, float] = (5.0, 600.0)  # the seconds after which they are interrupted
+    untold: float = 0.5  # the share of these whose events have no stopCode: aws/containers-roadmap issues 1565 and 797
     late_addresses: float = 0.05  # tasks whose address EC2 does not show at once
     address_late: tuple[float, float] = ADDRESS_LATE
     stillborn: float = 0.0  # tasks that end before they run: an image that cannot be pulled

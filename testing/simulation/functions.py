@@ -44,7 +44,7 @@ from testing.simulation.cloud import Cloud, NoRoom
 COLD = (0.5, 1.0)  # seconds of a cold start; billed
 POLL = (0.02, 0.2)  # seconds until a visible message is fetched
 BATCHES = 5  # invocations at once that Lambda begins with for a standard queue
-MORE_BATCHES = 5.0  # further ones, for each second of backlog
+MORE_BATCHES = 5.0  # further invocations at once for each second of backlog
 HOPS = 16  # allowed invocations of one function in a chain of requests
 ASYNC = (1.0, 300.0)  # seconds until Lambda tries an asynchronous invocation again: the first time, and at most
 Handler = Callable[[dict[str, Any], object], Any]
@@ -63,7 +63,7 @@ class Container:
     platform: Platform
     made: dict[Any, Any] = field(default_factory=dict)
     ends: float = math.inf  # the second at which its present invocation times out
-    lineage: Lineage = field(default_factory=dict)  # of its present invocation
+    lineage: Lineage = field(default_factory=dict)  # the lineage of its present invocation
 
 
 class SimulatedFunction:

@@ -22,7 +22,7 @@ class Habits:
     """The behaviour of one member in the lobby and in the game. Times are seconds since they came there."""
 
     leaves: float | None = None  # closes the page of the lobby
-    beacon: float | None = 0.1  # from then until the beacon of the closed page is sent; None: it never is
+    beacon: float | None = 0.1  # from then until the closed page's beacon is sent; None: it is never sent
     back: float | None = None  # from then until they open the link again; None: never. 0 is a reload
     offline: tuple[float, float] | None = None  # when they lose the network in the lobby, and for how long
     tabs: int = 1
@@ -43,7 +43,7 @@ class SimulatedMember(SimulatedParticipant):
         self.asked_at: list[datetime] = []  # when they sent each request that is no beacon
         self.lobby: float | None = None  # the second at which they came to the lobby
         self.matched: float | None = None  # the second at which their page first left the state `lobby`
-        self.first_picture: float | None = None  # the second at which they saw it
+        self.first_picture: float | None = None  # the second at which they saw the first picture
         self.polls = 0  # polls of the lobby's page
         self._left = False
         self._dropped = False

@@ -35,7 +35,7 @@ class TimedTask(Task):
 
     born: float = 0.0  # when RunTask was called
     runs: float = 0.0  # when it is to be RUNNING
-    lag: float = 0.0  # seconds from then until EC2 shows its address
+    lag: float = 0.0  # seconds from RUNNING until EC2 shows its address
     began: float | None = None  # when it was RUNNING
     closed: float | None = None  # when its container ended
     guests: int = 0  # connections so far

@@ -141,8 +141,8 @@ def _question_about_class(module: Any) -> str:
 
 def _similar_methods(name: str, agent_class: type) -> list[str]:
     """Return the method of the class whose name is most similar to `name`, as a list; empty if none is similar."""
-    # `load` refuses the agent because of it, so the names must be more similar than in the questions of
-    # `protocol/similar.py`.
+    # `load` refuses an agent with such a method, so the names must be more similar than for a mere question
+    # (`protocol/similar.py`).
     members = {other: getattr(agent_class, other, None) for other in dir(agent_class) if not other.startswith("_")}
     others = [other for other, member in members.items() if callable(member)]
     return difflib.get_close_matches(name, set(others) - set(_METHODS), n=1, cutoff=0.88)
@@ -285,7 +285,7 @@ class AgentAdapter:
         the environment reports it: then the `action` in the info counts only if it differs from the human's. Without
         an agent.py it never counts.
         """
-        if self.reader.first_due:  # steps of an earlier server are taken again without pictures
+        if self.reader.first_due:  # no picture yet: an earlier server's steps are repeated without them
             self.render()
         result = self._agent.step(action) if self._unusual_step is None else self._unusual_step(action)
         outcome = read_step_result(result)
@@ -377,7 +377,7 @@ def _read_dict(result: Mapping[str, Any]) -> StepResult:
     extra = {key: value for key, value in result.items() if key not in _KNOWN_KEYS}
     if "done" in result and "terminated" in result:
         extra["done"] = result["done"]
-    if action is not None and outcome.action is None:  # no number of an action: record it as it is
+    if action is not None and outcome.action is None:  # it is not the number of an action: record it as it is
         extra["action"] = action
     return replace(outcome, extra=extra) if extra else outcome
 
@@ -394,7 +394,7 @@ def _outcome(
 ) -> StepResult:
     try:
         if isinstance(reward, np.ndarray):
-            reward = reward.item()  # of an array that holds one number
+            reward = reward.item()  # the number in an array that holds one
         number = float(reward if reward is not None else 0.0)
     except (TypeError, ValueError) as error:
         raise AgentError(f"step() returned a reward that is no number: {type(reward).__name__}") from error

@@ -34,8 +34,8 @@ MAX_VALUES = 1_000
 """The most values that one call of a callback may record."""
 MAX_NAME = 200
 """The most characters of the name of a recorded value."""
-_MAX_ERROR = 2_000  # characters of an error in the recording
-_MAX_WAITING = 100_000  # finished lines that wait to be written
+_MAX_ERROR = 2_000  # the most characters of an error in the recording
+_MAX_WAITING = 100_000  # the most finished lines that wait to be written
 
 Record = Callable[[str, Any], None]
 

@@ -127,7 +127,7 @@ class JointAdapter:
             for player in self.players
             if player not in self._ended
         }
-        if self._reader.first_due:  # steps of an earlier server are taken again without pictures
+        if self._reader.first_due:  # no picture yet: an earlier server's steps are repeated without them
             self.pictures()
         returned = _read(self._adapter.step_with(given))
         self._end(returned.terminated, self._terminated)
@@ -189,7 +189,7 @@ class JointAdapter:
         """Set `ended` for the players whose episode is over by `returned`. ALL means all who are still in the game."""
         values = returned.values()
         if returned.keys() == self._names and _FLAGS.issuperset(map(type, values)) and True not in values:
-            return  # over for none of them: the usual case
+            return  # the episode is over for none of them: the usual case
         for player, value in self._by_player("step", returned).items():
             ended[player] = ended[player] or _truth(value, "step() returned for %s, as its end,", player)
         if _truth(returned.get(ALL), "step() returned for %s", ALL):
@@ -267,7 +267,7 @@ class JointAdapter:
                 count = len(self.action_spaces[player])
                 if len(legal) != count:
                     raise AgentError(f"{ACTION_MASK} of {player} has {len(legal)} values; there are {count} actions")
-                if any(legal):  # PettingZoo's games give only zeros to a player who is not to act
+                if any(legal):  # all zeros is no mask: PettingZoo gives it to a player who is not to act
                     found[player] = legal
         return found
 

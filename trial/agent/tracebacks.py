@@ -59,7 +59,8 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 def without(private: Iterable[str], text: str) -> str:
     """Replace these ids of participants by `(participant)`, except ids that are numbers of up to five digits."""
-    # Small numbers are in every traceback. The longest id comes first, since another may be its beginning.
+    # Ids that are small numbers stay, since every traceback has such numbers. The longest id comes first, since a
+    # shorter one may be its beginning.
     ids = [each for each in sorted(private, key=len, reverse=True) if each and not (each.isdigit() and len(each) < 6)]
     if not ids:
         return text

@@ -59,7 +59,7 @@ class _Notifier:
 
     def __del__(self) -> None:
         if self._eventfd >= 0:
-            # Unused by now: a loop that reads it, and a thread that may notify, hold a reference to this object.
+            # Nothing uses it any more: a loop that reads it or a thread that may notify would keep this object alive.
             os.close(self._eventfd)
 
 
@@ -75,7 +75,7 @@ class Worker:
         self._thread.start()
         self._unfinished = 0  # functions that have not returned
         self._waiting: dict[_Job, None] = {}  # unfinished functions that are not late; a dict keeps the order
-        self._timer: asyncio.TimerHandle | None = None  # one for all functions: most return before their limit
+        self._timer: asyncio.TimerHandle | None = None  # one for all functions, since most return before their limit
         self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each result
         self._notifier: _Notifier | None = None
 
@@ -160,7 +160,7 @@ def _call(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
     """Call the function. Return its result and None, or None and its exception; for SystemExit, a RuntimeError."""
     try:
         return function(), None
-    except StopIteration as error:  # cannot be raised in a coroutine
+    except StopIteration as error:  # a coroutine cannot raise it
         failure = RuntimeError("StopIteration")
         failure.__cause__ = error
         return None, failure

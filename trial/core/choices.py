@@ -55,8 +55,8 @@ class Choices:
             repeats_last=config.input != "single",
         )
         self._advice: dict[str, int] = {}
-        # Most steps take one of these actions, so they are made once: by player and by the action's number, the action
-        # that no one has chosen, and the same action chosen by the human.
+        # By player and action number: the action as nobody's choice, and as the human's. Most steps take one of these,
+        # so they are made once.
         self._usual = {
             name: tuple(
                 (Action(index, action), Action(index, action, "human"))

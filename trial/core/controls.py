@@ -19,7 +19,7 @@ KEY = "\0"
 """In a project with `keys`: the prefix of a key's name, so that it differs from every action's name."""
 PRESSES = 4
 """With `input: single`, the most presses that may wait for a step; more are dropped."""
-_COMBINED = 4  # the most keys that are combined; people do not hold more on purpose
+_COMBINED = 4  # the most held keys that are combined to an action; people do not hold more on purpose
 
 
 class Controls:

@@ -45,7 +45,7 @@ class Window:
         while self._under_way and self._under_way[0][0] <= frame_id:
             sent_id, at, first = self._under_way.popleft()
             frames += first
-            if sent_id == frame_id and first:  # for rows, it may be the acknowledgement of an earlier message
+            if sent_id == frame_id and first:  # rows of one frame share its id, so they tell no round trip
                 self._round_trip = min(self._round_trip, now - at)
         if frames:
             self._together = frames > 1
@@ -60,7 +60,7 @@ class Window:
             return 0.0
         if under_way < min(2 + self._together + math.ceil(self._round_trip * rate), _WIDEST):
             return 0.0
-        return max(0.0, self._sent_at + 1.0 - now)  # one frame a second in any case: an acknowledgement may be lost
+        return max(0.0, self._sent_at + 1.0 - now)  # at least one frame a second, since an acknowledgement may be lost
 
     def stalled(self, now: float) -> bool:
         """Whether the client has stopped acknowledging frames, after it has acknowledged some."""

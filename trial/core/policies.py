@@ -51,11 +51,11 @@ class _Place:
         self.asked: int | None = None  # the `ask_id` of the question that is not answered yet
         self.asked_at = 0.0
         self.asked_after = 0  # the number of steps before the last question
-        self.due = False  # to be asked as soon as the player is to act
+        self.due = False  # whether it is to be asked as soon as the player is to act
         self.mask: Mask | None = None
         self.answer: int | None = None  # the action that no step has taken yet
-        self.failed = False  # since the last step
-        self.failures = 0  # in a row
+        self.failed = False  # whether it has failed since the last step
+        self.failures = 0  # the number of failures in a row
         self.last: int | None = None  # the last action that the policy chose
         self.late = 0  # the number of steps at which it was late
 
@@ -231,7 +231,8 @@ class Policies:
             return _idle(player, mask, "late")
         place.asked = None
         place.failures += 1
-        return _idle(player, mask, "late", place.asked_after)  # it has seen the observation, and may remember it
+        # The policy has seen the observation of that step, and may remember it.
+        return _idle(player, mask, "late", place.asked_after)
 
     def turn(self, to_act: frozenset[str], now: float) -> None:
         """Begin a turn: the time of programs runs from now on, and what they chose before does not count."""

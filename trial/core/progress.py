@@ -272,7 +272,7 @@ class TrialProgress:
         if fatal or self._failures >= FAILURES_ALLOWED:
             self._end_all("failed", "failed")
         elif self.on_break or (self.steps == 0 and self.needs_reset):
-            pass  # no episode is on; after a reset that failed, the same one is tried again
+            pass  # no episode runs; a reset that failed is tried again
         else:
             self._end_episode("failed")
 

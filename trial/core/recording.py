@@ -11,7 +11,7 @@ from trial.core.policies import FAILURES
 from trial.core.progress import TrialProgress
 
 _MAX_POLICY_FAILURES = 20  # the most different failures of policies that a trial reports
-_MAX_ERROR = 2000  # characters
+_MAX_ERROR = 2000  # the most characters of an error
 
 
 class Recordings:
@@ -22,7 +22,7 @@ class Recordings:
         self.is_open = False
         self.is_awaited = False
         """Whether the shell is opening a recording."""
-        self._reported: set[str] = set()  # failures of policies
+        self._reported: set[str] = set()  # the failures of policies that were reported
 
     def ask(self, progress: TrialProgress, seed: int) -> None:
         """Ask the shell to open a recording that begins with the present episode. `seed` is the episode's."""

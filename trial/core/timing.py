@@ -198,7 +198,7 @@ class Timing:
         if self._max_steps and progress.steps + 1 >= self._max_steps:
             return "maxSteps"
         left = self._episode.left(now)
-        half_frame = 0.5 / progress.frame_rate  # no other step is nearer to the limit
+        half_frame = 0.5 / progress.frame_rate  # the step less than half a frame before the limit is the nearest to it
         return "episodeSeconds" if left is not None and left <= half_frame else None
 
     # ---- what clients are told

@@ -149,7 +149,7 @@ class _Numbers(ArrayLayout):
             raise CodecError("The message is too short for its values.")
         if self._dtype.kind == "b" and max(data[at:end], default=0) > 1:
             raise CodecError("True and false are sent as 1 and 0.")
-        # A copy, since environments and agents may write into their arguments.
+        # A copy, since environments and agents may write into what they are given.
         batch = np.frombuffer(data, self._wire, count * self._elements, at).astype(self._dtype)
         batch = batch.reshape((count, *self._shape))
         if self._action:

@@ -21,8 +21,8 @@ from trial.gym.spaces import CodecError
 TIMEOUT = 90.0
 """The seconds in which an answer must come: more than a server's default limit, so that its sentence comes first."""
 
-_CLOSE_SECONDS = 2.0  # in which the server must answer a close
-_MAX_REPLY = 2**30  # bytes
+_CLOSE_SECONDS = 2.0  # seconds in which the server must answer a close
+_MAX_REPLY = 2**30  # the most bytes of a reply
 
 
 class RemoteError(RuntimeError):
@@ -61,7 +61,7 @@ class GymClient:
                 open_timeout=timeout,
                 close_timeout=_CLOSE_SECONDS,
                 proxy=None if _is_this_machine(address) else True,
-                ping_interval=None,  # a step of an environment may take longer than the answer to a ping may
+                ping_interval=None,  # no pings: a step may take longer than their answers may
             )
             self._connection: ClientConnection = opened.__enter__()  # until `close`
         except (OSError, InvalidHandshake, InvalidURI, TimeoutError, ValueError) as error:
@@ -85,7 +85,7 @@ class GymClient:
         """Send a binary request. Return its binary answer. Raises RemoteError, and ConnectionLost."""
         answer = self._exchange(message)
         if isinstance(answer, str):
-            self.read(_result, answer)  # raises the error that a text should be
+            self.read(_result, answer)  # a text should be an error, which this raises
             self._confused()
         return answer
 
@@ -115,7 +115,7 @@ class GymClient:
             except ConnectionClosed as error:
                 self._end(_reason(error))
             except BaseException:
-                self._end("a request was interrupted")  # the next request would get its answer
+                self._end("a request was interrupted")  # otherwise the next request would get its answer
                 raise
             raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 

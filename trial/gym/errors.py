@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-_LONGEST = 300  # characters of a sentence
+_LONGEST = 300  # the most characters of a sentence
 
 
 class GymError(Exception):

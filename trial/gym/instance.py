@@ -54,7 +54,7 @@ class Instance:
         self.env = env
         self.mode = mode
         self.seed = seed
-        self._ended = False  # the last step of `step_many` ended an episode
+        self._ended = False  # whether the last step of `step_many` ended an episode
         self._process = overrides.replaced("process_step")
         self._reset_takes_seed = _reset_takes_seed(env)
         if seed is not None:

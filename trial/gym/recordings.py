@@ -69,7 +69,7 @@ class Recorded:
         self._episode = 0
         self._steps = 0
         self._score = 0.0
-        self._open = False  # an episode has begun and has not ended
+        self._open = False  # whether an episode has begun and has not ended
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)

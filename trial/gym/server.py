@@ -33,8 +33,8 @@ from trial.gym.wakeup import Wakeup
 PATH = "/gym"
 _HANDSHAKE_SECONDS = 10.0
 _HANDSHAKE_BYTES = 16 * 1024  # the most bytes of a handshake
-_CLOSE_SECONDS = 2.0  # for a client to close its end
-_NO_FILES_SECONDS = 0.05  # to wait if no file can be opened
+_CLOSE_SECONDS = 2.0  # the time that a client has to close its end
+_NO_FILES_SECONDS = 0.05  # the pause if no file can be opened
 WITHOUT_HANDSHAKE = 100
 """The connections beyond the limit that are accepted, so that their handshakes are answered with a refusal."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -130,7 +130,7 @@ class GymServer:
             accepted, _ = self._listener.accept()
         except OSError as error:
             if error.errno in (errno.EMFILE, errno.ENFILE):
-                time.sleep(_NO_FILES_SECONDS)  # or else this would be tried again and again without a pause
+                time.sleep(_NO_FILES_SECONDS)  # without a pause, the loop would try this all the time
             return
         if len(self._connections) >= self._limits.connections + WITHOUT_HANDSHAKE:
             accepted.close()

@@ -36,8 +36,8 @@ from trial.gym.recordings import ConnectionRecorder
 from trial.gym.spaces import CodecError
 
 _read = json.JSONDecoder().decode
-_ENDS = ("false,{}]", "true,{}]")  # of an answer: done and info, by `terminated`
-_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")  # terminated, truncated and info
+_ENDS = ("false,{}]", "true,{}]")  # the end of an answer (done and info), by `terminated`
+_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")  # the same of a reply with terminated, truncated and info
 
 
 class HeldEnvironment:

@@ -31,7 +31,7 @@ from trial.gym.worker import main as work
 TICK_SECONDS = 0.25
 """The time between two looks at how long the workers have been busy or idle."""
 _GRACE_SECONDS = 2.0  # between the interruption of Python code and the end of the process
-_ROUNDS = 1000  # the most attempts of `_reap` to collect killed processes
+_ROUNDS = 1000  # the most attempts of `_reap` to collect the processes that it has killed
 _USAGE_SECONDS = 1.0  # between two looks at memory and processes
 
 _AWAY, _FAILED, _TRY_LATER = 1001, 1011, 1013  # close codes (RFC 6455, 7.4.1, and IANA's registry)
@@ -58,7 +58,7 @@ class Spawner:
         self._output = output
         self._record = record
         self._memory = memoryview(mmap.mmap(-1, 8 * limits.workers)).cast("d")
-        self._free = set(range(limits.workers))  # slots
+        self._free = set(range(limits.workers))  # the free slots
         self._workers: dict[int, _Watched] = {}  # by process id
         self._unsent = bytearray()  # messages for which the socket to the server has no room yet
         self._usage_checked = 0.0
@@ -159,7 +159,7 @@ class Spawner:
         ended = self._workers.pop(pid, None)
         if ended is None:
             return
-        with contextlib.suppress(OSError):  # its children in its group; on Linux the others become our children
+        with contextlib.suppress(OSError):  # kills its group; on Linux its other children become this process's
             os.killpg(pid, signal.SIGKILL)
         self._free.add(ended.slot)
         code, sentence = ended.verdict or (0, "")

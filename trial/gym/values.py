@@ -35,7 +35,7 @@ def to_text(value: Any) -> str:
     """Write `value` as JSON, numpy's types too. An object for which JSON has no form becomes the name of its class."""
     try:
         return _strict.encode(value)
-    except (TypeError, ValueError, RecursionError):  # infinities, keys that are no text, an object within itself
+    except (TypeError, ValueError, RecursionError):  # infinity, a key that is no text, an object within itself
         text = json.dumps(plain(value), separators=(",", ":"))
         return _SPECIAL.sub(_written, text)
 

@@ -94,7 +94,7 @@ class ExperimentAgent:
     def __init__(self, config: RemoteConfig) -> None:
         self._config = config
         self._raw: Any = None  # the experiment's environment
-        self._first = True  # the next picture is the episode's first
+        self._first = True  # whether the next picture is the episode's first
         self.game: RemoteGame | None = None
         self.env: Any = None
         self.several = False

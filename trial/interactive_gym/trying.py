@@ -18,7 +18,7 @@ from trial.interactive_gym.sources import Locate
 from trial.policies import onnx
 from trial.policies.policy import PolicyError
 
-_LONGEST = 300  # characters of an error
+_LONGEST = 300  # the most characters of an error
 
 
 def try_policies(config: RemoteConfig, look: Look, find: Locate, root: Path) -> Iterator[str]:

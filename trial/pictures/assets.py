@@ -173,7 +173,7 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
             with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
                 kind, size = _TYPES[str(picture.format)], picture.size
                 if max(size) <= MAX_SIDE:
-                    picture.load()  # the whole image, since a file that was cut off has a good beginning
+                    picture.load()  # all of it, since the beginning of a file that was cut off is good
     except Exception:  # noqa: BLE001 - Pillow raises many kinds for a broken file
         raise AssetError("is no PNG, JPEG or WebP image, or is broken") from None
     if max(size) > MAX_SIDE:

@@ -7,9 +7,9 @@ import numpy as np
 from trial.pictures import frames
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame
 
-_RETRY_AFTER = 16  # frames; then a coding that was too large is tried again
-_MEASURE_AFTER = 8  # JPEG sizes sent as lossless frames; then a JPEG is encoded again, to know its size
-_GROWN = 1.25  # if a JPEG is this many times as large as the one before, the lossless codings are tried again
+_RETRY_AFTER = 16  # after so many frames, a coding that was too large is tried again
+_MEASURE_AFTER = 8  # after lossless frames as large as so many JPEGs, a JPEG is made again, to know its size
+_GROWN = 1.25  # if a JPEG is this many times as large as the last one, the lossless codings are tried again
 _SAVINGS = 4  # once differences would have saved the bytes of so many raw pictures, a key frame is sent
 
 
@@ -41,12 +41,12 @@ class Encoder:
         self._shown: Frame | None = None  # the picture sent last, in any coding
         self._exact: Frame | None = None  # the last picture that the client has without loss
         self._exact_rows = 0  # the number of rows of `_shown` that the client has without loss
-        self._bytes_a_row = 0.0  # the size of such a row, as sent last
+        self._bytes_a_row = 0.0  # the bytes of such a row when rows were last sent
         self._jpeg = b""  # the last JPEG
         self._unmeasured = 0  # bytes of lossless frames since that JPEG
         self._jpegs_left = 0  # JPEGs to send until the lossless codings are tried again
         self._keys_first = 0  # frames for which a key frame is tried before a difference
-        self._saved = 0  # bytes that differences would have saved over JPEGs, since differences became small
+        self._saved = 0  # bytes by which differences have been smaller than the JPEGs sent instead, in a row
 
     @property
     def exact(self) -> bool:
@@ -147,7 +147,7 @@ class Encoder:
 
 def _whole(rows: Frame, base: Frame | None = None) -> bytes:
     body = frames.packed(rows, base)
-    assert body is not None  # there is no limit
+    assert body is not None  # it is only None for a limit, and none is given
     return body
 
 

@@ -107,7 +107,7 @@ class Decoder:
     def __init__(self) -> None:
         self._exact: Frame | None = None  # the last picture without loss
         self._shown: Frame | None = None
-        self._rows = 0  # the rows so far of a picture that comes as ROWS
+        self._rows = 0  # how many rows have come of a picture that comes as ROWS
 
     def decode(self, data: bytes) -> tuple[int, Frame]:
         """Decode a binary frame. Return its id, and the picture that is shown now.

@@ -13,7 +13,7 @@ from trial.pictures.assets import Assets
 from trial.pictures.picture import Picture, as_picture
 from trial.pictures.scene import Scene, images_of
 
-_MAX_SENTENCES = 100  # for `tell`: a long game may have ever new mistakes
+_MAX_SENTENCES = 100  # the most sentences for `tell`: a long game may have ever new mistakes
 
 
 class PictureReader:

@@ -124,7 +124,7 @@ class _SceneBuilder:
     def add_all(self, values: Sequence[Any]) -> None:
         """Add, change or remove objects. Most objects are as in the scene before, so these take the shortest way."""
         objects, before, known = self._objects, self._before.objects, self._before.given
-        not_permanent = before.keys() - self._before.permanent  # permanent ones need `_put`
+        not_permanent = before.keys() - self._before.permanent  # permanent objects need `_put`
         room = len(objects) + len(values) <= MAX_OBJECTS
         for index, value in enumerate(values):
             name = value.get("id") if room and type(value) is dict else None
@@ -196,7 +196,7 @@ class _SceneBuilder:
             return None
         try:
             return name if self._before.given.get(name) == given else None
-        except ValueError:  # an array of NumPy's
+        except ValueError:  # NumPy's arrays do not compare to True or False
             return None
 
     def _put(self, name: str, checked: CheckedObject, fields: Mapping[str, Any]) -> None:

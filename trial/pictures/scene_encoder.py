@@ -82,7 +82,7 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
     known, objects = before.objects, scene.objects
     changed: dict[str, Any] = {}
     in_place = list(known) == list(objects)
-    # Few objects have changed. A loop over all of them would take longer than the rest of this function.
+    # `compress` finds the few changed objects. A loop over all would take longer than the rest of this function.
     maybe = compress(objects.items(), map(is_not, known.values(), objects.values())) if in_place else objects.items()
     for name, each in maybe:
         earlier = known.get(name)

@@ -24,9 +24,9 @@ MAX_TWEEN = 10_000
 
 _MAX_ID = 100  # characters
 _FARTHEST = 1e6  # the largest coordinate or length
-_DIGITS = 4  # with them, a relative coordinate is exact to a tenth of a pixel in a picture 1,000 pixels wide
+_DIGITS = 4  # of a relative coordinate: exact to a tenth of a pixel in a picture that is 1,000 pixels wide
 _HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
-_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # the names of images are without it
+_EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # the names of images lack this ending
 _FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
 
 CheckedObject = Mapping[str, Any]
@@ -140,7 +140,7 @@ def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mappi
         return None
     table, fields = TYPES[earlier["type"]], {}
     for key, each in value.items() - given.items():
-        if key not in earlier or key not in table:  # it had its default, or it concerns other fields too
+        if key not in earlier or key not in table:  # the field had its default, or its value concerns other fields
             return None
         check, default = table[key]
         try:
@@ -155,7 +155,7 @@ def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mappi
 # ---- values
 
 
-_NO_NUMBERS = (bool, np.bool_, str, bytes)  # `float` takes them, too
+_NO_NUMBERS = (bool, np.bool_, str, bytes)  # `float` takes values of these types, too, but they are no numbers
 
 
 def _number(low: float, high: float) -> Callable[[Any], float]:

@@ -134,6 +134,6 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
 def _has_signature(function: Callable[..., Any]) -> bool:
     try:
         inspect.signature(function)
-    except (TypeError, ValueError):  # some functions written in C have none, and can be called all the same
+    except (TypeError, ValueError):  # some functions in C have no signature, and can be called all the same
         return False
     return True

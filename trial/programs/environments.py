@@ -36,7 +36,7 @@ MAX_REPLY = 8 * 2**20
 """The most bytes of observations in one answer."""
 REQUESTS_A_SECOND = 500
 """The most requests of all programs together that are passed on in a second. The others wait: the game comes first."""
-_MAX_ANSWER = 8 * MAX_REPLY  # bytes of a message: JSON takes several for each byte of an observation
+_MAX_ANSWER = 8 * MAX_REPLY  # bytes of a message: JSON needs several bytes for one byte of an observation
 _AHEAD_SECONDS = 0.02  # a request may be passed on this much sooner than an even rate allows
 _START_SECONDS = 60.0
 _CLOSE_SECONDS = 2.0
@@ -50,7 +50,7 @@ def prepare(websocket: ServerConnection, request: Request) -> Response | None:
     if form_of(request.path) is None:
         return websocket.respond(http.HTTPStatus.BAD_REQUEST, UNKNOWN_FORM)
     websocket.protocol.max_message_size = MAX_REQUEST
-    websocket.ping_timeout = None  # while requests wait for an environment, its pong waits behind them
+    websocket.ping_timeout = None  # while requests wait for an environment, the pong waits behind them
     return None
 
 

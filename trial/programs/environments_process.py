@@ -62,7 +62,7 @@ def main() -> int:
     sys.dont_write_bytecode = True  # for agent.py, as in trial/__main__.py
     linux.die_with_parent()
     os.nice(19)
-    with contextlib.suppress(OSError):  # Linux only; without memory, it kills the highest score first (proc(5))
+    with contextlib.suppress(OSError):  # Linux only: if memory runs out, it kills the highest score first (proc(5))
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     handing = HandedConnections(socket.socket(fileno=int(sys.argv[1])))
     return serve_from(handing, LIMITS, modules=["trial.programs.agent_environments"])

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
-TIMEOUT = 20.0  # seconds without a byte
+TIMEOUT = 20.0  # seconds for which a connection may be silent
 PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts after a transient error
 MAX_REPLY = 64 * 1024  # the most bytes that are read of an answer of `sign_requests`
 _TRANSIENT = (400, 403, 408, 409, 429)
@@ -170,7 +170,7 @@ def _send(request: Mapping[str, Any], body: bytes | BinaryIO | None, most: int |
         answer = connection.getresponse()
         content = answer.read() if most is None else answer.read(most)
     except (OSError, http.client.HTTPException) as error:
-        raise StoreError(f"no answer: {type(error).__name__}") from None  # its message may contain the address
+        raise StoreError(f"no answer: {type(error).__name__}") from None  # its message may name the presigned address
     finally:
         connection.close()
     return answer.status, content

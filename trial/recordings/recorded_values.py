@@ -104,7 +104,7 @@ class Values:
     def _array(self, value: Any) -> Any:
         if value.dtype.kind not in "biuf":
             return text_of(value)
-        if self._listed is None and value.size > self._longest:  # too large already if each number has one byte
+        if self._listed is None and value.size > self._longest:  # too large even if each number has one byte
             self.left_out += value.nbytes
             return None
         if self._listed is None or not isinstance(value, np.ndarray) or value.size <= self._listed:

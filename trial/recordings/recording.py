@@ -215,7 +215,7 @@ class Recording:
         disk.make_folder(path.parent)
         self._file = path.open("xb", buffering=0)
         self._synced = time.monotonic()
-        self._folder_synced = False  # before that, a power cut may lose the file's name
+        self._folder_synced = False  # until it is synced, a power cut may lose the file's name
         self._gzip = zlib.compressobj(6, zlib.DEFLATED, 31)
         self._lines: list[Line] = []
         self._packed = b""
@@ -269,7 +269,7 @@ class Recording:
         if not self._finished and (lines or flush_mode == zlib.Z_FINISH):
             self._packed += self._gzip.compress(b"".join(map(text_of_line, lines))) + self._gzip.flush(flush_mode)
             self._finished = flush_mode == zlib.Z_FINISH
-        while self._packed:  # it stays here until it is written, so that a full disk loses nothing
+        while self._packed:  # the bytes stay there until they are written, so a full disk loses nothing
             self._packed = self._packed[self._file.write(self._packed) :]
 
 

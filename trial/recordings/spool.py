@@ -20,7 +20,7 @@ from trial.settings import TrialSettings
 T = TypeVar("T")
 log = logging.getLogger("trial")
 
-_MAX_PAUSE = 20.0  # seconds
+_MAX_PAUSE = 20.0  # the longest pause, in seconds
 
 
 class Spool:

@@ -78,13 +78,13 @@ class Admission:
         if not before.assigned:
             await self._wait_for_assignment(websocket)
         settings = self._settings()
-        if before.warm_server:  # the server knows only now which of the tokens counts
+        if before.warm_server:  # only now the server knows which token counts
             check_access(websocket, hello, tokens_for(settings, hello.user_id), settings.plain_origins)
         if settings.session:
             check_member(websocket, hello.user_id, settings)
         elif hello.token is None:
             check_matches(hello.user_id, settings.user_id, OTHER_ID)
-            if hello.project_id is not None:  # the id may take part in two studies, whose servers have the same name
+            if hello.project_id is not None:  # a participant of two studies may have servers of one name
                 check_matches(hello.project_id, settings.project_id, OTHER_STUDY)
         else:
             check_matches(hello.user_id, settings.user_id)

@@ -16,7 +16,7 @@ from trial.agent.worker import Worker
 from trial.core.effects import TellMoved
 from trial.recordings.recording import Line
 
-_MOVES = 4  # if so many moves wait for a callback, a return cancels the leave before it
+_MOVES = 4  # if so many moves wait, a return removes the leave that still waits before it
 
 
 class TrialCallbacks:
@@ -43,7 +43,7 @@ class TrialCallbacks:
         self._loop = asyncio.get_running_loop()
         self._callbacks: Callbacks | None = None
         self._recorded = 0  # the number of lines that callbacks had recorded at the end of the last work that is done
-        self._moves: deque[TellMoved] = deque()  # a callback is being told of the first
+        self._moves: deque[TellMoved] = deque()  # those that are not told yet, the first of them being told now
 
     @property
     def busy(self) -> bool:

@@ -24,7 +24,7 @@ class Lifetime:
         self._saving = saving
         self._ended: asyncio.Future[str] = self._loop.create_future()
         self._timer: asyncio.TimerHandle | None = None
-        # The deadline is a time of the system's clock. The watchdog gets all times by the loop's monotonic clock.
+        # The deadline is a time of the system's clock. The watchdog's times are those of the loop's monotonic clock.
         deadline = None if settings.deadline is None else self._loop.time() + settings.deadline - time.time()
         self._watchdog = Watchdog(
             now=self._loop.time() if settings.assigned else None,

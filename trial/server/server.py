@@ -57,7 +57,7 @@ EXIT_MARGIN = 4.0
 TELL_SECONDS = 5.0
 """If a trial cannot begin, the server ends after so many seconds, and another server replaces it. Until then it tells
 clients that connect."""
-_TOLD_SECONDS = 0.3  # after it has told one client, the server ends within this time instead
+_TOLD_SECONDS = 0.3  # once one client is told, the server ends within this time instead
 _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tried again."
 
 

@@ -83,7 +83,7 @@ class Connection:
         self._sent = 0, False  # the id of the last picture, and whether it is large
         self._closing: tuple[int, str] | None = None  # the code, and the last message
         self._wake = asyncio.Event()
-        self._resting = False  # whether `run` waits for `_wake`
+        self._resting = False  # whether `run` waits for `_wake` to be set
         _limit_unsent(websocket)
 
     def send(self, text: str) -> None:
@@ -221,7 +221,7 @@ class Connection:
         self._resting = False
         self._wake.clear()
         if self._direct is not None:
-            await self._direct.drain()  # because `PlayerSocket.send_now` does not wait until the data are written
+            await self._direct.drain()  # `PlayerSocket.send_now` does not wait until the data are written
 
     def _wait(self, now: float) -> float:
         """Return the seconds until the next picture or rows may be sent; infinity if there are none."""

@@ -3,7 +3,7 @@ import { expectAnswer, send } from "./connection.js";
 import { hooks } from "./hooks.js";
 import { game } from "./state.js";
 
-const held = new Map(); // action -> the set of its keys and fingers
+const held = new Map(); // action -> the set of keys and fingers that hold it down
 
 export const isRunning = () => game.state === "playing" || game.state === "break";
 
@@ -25,7 +25,7 @@ export function release(action, source) {
   send({ ...hooks.means(action), held: false });
 }
 
-// `tell` is false when there is no server to tell.
+// Lets go of all actions. `tell` is false when there is no server to tell.
 export function releaseAll(tell = true) {
   if (tell) for (const action of held.keys()) send({ ...hooks.means(action), held: false });
   held.clear();

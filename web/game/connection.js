@@ -63,7 +63,8 @@ function receive(own, raw, hear) {
   hear(message);
 }
 
-// Every second picture is acknowledged, with the one before it, and each that comes ACK_WAIT or more after the last one.
+// Acknowledges a picture at once if the last one came ACK_WAIT or more before it. If pictures come quicker, every second one
+// is acknowledged, which stands for both.
 function acknowledge(own, id) {
   if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
   const now = performance.now();

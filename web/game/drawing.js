@@ -1,5 +1,5 @@
 // Draws the frames of one connection in order. They are unpacked in parallel, but drawn one after the other, since each may
-// be a difference to the one before. A lossy picture is left out if a later whole picture is ready to be drawn; the
+// be a difference to the previous one. A lossy picture is left out if a later whole picture is ready to be drawn; the
 // server learns that by the acknowledgement of the later one.
 import { drawPicture, drawPixels, forgetPicture } from "./canvas.js";
 import { JPEG, KEY } from "./frames.js";

@@ -40,7 +40,7 @@ async function inflateRows({ width, height, channels }, buffer) {
 }
 
 // Unpacks little more than the header says: a small message must not become a huge picture. A DecompressionStream unpacks
-// at once what it is given, so it gets each part when the one before has been read. (The bytes of a Blob would come from
+// at once what it is given, so it gets each part when the previous part has been read. (The bytes of a Blob would come from
 // another process, and each frame would wait for it.)
 export async function inflate(packed, least, most = least) {
   let at = 0;

@@ -11,7 +11,7 @@ import { isOver } from "./waiting.js";
 const ASK_EVERY = 2_000;
 const CONFIRM_AFTER = 500;
 const CLOCKS_DIFFER = 5; // seconds by which the clocks of the site's computers may differ
-const NO_ANSWER = 10_000; // ms of failed polls after which the page is looked at: it may say why
+const NO_ANSWER = 10_000; // after so many ms of failed polls the page is fetched: it may say why they fail
 const SOON_OVER = [60, 10]; // a screen reader says when so many seconds are left
 const CALL = "● "; // stands before the title of a hidden page every other second
 
@@ -34,7 +34,7 @@ async function waitForOthers() {
         announce(find("lobby-note").textContent);
       }
       lobby.state = state;
-      if (took > ASK_EVERY) await pause(took); // a site that is slow is asked less often
+      if (took > ASK_EVERY) await pause(took); // so a slow site is asked less often
     } else await proceed(state);
   }
 }

@@ -18,7 +18,7 @@ import { isOver, noteRestart, pollDelay, restartedFor, showClock, showWaiting } 
 
 const HANGS = TEXT.hangs;
 const SILENT = 4_500; // ms without a message in a game, although the server was asked
-const LONG = 20_000; // ms of trouble until the page says more
+const LONG = 20_000; // after so many ms of trouble the page says more about it
 const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may be lost, and a reload repeats it
 
 const title = document.title;

@@ -51,7 +51,7 @@ function fit() {
   return true;
 }
 
-// Draws each `[fields, ms]` over the ones before; `ms` is the age of the object. Returns whether an animation plays.
+// Draws each `[fields, ms]` over the earlier ones; `ms` is the age of the object. Returns whether an animation plays.
 export function paint(layers) {
   brush.setTransform(1, 0, 0, 1, 0, 0);
   brush.globalAlpha = 1;

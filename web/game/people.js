@@ -53,7 +53,7 @@ hooks.message.push((message) => {
   presence.heldUntil = inSeconds(message.heldFor);
   tellHasRead();
   coverPicture();
-  queueMicrotask(() => sayWhoseTurn(message)); // after turns.js, which says it without names
+  queueMicrotask(() => sayWhoseTurn(message)); // later than turns.js, which says whose turn it is without names
 });
 
 const inSeconds = (seconds) => (typeof seconds === "number" ? performance.now() + 1000 * seconds : null);
@@ -156,7 +156,7 @@ function showWhoReads() {
 
 function noteEnd(message) {
   if (!Object.hasOwn(ENDINGS, message.outcome)) return;
-  if (!message.episodes) delete message.score; // nothing was played
+  if (!message.episodes) delete message.score; // no game was played, so there is no score
   Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false, shown: READ });
   setText(find("leave-title"), TEXT.thanks);
   setTimeout(() => setText(find("announce"), overlays.over.note), 500); // after the announcement of every end

@@ -9,7 +9,7 @@ import { paint, place, prepare, putAway } from "./painter.js";
 const SCENE_HEADER = 5; // bytes: kind, id
 const MAX_SCENE = 16 * 2 ** 20; // bytes, unpacked; trial/pictures/scene.py makes none so large
 const TWEENED = ["x", "y", "angle", "width", "height", "radius", "alpha"];
-const DEFAULTS = { angle: 0, alpha: 1 }; // of fields that the server leaves out
+const DEFAULTS = { angle: 0, alpha: 1 }; // the values of fields that the server leaves out
 
 const utf8 = new TextDecoder();
 const things = new Map(); // id -> the object: its `fields`, and while it moves `from`, `began`, `ms`

@@ -15,7 +15,7 @@ const loaded = new Map(); // hash -> `{ bitmap, frames, animations }`, kept whil
 let table = []; // the server's list of images
 let arrived = new Map(); // number -> the bytes so far
 let asked = 0; // images with smaller numbers were asked for on this connection, or had come before
-let underWay = 0; // how many were asked for and have not come
+let underWay = 0; // how many images were asked for and have not come
 let pixelsLeft = 64 * 2 ** 20; // pixels of all images, of which a browser needs four bytes each
 const bar = make("progress", { max: 1, value: 0, hidden: true });
 bar.setAttribute("aria-label", TEXT.pictures);

@@ -13,9 +13,9 @@ from deploy.aws import concurrency, quotas
 from deploy.core.finding import Finding, bad, good, look
 from deploy.operate.doctor.check_context import CheckContext
 
-USUAL = 1.0  # vCPU of a server, if there is no project
-REQUESTS = 0.1  # executions of next_step for each waiting participant: one of 0.12 s every two seconds, rounded up
-IN_LOBBY = 0.15  # the same in a lobby, where an execution makes four more calls of S3, one after the other
+USUAL = 1.0  # vCPU of a server, if no project says how many
+REQUESTS = 0.1  # executions of next_step at once for each waiting participant: 0.12 s every two seconds, rounded up
+IN_LOBBY = 0.15  # the same in a lobby: its executions make four more calls of S3, one after the other
 HEADROOM = 4  # standard deviations above the mean: requests come at random, and all should find room
 
 

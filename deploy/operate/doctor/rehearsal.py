@@ -165,12 +165,12 @@ class Rehearsal:
         """Stop the server, and check that nothing of it is left."""
         stop = StopServer(self._project.id, self.user_id)
         self._progress("stopping it")
-        with contextlib.suppress(Exception):  # then this machine stops it, below
+        with contextlib.suppress(Exception):  # if this fails, this machine stops the server below
             self._platform.bus.publish(Topic.STOP, to_message(stop))
         end = self._clock() + LEAVE
         helped = False
         while (left := self._left()) and self._clock() < end:
-            if self._clock() > end - LEAVE / 2 and not helped:  # the functions have not stopped it
+            if self._clock() > end - LEAVE / 2 and not helped:  # the functions have not stopped the server
                 helped = True
                 self._stop_from_here(stop)
             self._progress(f"stopping it: {', '.join(left)}")

@@ -97,7 +97,7 @@ class GameStep:
         record = self._services.repository.server_of(visit.project.id, visit.user_id)
         self._request_if_overdue(visit, visit.user_id, record)
         if record is not None and not record.is_closed and record.lacks(visit.step.key):
-            stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # then another may be requested
+            stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # after that, another may be requested
             self._services.platform.bus.publish(Topic.STOP, to_message(stop))
         since = visit.progress.reached_at(visit.project, visit.step)
         return self._services.state(visit.project, visit.user_id, visit.step, record, since)

@@ -109,10 +109,10 @@ class Handovers:
 
     def _write_handover(self, project: Project, record: Server) -> None:
         own = ids.server_name(record.label, record.attempt)
-        # The group of a session is in the session's document.
+        # For a session the handover names no group: it is in the session's document.
         group = None if record.is_of_session else project.group(record.user_id)
         handover = Handover(record.user_id, group, own)
-        with contextlib.suppress(Conflict):  # written by an earlier delivery
+        with contextlib.suppress(Conflict):  # an earlier delivery of the message has written it
             self._platform.documents.create(handover_key(project.id, record.name), handover.to_json())
 
     def _undo_if_stopped(self, record: Server) -> None:

@@ -103,7 +103,7 @@ class Pools:
             except (ValueError, RecursionError) as error:
                 failure("a pool cannot be read", error, project=project_id)
                 unread.append(error)
-                self.request_adjustment(project_id)  # which replaces the document
+                self.request_adjustment(project_id)  # the adjustment replaces the document
                 continue
             pool = pool.without([warm_id for warm_id in pool.warm_servers if not ids.is_warm_id(warm_id)])
             known.update(pool.warm_servers)
