@@ -1,7 +1,7 @@
 """Measures the peak memory of a command in the command's own process.
 
 `ru_maxrss` of a child is at least the memory that its parent held at the fork. `VmHWM` in /proc/self/status begins anew
-with exec (proc_pid_status(5)), so the command's process reads that at its end.
+with exec (proc_pid_status(5)), so the command's process reads `VmHWM` at its end.
 
 `python -m bench.memory FILE MODULE ARGUMENTS` runs `python -m MODULE ARGUMENTS` and writes its peak memory in MB to
 FILE.

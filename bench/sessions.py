@@ -2,8 +2,8 @@
 
 `python -m bench sessions`. The figures are those of the simulation, not of AWS; its assumptions are printed beside
 them. Participants come within a minute, read two pages, meet in the lobby, and play in pairs or fours. A server for
-each session starts ahead, while they read. They wait from the lobby to the first picture. The yardstick is the time of
-AWS alone, where the next session gets the server that is ready first (`testing/simulation/aws_bound.py`).
+each session starts ahead, while they read. A wait begins in the lobby and ends with the first picture. The yardstick is
+the time of AWS alone, where the next session gets the server that is ready first (`testing/simulation/aws_bound.py`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Measures how long `apply` takes on the emulator: the first time, and again when there is nothing to change.
 
-Real AWS takes minutes for the first one; here our own code is measured, with what the emulator takes.
+Real AWS takes minutes for the first `apply`. Here the times are those of our own code and of the emulator.
 """
 
 from __future__ import annotations

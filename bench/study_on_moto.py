@@ -1,4 +1,4 @@
-"""The example study on moto with its real pages, and a participant who goes through it, whose AWS calls are counted."""
+"""The example study on moto with its real pages, and a participant who goes through it. The AWS calls are counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads converted recordings for datasets (`datasets.py`): the properties of each, and the rows of its episodes."""
+"""Reads converted recordings for datasets (`datasets.py`): their properties, and the rows of their episodes."""
 
 # ruff: noqa: PLC0415 - pyarrow is large, and imported when a recording is read
 

@@ -3,7 +3,7 @@
 All functions of an account share its concurrent executions in a Region: 1,000, and in many new accounts 10 (Lambda
 Developer Guide, "Lambda quotas"; AWS raises them on request, quota L-B99A9384). If none is free, API Gateway answers a
 participant's request with an error. Concurrency cannot be reserved for pages in a small account: Lambda refuses
-PutFunctionConcurrency unless 100 executions stay unreserved, in a smaller account all of them (API Reference,
+PutFunctionConcurrency unless 100 executions, or all if the account has fewer, stay unreserved (API Reference,
 PutFunctionConcurrency; "below its minimum value of [10]", awslabs/fhir-works-on-aws-deployment issue 691). So the
 queues are kept small instead, by `MaximumConcurrency` of their event source mappings, which takes 2 to 1,000 (API
 Reference, ScalingConfig).

@@ -1,6 +1,6 @@
 """Bytecode for the zips: on Lambda /var/task is read-only, so without it each cold start compiles every module again.
 
-The function's own version of Python compiles it, if this machine has that version; else the zips hold none. The
+The function's own version of Python compiles it, if this machine has that version; otherwise the zips hold none. The
 bytecode has unchecked hashes (PEP 552), so that Python does not compare it with the source or the source's time.
 """
 

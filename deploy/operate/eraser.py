@@ -8,7 +8,7 @@ participant's record leads to both, so it is deleted last.
 
 The documents (every version, delete marker and unfinished upload) are deleted only after the server's task has ended,
 since a trial that is told to stop still stores recordings. The server's presigned requests
-(`hippodrome/servers/signing.py`) stay valid for a short time after its end, so this waits until they are not. If the
+(`hippodrome/servers/signing.py`) stay valid for a short time after its end, and the eraser waits until then. If the
 participant or the server has stored something meanwhile, the next look finds it and the next round erases it.
 """
 

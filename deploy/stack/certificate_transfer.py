@@ -3,7 +3,7 @@
 `destroy` keeps the data bucket, with the certificate in it; the next installation has a bucket of its own. Ordering
 anew each time would meet Let's Encrypt's limit of five certificates for the same names in seven days (see
 `hippodrome.certificates.rules`). So this copies a certificate that is not due for renewal, and the key of the ACME
-account that renews it, from the kept bucket to the new one, with the administrator's rights. Both are private.
+account that renews it, from the kept bucket to the new one, with the administrator's rights. Both buckets are private.
 """
 
 from __future__ import annotations

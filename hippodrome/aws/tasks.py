@@ -6,7 +6,7 @@ Facts (ECS API Reference and Developer Guide, read November 2026):
   parameters is a ConflictException that names the tasks of the first call.
 * `startedBy` must be the only filter of ListTasks.
 * The overrides may have 8,192 characters, including those of the JSON syntax.
-* A capacity provider's `weight` is 0 by default, and one with 0 places no tasks.
+* A capacity provider's `weight` is 0 by default, and a provider of weight 0 places no tasks.
 * If Fargate has no capacity, RunTask says so in `failures` ("Capacity is unavailable at this time. Please try again
   later or in a different availability zone"). A quota is a ClientException ("You've reached the limit on the number of
   vCPUs you can run concurrently"). In new accounts a quota may also be in `failures` ("The requested CPU configuration

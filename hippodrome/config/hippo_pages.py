@@ -1,7 +1,7 @@
 """Finds the sites from which the pages of a HIPPO Gym project load images, media and frames.
 
 HIPPO's front end lets pages load them from any site. Hippodrome needs the sites in `project.allowedHosts`, which no
-configuration of HIPPO has. So the sites that its pages load from are allowed.
+configuration of HIPPO has. So the sites from which the project's pages load are added to that list.
 """
 
 from __future__ import annotations

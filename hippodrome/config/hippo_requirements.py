@@ -1,4 +1,4 @@
-"""Removes lines from the requirements.txt of a HIPPO Gym project that Hippodrome's image cannot install. Pure.
+"""Removes from a HIPPO Gym project's requirements.txt the lines that Hippodrome's image cannot install. Pure.
 
 HIPPO's images have Python 3.7, and its requirements.txt pins the packages of HIPPO's own programs, in versions that do
 not exist for the Python of Hippodrome's image. This image has the packages (requirements/trial.txt) or does not need

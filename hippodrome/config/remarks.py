@@ -1,4 +1,4 @@
-"""Makes remarks on a configuration without mistakes that may cost or do something that its researcher does not want."""
+"""Makes remarks on a configuration that has no mistake, but may cost or do what its researcher does not want."""
 
 from __future__ import annotations
 

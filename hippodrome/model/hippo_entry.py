@@ -1,4 +1,4 @@
-"""Turns an entry of `project_master_list.json` that HIPPO's `update_project_master_list` wrote into our form. Pure.
+"""Gives our form to the entries of `project_master_list.json` that HIPPO's function has written. Pure.
 
 HIPPO stores `id`, `name`, `live`, `researcher`, `team_members`, `ecsTask`, `steps` (a map), `events`, `maxRuntime` and
 `bucket` as they were sent (IRLL/HIPPO_Gym_AWS, `update_project_master_list.py`). Functions that show pages read such

@@ -1,7 +1,7 @@
 """The record of a server, and the transitions of its state. Pure: no clock, no I/O.
 
 States: (no record: queued) → starting → naming → ready → closed. The server's resources are removed before `closed` is
-written, so a function that fails before that is run again. Two are removed later: the timer, and the own cluster of a
+written: if a function fails before that, it is run again. Two are removed later: the timer, and the own cluster of a
 server that ended by itself (`servers/termination.py`).
 
 A *warm server* is started ahead of its participant (`warmServers`), under a warm id. When it is ready, it is either

@@ -2,7 +2,7 @@
 
 The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`) with a
 server's environment variables. With `warmServers` it is tried as on a warm server (`trial/server/assignment.py`): the
-participant becomes known only before the first `reset`, and code that reads them earlier gets a remark.
+participant becomes known only before the first `reset`, and code that asks for the participant earlier gets a remark.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The permissions that a call of an AWS API needs: actions on resources, with the values of the call's condition keys.
 
-Source: AWS's Service Authorization Reference (read November 2026). Where it is silent or wrong, the messages count with
-which AWS refuses calls: they name "*" (cdklabs/construct-hub pull request 1207) or `container-instance/{cluster}/*` for
+Source: AWS's Service Authorization Reference (read November 2026). Where it is silent or wrong, the messages of calls
+that AWS has refused count: they name "*" (cdklabs/construct-hub pull request 1207) or `container-instance/{cluster}/*` for
 ListTasks, so both must be allowed; `schedule/*/*` for ListSchedules, whatever its group; and the new cluster for
 CreateCluster.
 """

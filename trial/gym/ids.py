@@ -1,4 +1,4 @@
-"""Finds the present ids of environments whose ids Gymie's users wrote for gym 0.17.
+"""Finds the present id of an environment that a program of Gymie's users names by its id in gym 0.17.
 
 `trial/agent/old_gym` does the same for agents that import gym. That is a package of its own, which imports nothing of
 the trial, so it does not use this module.

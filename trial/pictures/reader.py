@@ -1,4 +1,4 @@
-"""Reads the pictures that `render()` returns, one after another: a scene refers to the scene before it. Pure."""
+"""Reads the pictures that `render()` returns, one after another: a scene refers to the previous scene. Pure."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Reads scenes: pictures that are described by objects instead of pixels (docs/objects.md). Pure.
 
-`scene_object.py` reads and checks one object. This module makes a scene of the objects, after the scene before it.
+`scene_object.py` reads and checks one object. This module makes a scene of the objects. It takes
+over from the previous scene what has not changed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Checks the quotas: whether AWS lets as many servers run as a study needs.
 
-A quota for too few servers is worth a look. It is bad only if no server at all could run.
+A quota that allows too few servers is worth a look. It is bad only if it allows none.
 """
 
 from __future__ import annotations

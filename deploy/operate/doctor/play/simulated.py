@@ -1,7 +1,7 @@
 """How many seconds AWS's stages take in the simulation. A rehearsal shows its own times beside these.
 
-The figures are those of `testing/simulation`, which no command imports: `tests/deploy/operate/test_play.py` compares
-them.
+The figures are those of `testing/simulation`, written here again, since no command imports that package.
+`tests/deploy/operate/test_play.py` compares the two.
 """
 
 from __future__ import annotations
