@@ -6,8 +6,8 @@ formed. The trial server reads it, and lets in only the members:
     {"schema": 1, "id": "s.…", "players": 2, "group": null, "formed": "…",
      "members": [{"userId": "…", "group": null, "seat": 0}, …]}
 
-The human players of the environment are numbered from 0, in the environment's order. A member plays the
-human player whose number is their seat. `trial.substitute` plays in the seats that no member has.
+The human players of the environment are numbered from 0, in the environment's order. A member plays the human
+player whose number is their seat. `trial.substitute` plays in the seats that no member has.
 """
 
 from __future__ import annotations

@@ -241,8 +241,8 @@ def _of(count: int, limit: int | None) -> str:
 def _servers(look: Snapshot) -> list[RenderableType]:
     if "servers" in look.problems:
         return []
-    states = Counter(str(server.state) for server in look.servers)
-    counts = ", ".join(f"{count:,} {state}" for state, count in sorted(states.items())) or "none"
+    by_state = Counter(str(server.state) for server in look.servers)
+    counts = ", ".join(f"{count:,} {state}" for state, count in sorted(by_state.items())) or "none"
     waiting = sum(server.is_warm_server for server in look.servers)
     counts += f", {waiting:,} of them warm" if waiting else ""
     sessions = sum(server.is_of_session for server in look.servers)

@@ -3,8 +3,8 @@
 The same checks run for a project folder (`folder`) and for a registration from outside (`registration`): first each
 value by itself (`each_value`, with `project_keys` and `protocol.trial`), then values against each other
 (`consistency`), and in a folder the step files (`step_files`). A value with a mistake is left out of the later checks,
-so that all mistakes are reported at once. A project without mistakes becomes a `Config`. PyYAML is
-imported (in `yaml_file`) only when a project folder is read.
+so that all mistakes are reported at once. A project without mistakes becomes a `Config`. PyYAML is imported
+(in `yaml_file`) only when a project folder is read.
 """
 
 from hippodrome.config.config import Config, StepFiles

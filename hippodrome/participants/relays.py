@@ -112,9 +112,8 @@ class Relays:
         self._authorize(project, user_id, form, record)
         if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
-        if (
-            record is None or record.is_closed or record.is_of_session
-        ):  # the participant leaves the lobby or the session
+        if record is None or record.is_closed or record.is_of_session:
+            # The participant leaves the lobby or the session.
             message, name = StopServer(project.id, user_id), ids.server_name(ids.server_label(project.id, user_id), 1)
         else:
             message, name = StopServer(project.id, user_id, record.attempt), record.name
