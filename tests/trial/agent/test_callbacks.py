@@ -393,7 +393,7 @@ async def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, gri
         "    def on_tick(self, session):\n        raise ValueError('no such thing')\n"
         "    def on_episode_end(self, session):\n        while True: time.sleep(1)\n"
     )
-    server = launch(agent, {**TRIAL, "callbackSeconds": 0.05})
+    server = launch(agent, {**TRIAL, "callbackSeconds": 2})  # which on_tick does not need, even on a busy machine
     await play_to_the_end(server, open_client)
     assert server.wait() == 0
     assert server.answer()["answers"]["outcome"] == "finished"
@@ -407,9 +407,9 @@ async def test_a_callback_that_hangs_or_raises_does_not_end_the_game(launch, gri
 async def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_again_and_again(
     launch, grid, open_client
 ):
-    slow = "\nimport time\nclass Agent(Agent):\n    def on_join(self, session, player):\n        time.sleep(0.4)\n"
+    slow = "\nimport time\nclass Agent(Agent):\n    def on_join(self, session, player):\n        time.sleep(2)\n"
     agent = grid(20) + slow + "        return True\n    on_leave = on_return = on_join\n"
-    server = launch(agent, {**TRIAL, "maxEpisodes": 1})
+    server = launch(agent, {**TRIAL, "maxEpisodes": 1, "callbackSeconds": 10})
     for _ in range(40):
         async with open_client(server.address) as client:
             await client.hello()
@@ -418,7 +418,7 @@ async def test_slow_callbacks_do_not_hold_up_the_game_of_a_page_that_connects_ag
         await client.start()
         began = time.monotonic()
         await client.until(lambda: client.done)
-        assert time.monotonic() - began < 10, "81 calls would take half a minute"
+        assert time.monotonic() - began < 60, "81 calls would take more than two minutes"
     assert server.wait() == 0
     (found,) = server.recordings().values()
     moves = [line["name"] for line in found if line["kind"] == "callback"]
