@@ -46,7 +46,7 @@ def _of_module(module: str) -> str:
         return f"; {_OLD[package]}"
     if module != package and util.find_spec(package):
         return f"; the {package} that is installed does not have it"
-    return f"; install its package: {_PIP} install {_PACKAGES.get(package, package)}"
+    return f"; name its package in a requirements.txt beside agent.py: {_PACKAGES.get(package, package)}"
 
 
 def _of_gym(name: str) -> str:

@@ -263,7 +263,7 @@ def test_the_error_of_an_agent_that_cannot_start_comes_with_the_advice_of_make_c
     here.run()
     Walker(here.url, "quick", "P1").page()
     here.wait_for_text(
-        r"agent\.py:1: ModuleNotFoundError: No module named 'cv2_of_nobody'; install its package: \.venv/bin/pip"
+        r"agent\.py:1: ModuleNotFoundError: No module named 'cv2_of_nobody'; name its package in a requirements\.txt"
     )
 
 

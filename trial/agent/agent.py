@@ -361,7 +361,8 @@ def read_step_result(result: Any) -> StepResult:
         return _outcome(observation, reward, *_done(done, info), info)
     if isinstance(result, bool | np.bool_):  # later agents of HIPPO return `done` alone
         return StepResult(None, 0.0, bool(result), False)
-    raise AgentError("step() must return (observation, reward, terminated, truncated, info) or a dict of these")
+    wanted = "step() must return (observation, reward, terminated, truncated, info) or a dict of these"
+    raise AgentError(f"{wanted}; it returned nothing" if result is None else wanted)
 
 
 def _read_dict(result: Mapping[str, Any]) -> StepResult:

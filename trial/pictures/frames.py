@@ -47,7 +47,8 @@ class FrameError(ValueError):
 def as_frame(picture: Any) -> Frame:
     """Copy the pixels that `render()` returned into a contiguous array. Raises FrameError if they are no picture."""
     if picture is None:
-        raise FrameError("render() returned nothing; make the environment with render_mode='rgb_array'")
+        why = "is a `return` missing? Gymnasium's environments need render_mode='rgb_array'"
+        raise FrameError(f"render() returned nothing: {why}")
     array = np.asarray(picture)
     if array.ndim == 2:
         array = array[:, :, np.newaxis]

@@ -12,7 +12,7 @@ from local.check.remedies import remedy
 
 OLD_GYM = Path(__file__).resolve().parents[3] / "trial/agent/old_gym"
 STAND_IN = "; what stands in for Gym here has no {}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"
-PIP = "; install its package: .venv/bin/pip install {}"
+PACKAGE = "; name its package in a requirements.txt beside agent.py: {}"
 
 
 @pytest.fixture(autouse=True)
@@ -26,8 +26,8 @@ def without_gym(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("code", "advice"),
     [
-        ("import no_such_thing", PIP.format("no_such_thing")),
-        ("import no_such_thing.part", PIP.format("no_such_thing")),
+        ("import no_such_thing", PACKAGE.format("no_such_thing")),
+        ("import no_such_thing.part", PACKAGE.format("no_such_thing")),
         ("import stable_baselines", "; it needs TensorFlow 1 and Python 3.7: use stable_baselines3"),
         ("import atari_py", "; ale_py stands in for it"),
         ("import numpy.no_such_part", "; the numpy that is installed does not have it"),
@@ -45,7 +45,7 @@ def test_the_advice_fits_the_error(code: str, advice: str) -> None:
 
 @pytest.mark.parametrize(("module", "package"), [("sklearn", "scikit-learn"), ("cv2", "opencv-python-headless")])
 def test_the_advice_names_the_package_and_not_the_module(module: str, package: str) -> None:
-    assert remedy("ModuleNotFoundError", f"ModuleNotFoundError: No module named '{module}'") == PIP.format(package)
+    assert remedy("ModuleNotFoundError", f"ModuleNotFoundError: No module named '{module}'") == PACKAGE.format(package)
 
 
 def test_gymnasium_names_its_packages_itself() -> None:
