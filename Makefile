@@ -175,7 +175,7 @@ $(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas constraint
 	@touch $@
 
 $(VENV)/deploy: $(REQUIREMENTS)/deploy.txt $(VENV)/local
-	@echo 'Installing what the command line for AWS needs (once) …'
+	@echo 'Installing what tables of data and AWS need (once; a minute or two) …'
 	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/deploy.txt $(NOT_INSTALLED)
 	@touch $@
 
