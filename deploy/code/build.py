@@ -100,7 +100,10 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
     for owner, wheel in wheels.wheels(distributions).items():
         pruned = _pruned(wheel, third_party, PRUNED[owner]) if owner in PRUNED else wheel.members
         if twice := set(pruned) & set(members):
-            raise Problem(f"{owner} brings {min(twice)}, which is there already.")
+            raise Problem(
+                f"The zip of lambdas/{name}.py would have two files {min(twice)}; one of them is of {owner}.",
+                "Rename a module of this project, or leave one of the two packages out of requirements/lambdas.txt.",
+            )
         members |= pruned
     return Function(name, tuple(members[key] for key in sorted(members)), tuple(sorted(distributions)), python)
 
@@ -262,7 +265,9 @@ def _parse(text: str, where: str) -> ast.Module:
     try:
         return ast.parse(text)
     except SyntaxError as error:
-        raise Problem(f"{where} is not Python: line {error.lineno}: {error.msg}.") from None
+        raise Problem(
+            f"{where} is not Python: line {error.lineno}: {error.msg}.", "Correct it, and run the same command again."
+        ) from None
 
 
 def _module(path: str) -> str:

@@ -43,6 +43,7 @@ PINS = ROOT / "requirements" / "packages.txt"
 IN_RUNTIME = {"boto3", "botocore", "jmespath", "python-dateutil", "s3transfer", "six", "urllib3"}
 
 _GLIBC = range(34, 16, -1)  # Lambda's python3.13 runs on Amazon Linux 2023, which has glibc 2.34
+_ANEW = "Run `.venv/bin/python -m pip cache purge`, then the same command again: it downloads the file anew."
 _LEAVE_OUT = re.compile(  # not needed to run: stubs, C sources, tests, metadata
     r"(^|/)(tests?|__pycache__)/|\.(pyi|c|h|pyx|pxd|cpp|rs|pyc)$|(^|/)py\.typed$|^[^/]+\.dist-info/|\.libs/.*\.debug$"
 )
@@ -177,9 +178,9 @@ class Wheel:
                 if name.endswith(("/", ".dist-info/RECORD", ".dist-info/RECORD.jws", ".dist-info/RECORD.p7s")):
                     continue
                 if not digest or hashlib.sha256(self._zip.read(name)).hexdigest() != digest:
-                    raise Problem(f"{self.path.name} is damaged: {name} is not what its RECORD says.")
+                    raise Problem(f"{self.path.name} is damaged: {name} is not what its RECORD says.", _ANEW)
         except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-            raise Problem(f"{self.path.name} is not a sound wheel: {error}.") from None
+            raise Problem(f"{self.path.name} is not a sound wheel: {error}.", _ANEW) from None
 
     @cached_property
     def _zip(self) -> zipfile.ZipFile:
@@ -293,7 +294,10 @@ class WheelCache:
             wheels = {_distribution(path): path for path in Path(coming).glob("*.whl")}
             for pin in pins:
                 if pin.name not in wheels:
-                    raise Problem(f"pip did not bring a wheel of {pin} for {self.target}.")
+                    raise Problem(
+                        f"pip did not bring a wheel of {pin} for {self.target}.",
+                        "Pin a version in requirements/ that has one, and run `python -m deploy.code.packages`.",
+                    )
                 self._take_in(pin, wheels[pin.name])
 
     def _take_in(self, pin: Pin, path: Path) -> None:

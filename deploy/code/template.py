@@ -16,6 +16,7 @@ from deploy.code.packages import ROOT
 
 PATH = ROOT / "infra" / "template.yml"
 
+_CORRECT = "Correct infra/template.yml, or take it from the repository again."
 _KEY = re.compile(r"(\bS3Key:\s*)([\"']?)([A-Za-z0-9_]+)\.zip\2(?=[\s,}]|$)")
 
 
@@ -31,7 +32,10 @@ class Template:
         try:
             return cls(path.read_text(encoding="utf-8"))
         except OSError as error:
-            raise Problem(f"{path.name} cannot be read: {error.strerror}.") from None
+            raise Problem(
+                f"{path.name} cannot be read: {error.strerror}.",
+                "Look at the file's permissions, or take it from the repository again.",
+            ) from None
 
     def with_code(self, functions: Iterable[Function]) -> Template:
         """Replace each `<function>.zip` in the template by the key of its zip, and return the result.
@@ -48,7 +52,9 @@ class Template:
 
         text = _KEY.sub(key, self.text)
         if missing:
-            raise Problem(f"The template names functions that lambdas/ does not have: {', '.join(sorted(missing))}.")
+            raise Problem(
+                f"The template names functions that lambdas/ does not have: {', '.join(sorted(missing))}.", _CORRECT
+            )
         return Template(text)
 
     @property
@@ -65,9 +71,9 @@ class Template:
         try:
             found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:
-            raise Problem(f"The template is not YAML: {error}.") from None
+            raise Problem(f"The template is not YAML: {error}.", _CORRECT) from None
         if not isinstance(found, dict) or "Resources" not in found:
-            raise Problem("The template has no Resources.")
+            raise Problem("The template has no Resources.", _CORRECT)
         return found
 
     @property

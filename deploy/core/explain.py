@@ -52,7 +52,11 @@ def problem_from(error: BaseException) -> Problem | None:
     if isinstance(error, (boto.HTTPClientError, boto.EndpointConnectionError)):
         return Problem("AWS could not be reached.", "Check the network and the region's name, and try again.")
     if isinstance(error, boto.BotoCoreError):
-        return Problem(f"The AWS library refused: {error}.")
+        return Problem(
+            f"The AWS library refused: {error}.",
+            "If that names an option or a setting of ~/.aws/config, correct it. Otherwise run the command again with "
+            "HIPPODROME_DEBUG=1 and send us what it prints.",
+        )
     if isinstance(error, ModuleNotFoundError):
         return Problem(
             f"The package {error.name} is not installed.",

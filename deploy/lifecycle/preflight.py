@@ -205,7 +205,11 @@ def _authorities(prepared: Prepared) -> Iterator[Finding]:
     for issuer, name, authorities in wanted:
         found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
         if not found.certain:
-            yield look("CAA", f"DNS could not be asked which authorities may issue certificates for {name}.")
+            yield look(
+                "CAA",
+                f"DNS could not be asked which authorities may issue certificates for {name}.",
+                "If the domain has no CAA records, nothing needs to be done. Otherwise try again on another network.",
+            )
         elif forbidding := found.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):
             place = root if root.endswith(f".{found.where}") else found.where
             records = ", ".join(f'0 {tag} "{value}"' for tag, value in forbidding)

@@ -37,7 +37,9 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
     if project not in present:
         raise Problem(
             f"The bucket {name} holds nothing of participants of {project}.",
-            f"It holds those of {', '.join(present)}: name one with --project." if present else "It holds none at all.",
+            f"It holds those of {', '.join(present)}: name one with --project."
+            if present
+            else "It holds no participant's data at all: check the bucket's name.",
         )
     if not listed:
         screen.warning(

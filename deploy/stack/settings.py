@@ -102,7 +102,10 @@ class StackSettings:
             value = getattr(self, setting)
             if value is not None:
                 if parameter not in defaults:
-                    raise Problem(f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.")
+                    raise Problem(
+                        f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.",
+                        "Leave that option out, or take infra/template.yml from the repository again.",
+                    )
                 found[parameter] = str(value).strip()
         if found.get("SiteHost") and found.get("SiteHost") == found.get("ServersHost"):
             raise Problem(
@@ -123,7 +126,10 @@ class StackSettings:
             found |= _zones(account, found, previous, subnets)
         missing = sorted(set(defaults) - set(found))
         if missing:
-            raise Problem(f"The template wants values that no option gives: {', '.join(missing)}.")
+            raise Problem(
+                f"The template wants values that no option gives: {', '.join(missing)}.",
+                "Give these parameters a Default in infra/template.yml, or take the file from the repository again.",
+            )
         return {name: value for name, value in found.items() if name in defaults}
 
     def _addresses(self, account: Account, previous: Mapping[str, str]) -> dict[str, str]:
@@ -137,7 +143,10 @@ class StackSettings:
         if self.zone:
             zone = read_zone(account, self.zone)
             if not zone.holds(domain):
-                raise Problem(f"The hosted zone {self.zone} is of {zone.domain}, which {domain} is not below.")
+                raise Problem(
+                    f"The hosted zone {self.zone} is of {zone.domain}, and {domain} is not below that.",
+                    "Give the zone of your domain, or leave --zone out: the command finds the zone.",
+                )
             return {"RootDomain": domain, "HostedZoneId": zone.id}
         if domain == before and previous.get("HostedZoneId"):
             return {"RootDomain": domain, "HostedZoneId": previous["HostedZoneId"]}

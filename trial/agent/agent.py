@@ -125,7 +125,9 @@ def load(folder: Path) -> Any:
     if len(missing) == len(_METHODS):
         raise AgentError(f"{path.name} has no class Agent{_question_about_class(module)}")
     if missing:
-        raise AgentError(f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}")
+        raise AgentError(
+            f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}; write these, or a class"
+        )
     return module
 
 

@@ -51,7 +51,10 @@ def made_by_module(game: str) -> Any:
         raise PlayersUnknown(f"there is no module {game}; its package has {', '.join(others)}") from None
     make = getattr(module, "parallel_env", None) or getattr(module, "env", None)
     if not callable(make):
-        raise PlayersUnknown(f"the module {game} has neither parallel_env() nor env()")
+        raise PlayersUnknown(
+            f"the module {game} has neither parallel_env() nor env(); name the module of a game, or make the "
+            "environment in agent.py"
+        )
     return playable(make(render_mode="rgb_array"))
 
 
@@ -115,7 +118,9 @@ def players_of(owner: Any, keys: Sequence[Any], configured: Sequence[str], *, st
     """
     by_name = {str(key): key for key in keys}
     if len(by_name) != len(keys):
-        raise PlayersUnknown(f"two players have the same name: {', '.join(map(str, keys))}")
+        raise PlayersUnknown(
+            f"two players have the same name: {', '.join(map(str, keys))}; their keys must differ as text, too"
+        )
     spaces = {name: _space(owner, "action_space", key) for name, key in by_name.items()}
     return Players(
         names=tuple(by_name),

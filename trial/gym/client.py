@@ -22,6 +22,7 @@ TIMEOUT = 90.0
 """The seconds in which an answer must come: more than a server's default limit, so that its sentence comes first."""
 
 _CLOSE_SECONDS = 2.0  # seconds in which the server must answer a close
+_UNFIT = "If it is a server of another version of Hippodrome, use the same version on both sides."
 _MAX_REPLY = 2**30  # the most bytes of a reply
 
 
@@ -69,7 +70,10 @@ class GymClient:
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
         if self._connection.subprotocol != SUBPROTOCOL:
             self._end(f"it does not speak {SUBPROTOCOL}")
-            raise ConnectionLost(f"The server at {self.url} does not speak {SUBPROTOCOL}.")
+            raise ConnectionLost(
+                f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do, and those "
+                f"of a study with `gym: environments`. {_UNFIT}"
+            )
 
     @property
     def closed(self) -> bool:
@@ -95,7 +99,9 @@ class GymClient:
             return reader(*arguments)
         except CodecError as error:
             self._end(str(error))
-            raise ConnectionLost(f"The answer of {self.url} cannot be read: {error}") from error
+            raise ConnectionLost(
+                f"The answer of {self.url} cannot be read: {str(error).rstrip('.')}. {_UNFIT}"
+            ) from error
 
     def close(self) -> None:
         """Close the connection. The server then closes its environments. May be called again."""
@@ -122,7 +128,7 @@ class GymClient:
     def _confused(self) -> NoReturn:
         """End the connection, and raise ConnectionLost: the server's answer does not fit the request."""
         self._end("it answered something else than what it was asked")
-        raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
+        raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}. {_UNFIT}")
 
     def _end(self, why: str) -> None:
         if self._over is None:

@@ -132,7 +132,10 @@ def _walk(root: Path, folder: Path, ignored: Ignore) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
     except OSError as error:
-        raise Problem(f"The folder {folder} cannot be read: {error.strerror}.") from None
+        raise Problem(
+            f"The folder {folder} cannot be read: {error.strerror}.",
+            "Change its permissions, or name it in .dockerignore if the agent does not need it.",
+        ) from None
     for path in entries:
         name = path.relative_to(root).as_posix()
         if _never_included(root, path) or (ignored(name) and not (path.is_dir() and ignored.may_take_back)):
