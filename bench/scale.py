@@ -36,7 +36,7 @@ from testing.simulation.tasks import ADDRESSES
 from testing.simulation.world import PROJECT, TIMEOUTS, WIRES, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
-SEEDS = range(2026, 2044)  # of the crowds whose waits are judged; with only six, slow spans change the p95 by 3 %
+SEEDS = range(2026, 2044)  # seeds of the crowds whose waits are judged; with only six, slow spans change the p95 by 3 %
 SMALL, SMALL_WITHIN = 250, 600.0
 MANY, MANY_WITHIN = 10_000, 900.0
 HOUR = 3600.0  # seconds for which the MANY participants play

@@ -59,8 +59,8 @@ class MeasuredStudy:
     def __init__(self, world: MotoWorld, registration: Mapping[str, Any] | None = None) -> None:
         self.world = world
         self.platform = AgingPlatform(world.env)
-        self.calls: dict[str, list[ApiCall]] = {}  # by function
-        self._caches: dict[str, dict[Any, Any]] = {}  # by function
+        self.calls: dict[str, list[ApiCall]] = {}  # by function: the AWS calls that it made
+        self._caches: dict[str, dict[Any, Any]] = {}  # by function: what its process has cached
         installed.use(self.platform)
         project = dict(registration) if registration else read_project(ROOT).registration()
         self.id = str(project["id"])

@@ -100,7 +100,7 @@ class TogetherLoad:
     """The figures of one server: what it delivered and cost. `cpu` is in ms per tick, `memory` in MB."""
 
     shares: list[float]  # by member: the share of the ticks that were due
-    bytes_a_tick: float  # to each member
+    bytes_a_tick: float  # the bytes sent to each member
     cpu: float
     memory: float
 

@@ -60,9 +60,9 @@ class Came:
 
     world: SimulatedWorld
     took_warm_server: float  # the share of the participants who got a warm server
-    to_shown: list[float]  # from the answer that starts the server until the page has its address
-    at_game: list[float]  # from the first view of the game page until the page has the address
-    calls: float  # of AWS, per participant
+    to_shown: list[float]  # seconds from the answer that starts the server until the page has its address
+    at_game: list[float]  # seconds from the first view of the game page until the page has the address
+    calls: float  # AWS calls per participant
 
 
 def simulated(warm: int, arrivals: Sequence[float], closes: float = CLOSES, ends: float = ENDS) -> Came:

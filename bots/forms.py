@@ -32,8 +32,8 @@ class Control:
 
     kind: str
     attributes: Mapping[str, str]
-    options: list[SelectOption] = field(default_factory=list)  # of a select
-    text: str = ""  # of a textarea
+    options: list[SelectOption] = field(default_factory=list)  # the options of a select
+    text: str = ""  # the text of a textarea
 
     @property
     def name(self) -> str:

@@ -88,7 +88,7 @@ class GameConnection:
         self._first = True  # whether no frame has come yet
         self._last_frame: float | None = None  # time.monotonic() of the last frame while playing
         self._may_stop = False
-        self._break_seconds = 0.0  # of breaks, as the server has announced them: nothing is played then
+        self._break_seconds = 0.0  # seconds of breaks that the server has announced: nothing is played then
 
     async def run(self, hello: dict[str, Any]) -> None:
         """Play until the server closes.

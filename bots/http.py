@@ -12,7 +12,7 @@ import h11
 
 from bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
 
-ASK_SECONDS = 20.0  # from a request to the end of its response
+ASK_SECONDS = 20.0  # the most seconds from a request to the end of its response
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ class PlayedStep:
     outcome: str = ""  # `outcome` of the server's last message in a game of several participants, or "unmatched"
     frames: int = 0  # frames received, without the first of each connection
     frame_rate: int = 0  # the frame rate that the server announced
-    seconds: float = 0.0  # of playing: the times between two frames, added up
+    seconds: float = 0.0  # seconds of playing: the times between two frames, added up
     timed_frames: int = 0  # received in `seconds`
-    bytes: int = 0  # of frames, scenes and images
+    bytes: int = 0  # the bytes of frames, scenes and images
     score: float = 0
     episodes: int = 0
     done: bool = False
@@ -38,10 +38,10 @@ class BotReport:
     user_id: str
     stage: str = "waits for its turn"  # what the bot is doing now
     finished: bool = False  # the bot came to the study's last page
-    answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step
+    answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step: the fields that it has sent
     plays: list[PlayedStep] = field(default_factory=list)
     final_page: str = ""  # the HTML of the last page
     code: str | None = None  # the completion code on the last page
     errors: list[str] = field(default_factory=list)
-    troubles: list[str] = field(default_factory=list)  # such as lost connections, after which the bot went on
+    troubles: list[str] = field(default_factory=list)  # troubles such as lost connections, after which the bot went on
     seconds: float = 0.0  # from the bot's start to its end

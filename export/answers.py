@@ -34,10 +34,10 @@ _MAX_COUNTED = 50_000  # different fields that are counted at once
 class Field:
     """The answers to one field: their number and their kinds."""
 
-    place: int  # in the order in which fields were first read
+    place: int  # the field's place in the order in which fields were first read
     count: int = 0
     kinds: set[str] = field(default_factory=set)
-    page_kind: FieldKind = FieldKind.TEXT  # by the field's page
+    page_kind: FieldKind = FieldKind.TEXT  # the kind that the field's page tells
 
     @property
     def type(self) -> str:

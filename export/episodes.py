@@ -19,11 +19,11 @@ class Spec(NamedTuple):
 
     step: str
     actions: tuple[str, ...]
-    dtype: str  # of the observations; "" if there are none
-    shape: tuple[int, ...]  # of an observation
+    dtype: str  # the type of the observations; "" if there are none
+    shape: tuple[int, ...]  # the shape of an observation
     players: tuple[str, ...] = ()  # all players, if there are several
     human: str = ""  # the player whose steps these are, if there are several
-    together: bool = False  # with other participants, in a session
+    together: bool = False  # whether the participant played with others, in a session
 
 
 def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:

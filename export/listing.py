@@ -21,8 +21,8 @@ class Wanted(NamedTuple):
     """The data that a run fetches."""
 
     recordings: bool = True
-    raw: bool = False  # also the files of the source, unchanged
-    apart: bool = False  # ids are kept apart, in `private/`
+    raw: bool = False  # whether the source's files are also copied unchanged
+    apart: bool = False  # whether ids are kept apart, in `private/`
 
 
 class Unit(NamedTuple):
@@ -58,7 +58,7 @@ class Tally:
     changed: int = 0
     unchanged: int = 0
     gone: int = 0  # files that are no longer in the source
-    bytes: int = 0  # to fetch
+    bytes: int = 0  # the bytes to fetch
     damaged: int = 0  # files in the folder that have changed or are missing
 
     @property

@@ -39,9 +39,9 @@ class Options:
     """The options of the command."""
 
     formats: frozenset[str] = frozenset({"csv", "parquet"})
-    apart: bool = False  # ids only in `private/`, and numbers everywhere else
-    raw: bool = False  # also the files of the source, unchanged
-    long: bool = False  # also answers-long, with a row per field
+    apart: bool = False  # whether ids are only in `private/`, and numbers everywhere else
+    raw: bool = False  # whether the source's files are also copied unchanged
+    long: bool = False  # whether the table answers-long, with a row per field, is written too
     spreadsheet: bool = False  # CSV for spreadsheets (`table_files.Style`)
 
     @property

@@ -69,7 +69,7 @@ class ScriptedAnswer:
     parsed: dict[str, Any]
     status: int
     times: int
-    when: Callable[[Mapping[str, Any]], bool] | None = None  # only calls whose parameters satisfy this
+    when: Callable[[Mapping[str, Any]], bool] | None = None  # only calls count whose parameters satisfy this
 
 
 class MotoWorld:
@@ -86,7 +86,7 @@ class MotoWorld:
         self.calls: list[ApiCall] = []
         self.in_sync = True  # False: Route 53 answers PENDING to every GetChange
         self.env: dict[str, str] = {}
-        self.ids: dict[str, str] = {}  # of the account's resources: VPC, zone, queue URLs and ARNs, …
+        self.ids: dict[str, str] = {}  # the ids of the account's resources: VPC, zone, queue URLs and ARNs, …
         self._lock = threading.RLock()
         self._answers: list[ScriptedAnswer] = []
         self._tokens: dict[tuple[str, str], tuple[str, list[Any]]] = {}

@@ -34,7 +34,7 @@ other prefixes.
 (EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
 """
 
-_OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # of infra/template.yml
+_OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # parameters of infra/template.yml
 
 _NO_REGION = (
     "No AWS region is set.",

@@ -21,7 +21,7 @@ class Mark(StrEnum):
     """Whether a result is good, worth a look, or bad."""
 
     GOOD = "good"
-    LOOK = "look"  # it works, but is worth a look; or it could not be checked
+    LOOK = "look"  # what was checked works, but is worth a look; or it could not be checked
     BAD = "bad"  # participants would be affected
 
     @property

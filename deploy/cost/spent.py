@@ -18,8 +18,8 @@ class Spent:
     """The sum of what some servers have cost."""
 
     usd: Usd = field(default_factory=Usd)
-    hours: float = 0.0  # of servers
-    attempts: int = 0  # that ran; an attempt on a warm server is not counted, since the warm server's own record is
+    hours: float = 0.0  # the hours of servers
+    attempts: int = 0  # attempts that ran; one on a warm server is not counted, since the warm server's own record is
     never_ran: int = 0  # attempts that are not in the sum: no room, refused, or lost before the task ran
     guessed: int = 0  # attempts whose record has no size
 

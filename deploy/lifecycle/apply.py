@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
 ROLE_PAUSE = 10  # seconds to wait until AWS knows a new role everywhere
-ROLE_TRIES = 3  # at making the stack
+ROLE_TRIES = 3  # attempts to make the stack
 
 
 def _suggest_python(python: str | None) -> None:

@@ -43,7 +43,7 @@ class FoundInstallation:
     data: Sequence[str]  # data buckets
     installation: Installation | None  # None if the stack's outputs are not complete
     resources: Sequence[Resource] = ()  # of the stack, and of deleted stacks of its name, as CloudFormation lists them
-    addresses: Sequence[Addresses] = ()  # of the same stacks
+    addresses: Sequence[Addresses] = ()  # the addresses of the same stacks
     attached: Sequence[PolicyAttachments] = ()  # to whom the stack's policies are attached
 
     def __bool__(self) -> bool:

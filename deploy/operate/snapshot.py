@@ -55,7 +55,7 @@ class CertificateState:
     renewal: datetime
     expires: datetime
     days_left: int
-    staging: bool  # from an authority for tests, which browsers do not trust
+    staging: bool  # whether it is from an authority for tests, which browsers do not trust
 
     def overdue(self, now: datetime) -> bool:
         """Whether the next certificate should be there by now."""

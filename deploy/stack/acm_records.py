@@ -24,7 +24,7 @@ from deploy.stack.code_bucket import CodeBucket
 from deploy.stack.listings import KEY_TYPES
 from hippodrome.aws import errors
 
-NOTE = "destroy/validation-records.json"  # in the code bucket
+NOTE = "destroy/validation-records.json"  # the key of the note in the code bucket
 _AT_ONCE = 8
 _ACM = ".acm-validations.aws"
 _GONE = {"ResourceNotFoundException", "NoSuchHostedZone"}

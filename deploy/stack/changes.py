@@ -26,7 +26,7 @@ from deploy.stack.stack import Stack
 from deploy.stack.states import StackAction
 from hippodrome.aws import errors
 
-PREFIX = "hippodrome-"  # of the names of Hippodrome's change sets
+PREFIX = "hippodrome-"  # begins the names of Hippodrome's change sets
 _NO_CHANGES = ("didn't contain changes", "No updates are to be performed")
 
 

@@ -29,7 +29,7 @@ KEPT = {"AWS::SQS::Queue": 60.0}  # resource type → seconds that AWS keeps its
 MARGIN = 10.0  # seconds more: the events' times are CloudFormation's, not the service's
 PAUSE = 5  # seconds between two looks at the schedule group
 LONGEST = 300  # seconds to wait for the schedule group at most
-_STACKS = 3  # stacks of one name whose events are read, the newest first
+_STACKS = 3  # of the stacks of one name, the events of this many are read, the newest first
 
 
 def remaining(account: Account, stack: str) -> float:

@@ -13,7 +13,7 @@ from deploy.stack import acm_records, policies
 from deploy.stack.deletion_failures import Recovery, recoveries, recovery_from
 from deploy.stack.stack import FailedResource, NotDeleted, Stack
 
-TRIES = 8  # at deleting the stack
+TRIES = 8  # attempts to delete the stack
 PAUSE = 20  # seconds between two looks at what blocks the deletion
 IN_USE = 75 * 60
 """The seconds for which a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported

@@ -32,8 +32,8 @@ class Resource(NamedTuple):
     physical_id: str
 
 
-MEASURED = 200_000  # versions of a bucket whose sizes are added up
-REMEMBERED = 10  # stacks of one name, deleted ones included, whose resources are listed
+MEASURED = 200_000  # the sizes of at most so many versions of a bucket are added up
+REMEMBERED = 10  # the resources of so many stacks of one name are listed, also of deleted ones
 
 
 def cost_of(kind: str) -> str:

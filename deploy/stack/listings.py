@@ -16,7 +16,7 @@ class Listing(NamedTuple):
     operation: str
     path: str  # the key of the list in the answer, and of the id in each item
     remove: str  # the AWS CLI's command and option that remove one
-    cost: str = "nothing"  # of one unused resource, a month
+    cost: str = "nothing"  # what one unused resource costs a month
 
     def removal(self, name: str, region: str) -> str:
         """Return the AWS CLI command that removes the resource of this name."""

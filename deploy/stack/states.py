@@ -19,7 +19,7 @@ class StackAction(Enum):
     CREATE = "make it"  # there is no stack, or one without resources
     UPDATE = "bring it up to date"
     WAIT = "wait for the present operation"
-    RECREATE = "delete what is left of it, and make it anew"  # it was never complete
+    RECREATE = "delete what is left of it, and make it anew"  # for a stack that was never complete
     ROLL_BACK = "take the failed update back"  # RollbackStack
     CONTINUE = "go on taking the failed update back"  # ContinueUpdateRollback
     STOP = "leave it to the administrator"

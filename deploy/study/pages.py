@@ -16,7 +16,7 @@ from hippodrome.aws.documents import S3Documents
 from hippodrome.config import layout
 from hippodrome.ports import Conflict
 
-LIMIT_BYTES = 4 * 1024**2  # of one file: `next_step` sends it, and the answer of a function has 6 MB at most, in base64
+LIMIT_BYTES = 4 * 1024**2  # a file's size: `next_step` sends it, and a function's answer has 6 MB at most, in base64
 
 
 @dataclass(frozen=True)

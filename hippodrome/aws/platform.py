@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT = 2  # seconds
 READ_TIMEOUT = 5  # seconds; ECS and EC2 get twice as long
-ATTEMPTS = 3  # of a call in all, with botocore's backoff between them (at most 1 s, then 2 s)
+ATTEMPTS = 3  # attempts at a call, the first included, with botocore's backoff between them (at most 1 s, then 2 s)
 
 MAX_THREADS = 16  # the most threads of a function that handles a batch
 

@@ -19,7 +19,7 @@ from hippodrome.aws import errors
 from hippodrome.ports import Message
 
 MIN_DELAY = timedelta(seconds=20)  # a timer's time is at least so far ahead, so that the request comes before it
-MAX_TRIES = 3  # of both calls together: another function may create or delete the timer between the two
+MAX_TRIES = 3  # attempts at both calls: another function may create or delete the timer between the two
 
 
 class SchedulerTimers:

@@ -25,7 +25,7 @@ from protocol.trial_keys import names
 from protocol.trial_sections import Ui
 from protocol.values import KeyPath, is_blank, show
 
-_EXAMPLES: dict[KeyPath, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # of sections whose keys are not in NAMES
+_EXAMPLES: dict[KeyPath, str] = {STEPS: "1: consent", TEXTS: 'start: "Los"'}  # where NAMES has no keys
 _ENOUGH = 200  # after so many mistakes, unknown keys get no suggestions, because finding one takes time
 
 

@@ -84,9 +84,9 @@ class Entries:
     A participant who has left and not come back is in `left`, not in `waiting`.
     """
 
-    waiting: Mapping[str, Waiting] = field(default_factory=dict)  # by label
+    waiting: Mapping[str, Waiting] = field(default_factory=dict)  # by the participant's label
     confirmed: Mapping[str, frozenset[str]] = field(default_factory=dict)  # by the proposal's id: who has confirmed it
-    left: Mapping[str, Departure] = field(default_factory=dict)  # by label
+    left: Mapping[str, Departure] = field(default_factory=dict)  # by the label of a participant who has left
     under_way: frozenset[str] = frozenset()
     done: frozenset[str] = frozenset()  # ids of sessions, and labels of unmatched participants
     keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by label: the keys of the participant's entries

@@ -61,7 +61,7 @@ class LobbyState:
     """The state of the lobby, as the page of a waiting participant shows it."""
 
     here: int  # participants who could play together, this one included
-    seconds: float  # since the participant came
+    seconds: float  # the seconds since the participant came
     proposed: bool  # whether others are found: then the pages of all confirm that they are still open
 
 

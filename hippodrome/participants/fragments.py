@@ -95,7 +95,7 @@ class _Preparation:
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
         self._out: list[str] = []
-        self._seen: set[str] = set()  # which of "field", "submit" and "h1" the page has
+        self._seen: set[str] = set()  # those of "field", "submit" and "h1" that the page has
         self._title = self._lang = ""
         self._drawings = 0  # open <svg> elements, whose <title> is their own
 
@@ -214,7 +214,7 @@ class _Preparation:
 
     def _may_run(self, address: str) -> bool:
         """Whether a script is the researcher's: in the page, among the project's files, or on a host in `hosts`."""
-        plain = _IGNORED.sub("", address).replace("\\", "/")  # as browsers read an address
+        plain = _IGNORED.sub("", address).replace("\\", "/")  # the address as browsers read it
         if _NAMES_HOST.match(plain):
             origin = _ORIGIN.match(plain)
             return origin is not None and origin[0].lower() in self._hosts

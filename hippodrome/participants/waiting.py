@@ -10,7 +10,7 @@ from hippodrome.model.server import Reason, Server, ServerState, next_attempt, r
 from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import SecretCache
 
-MAX_START_TIMES = 50  # of the latest starts, for `typical`
+MAX_START_TIMES = 50  # so many of the latest starts count for `typical`
 FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 
 

@@ -26,9 +26,9 @@ from hippodrome.storage.repository import Versioned
 
 PAUSES = (18, *[3] * 34)  # seconds before each check, for two minutes; a change is seldom INSYNC before 18 s
 LONG_PAUSE = 30  # seconds between later checks
-MAX_CHECKS = 51  # of one change: they take ten minutes
+MAX_CHECKS = 51  # the most checks of one change: they take ten minutes
 RETRY_PAUSE = 3  # seconds until the next try if the zone was busy, or if an interface had no public address yet
-MAX_ADDRESS_CHECKS = 5  # for one network interface; then the queue delivers the event again
+MAX_ADDRESS_CHECKS = 5  # checks for one network interface; after them the queue delivers the event again
 BEFORE_READY = (ServerState.STARTING, ServerState.NAMING)
 DRAINING_OR_CLOSED = (ServerState.DRAINING, ServerState.CLOSED)
 MAX_SERVERS_PER_CHANGE = 400  # as many as one message can name

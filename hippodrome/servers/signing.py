@@ -51,14 +51,14 @@ from protocol.keys import (
 )
 from protocol.session import is_session_id
 
-VALID_SECONDS = 60  # of a presigned request; S3 checks it when the request begins, and servers send it at once
+VALID_SECONDS = 60  # a presigned request's life; S3 checks it when the request begins, and servers send it at once
 STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end after SIGTERM
-MAX_REQUESTS = 20  # in one call
+MAX_REQUESTS = 20  # the most requests that one call signs
 MAX_BODY = 32 * 1024  # bytes
 MAX_ANSWER = 64 * 1024  # bytes
 MAX_RECORDING = 5 * 1024**3  # bytes; S3 takes no more in one PUT
 MAX_RECORDED = 20 * 1024**3  # bytes of all recordings of one server: the size of a Fargate task's disk
-MAX_RECORDINGS = 2_000  # of one server
+MAX_RECORDINGS = 2_000  # the most recordings of one server
 
 _RECORDING = re.compile(r"([A-Za-z0-9_-]{1,64})-(?:trial|episode-[0-9]{4,6})(?:-[1-9][0-9]?)?\.jsonl\.gz")
 

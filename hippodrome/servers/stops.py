@@ -17,7 +17,7 @@ from hippodrome.servers.services import ServerServices
 from hippodrome.servers.sessions import Sessions
 from hippodrome.servers.termination import Termination
 
-MAX_READS = 2_000  # of records in one invocation. Messages beyond them come again; one is always handled
+MAX_READS = 2_000  # reads of records in one invocation. Messages beyond them come again; one is always handled
 
 
 class Stops:

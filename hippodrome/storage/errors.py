@@ -6,4 +6,4 @@ from __future__ import annotations
 class RetryLater(Exception):
     """The message cannot be handled now. The queue should deliver it again."""
 
-    expected = True  # so `log.failure` logs these errors as information
+    expected = True  # so that `log.failure` logs these errors as information

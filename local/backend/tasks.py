@@ -70,7 +70,7 @@ class ProcessTasks:
         for folder in (self._files.path, self._shared.logs, self._shared.spool, self._clusters):
             disk.make_folder(folder)
         self._lock = self._shared.lock
-        self._servers: dict[str, TaskProcess] = {}  # by name; also servers that have stopped
+        self._servers: dict[str, TaskProcess] = {}  # by name: all servers, also those that have stopped
         self._closing = False
         self._load()
 

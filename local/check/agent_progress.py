@@ -18,7 +18,7 @@ from local.check.outside import Outside
 from local.check.pace import Pace
 from trial.recordings import recording
 
-PLAY_STEPS = 5_000  # in each group
+PLAY_STEPS = 5_000  # the most steps in each group
 REPORT_BYTES = 2**20  # a report of this size begins anew
 
 

@@ -113,7 +113,7 @@ class EarlierAnswers:
 
 _PLAYED = {"episodes": 1, "score": 1.5, "frames": 100, "seconds": 3.5, "trial": "t", "outcome": "finished"}
 
-_PLAYED_TOGETHER = ("scores", "session", "player")  # in games of several players
+_PLAYED_TOGETHER = ("scores", "session", "player")  # what an answer holds in games of several players
 
 
 def _forms(text: str) -> list[forms.Form]:

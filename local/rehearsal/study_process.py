@@ -254,7 +254,7 @@ class Leftovers:
 
     processes: int = 0
     records: list[str] = field(default_factory=list)
-    local_mode_killed: bool = False  # since Ctrl-C did not end it
+    local_mode_killed: bool = False  # whether it was killed, since Ctrl-C did not end it
 
     def words(self) -> list[str]:
         """Return lines that say what is left over; none if nothing is."""

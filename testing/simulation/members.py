@@ -21,13 +21,13 @@ GIVES_UP = 3900.0  # seconds in the lobby: `patience` is an hour at most
 class Habits:
     """The behaviour of one member in the lobby and in the game. Times are seconds since they came there."""
 
-    leaves: float | None = None  # closes the page of the lobby
-    beacon: float | None = 0.1  # from then until the closed page's beacon is sent; None: it is never sent
-    back: float | None = None  # from then until they open the link again; None: never. 0 is a reload
+    leaves: float | None = None  # the seconds after which they close the page of the lobby
+    beacon: float | None = 0.1  # seconds from leaving until the page's beacon is sent; None: never
+    back: float | None = None  # seconds from leaving until they open the link again; None: never. 0 is a reload
     offline: tuple[float, float] | None = None  # when they lose the network in the lobby, and for how long
     tabs: int = 1
     drops: tuple[float, float] | None = None  # when they lose the connection to the game, and for how long
-    quits: float | None = None  # closes the page of the game for good
+    quits: float | None = None  # the seconds after which they close the page of the game for good
 
 
 class Quit(Exception):

@@ -47,7 +47,7 @@ class SimulatedVisit:
     ready: float | None = None  # when their page first got a server's address
     interruptions: int = 0  # servers that were lost while they played
     pages: int = 0  # pages that they requested, without polls
-    unanswered: int = 0  # of these, the pages that did not come at the first try
+    unanswered: int = 0  # requested pages that did not come at the first try
     finished: float | None = None
     reason: str = ""  # why the study was over for them, if they have not finished
 
@@ -60,7 +60,7 @@ class SimulatedParticipant:
     ) -> None:
         self.world, self.clock = world, world.clock
         self.visit = SimulatedVisit(f"p{number:05d}", world.clock.seconds)
-        self.answered: list[str] = []  # the steps whose answers they were told are stored
+        self.answered: list[str] = []  # the steps of which they were told that the answer is stored
         self._read, self._play, self._leaves_at = read, play, leaves_at
         self._first_ask = self._step_before_server()
         world.people += 1

@@ -126,7 +126,7 @@ class SimDns:
         self._busy_until = 0.0
         self.strangers: dict[str, str] = {}  # records that belong to no server of ours
         self.most_records = 0  # the most records at once
-        self.spreads: dict[str, float] = {}  # by name: seconds that its change took to be in sync
+        self.spreads: dict[str, float] = {}  # by name: the seconds until its change was in sync
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
         changes = [(record, False) for record in remove] + [(record, True) for record in add]

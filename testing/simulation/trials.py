@@ -138,7 +138,7 @@ class SimTrials:
         """`idle`: the seconds after which a trial without members ends."""
         self.platform, self.project_id, self.idle = platform, project_id, idle
         self.played: defaultdict[str, float] = defaultdict(float)  # by session: seconds of play in its recordings
-        self._trials: dict[str, SimTrial] = {}  # by task
+        self._trials: dict[str, SimTrial] = {}  # the trials by their tasks
 
     def at(self, task: TimedTask, step: str, play: float) -> SimTrial | None:
         """Return the trial of a session's task; None if the task has no session, or if the session is not formed yet.

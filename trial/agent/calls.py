@@ -32,7 +32,7 @@ class Calls:
         self.callbacks: Callbacks | None = None
         """The agent's callbacks, if it has any."""
         self._warned_of: set[str] = set()
-        self._cut = False  # in the previous line, a value of an info was too large
+        self._cut = False  # whether a value of an info was too large in the previous line
 
     def run(self, call: Call) -> Any:
         """Run the call, and return the result that the docstring of its class names.

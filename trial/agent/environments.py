@@ -169,6 +169,6 @@ def action_meanings(env: Any) -> list[str]:
         if callable(meanings):
             try:
                 return [str(name).strip().lower() for name in meanings()]
-            except TypeError:  # it takes a player
+            except TypeError:  # `meanings` takes a player
                 continue
     return []

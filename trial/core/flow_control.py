@@ -20,7 +20,7 @@ class Window:
 
     def __init__(self) -> None:
         self._under_way: deque[tuple[int, float, bool]] = deque()  # id, time, and whether it is the id's first message
-        self._round_trip = math.inf  # the shortest so far
+        self._round_trip = math.inf  # the shortest round trip so far
         self._together = False  # whether the last acknowledgement was for several frames
         self._sent_at = -math.inf
         self.newest = -1

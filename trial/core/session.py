@@ -97,7 +97,7 @@ class TrialSession:
         """The players whose members have sent `stop`, on this server or an earlier one."""
         self._stored: set[str] = set()
         """The ids of the members whose answer is stored."""
-        self._was_on_break = False  # at the last call of `attend`
+        self._was_on_break = False  # whether there was a break at the last call of `attend`
         self._begun = resumed
         """Whether the game has begun: a member who is missing afterwards has left, and before has not come."""
         self._settled: int | None = None

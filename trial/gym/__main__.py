@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     if status == 0:
         where = f" Recordings are in {given['record']}." if given["record"] else ""
-        print(f"Ended.{where}", file=sys.stderr)  # since the reader of a pipe at stdout may have ended before
+        print(f"Ended.{where}", file=sys.stderr)  # stderr, since the reader of a pipe at stdout may have ended already
     return status
 
 

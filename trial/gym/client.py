@@ -64,7 +64,7 @@ class GymClient:
                 proxy=None if _is_this_machine(address) else True,
                 ping_interval=None,  # no pings: a step may take longer than their answers may
             )
-            self._connection: ClientConnection = opened.__enter__()  # until `close`
+            self._connection: ClientConnection = opened.__enter__()  # `close` ends what begins here
         except (OSError, InvalidHandshake, InvalidURI, TimeoutError, ValueError) as error:
             # `from None`, since the error may show the token.
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None

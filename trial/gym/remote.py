@@ -120,7 +120,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
     connection has ended: then the environment is closed, and a new RemoteEnv makes a new one.
     """
 
-    # `gymnasium.make` reads the modes of the class: the usual ones. An instance has those of its environment.
+    # `gymnasium.make` reads the modes of the class, which are the usual ones. An instance has its environment's modes.
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "ansi"]}  # noqa: RUF012
 
     def __init__(

@@ -37,7 +37,7 @@ from trial.gym.spaces import CodecError
 
 _read = json.JSONDecoder().decode
 _ENDS = ("false,{}]", "true,{}]")  # the end of an answer (done and info), by `terminated`
-_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")  # the same of a reply with terminated, truncated and info
+_ENDS_OF_FIVE = ("false,false,{}]", "true,false,{}]")  # the same for answers with terminated, truncated and info
 
 
 class HeldEnvironment:
@@ -384,7 +384,7 @@ def _together(instance: Instance, actions: Sequence[Any]) -> Any:
 
 def _metadata(env: Any) -> Any:
     metadata = dict(getattr(env, "metadata", None) or {})
-    metadata.pop("autoreset_mode", None)  # it is an enumeration, and has a field of its own
+    metadata.pop("autoreset_mode", None)  # an enumeration, which is sent in a field of its own
     return values.plain(metadata)
 
 

@@ -59,7 +59,7 @@ class Spawner:
         self._record = record
         self._memory = memoryview(mmap.mmap(-1, 8 * limits.workers)).cast("d")
         self._free = set(range(limits.workers))  # the free slots
-        self._workers: dict[int, _Watched] = {}  # by process id
+        self._workers: dict[int, _Watched] = {}  # the living workers, by process id
         self._unsent = bytearray()  # messages for which the socket to the server has no room yet
         self._usage_checked = 0.0
         self._own_megabytes = 0.0

@@ -66,7 +66,7 @@ def _key(key: Any) -> str:
     if isinstance(key, str):
         return key
     if key is None or isinstance(key, bool):
-        return json.dumps(key)  # as JSONEncoder writes it
+        return json.dumps(key)  # written as JSONEncoder writes such a key
     try:
         return str(key)
     except Exception:  # noqa: BLE001 - the key is the researcher's

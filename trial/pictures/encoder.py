@@ -147,7 +147,7 @@ class Encoder:
 
 def _whole(rows: Frame, base: Frame | None = None) -> bytes:
     body = frames.packed(rows, base)
-    assert body is not None  # it is only None for a limit, and none is given
+    assert body is not None  # `packed` returns None only at a limit, and here is none
     return body
 
 

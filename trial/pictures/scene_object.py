@@ -24,7 +24,7 @@ MAX_TWEEN = 10_000
 
 _MAX_ID = 100  # characters
 _FARTHEST = 1e6  # the largest coordinate or length
-_DIGITS = 4  # of a relative coordinate: exact to a tenth of a pixel in a picture that is 1,000 pixels wide
+_DIGITS = 4  # digits of a relative coordinate: exact to a tenth of a pixel in a picture 1,000 pixels wide
 _HEX = re.compile(r"#(?:[0-9a-fA-F]{3,4}|[0-9a-fA-F]{6}|[0-9a-fA-F]{8})")
 _EXTENSION = re.compile(r"\.(?:png|jpe?g|webp)$", re.IGNORECASE)  # the names of images lack this ending
 _FONT = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ,_-]{0,99}")
@@ -276,7 +276,7 @@ def _tween(fields: Mapping[str, Any]) -> float:
         raise UnusableValue(f"cannot be drawn: its tween {error}") from None
 
 
-_NEEDED: Any = object()  # in the place of a default
+_NEEDED: Any = object()  # stands in the place of a default
 _DEFAULT_TWEEN = 50  # ms, as in Interactive Gym
 _OTHER_NAMES = {"uuid": "id", "object_type": "type", "image_name": "image", "opacity": "alpha", "rotation": "angle"}
 _COMMON_FIELDS = frozenset({"type", "permanent", "remove", "tween", "tween_duration", "object_size"})

@@ -59,7 +59,7 @@ class HandedConnections:
 
 def main() -> int:
     """Serve until the trial server ends, and return the exit status."""
-    sys.dont_write_bytecode = True  # for agent.py, as in trial/__main__.py
+    sys.dont_write_bytecode = True  # because of agent.py, as in trial/__main__.py
     linux.die_with_parent()
     os.nice(19)
     with contextlib.suppress(OSError):  # Linux only: if memory runs out, it kills the highest score first (proc(5))

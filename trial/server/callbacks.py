@@ -43,7 +43,7 @@ class TrialCallbacks:
         self._loop = asyncio.get_running_loop()
         self._callbacks: Callbacks | None = None
         self._recorded = 0  # the number of lines that callbacks had recorded at the end of the last work that is done
-        self._moves: deque[TellMoved] = deque()  # those that are not told yet, the first of them being told now
+        self._moves: deque[TellMoved] = deque()  # moves that are not told yet; a callback is being told of the first
 
     @property
     def busy(self) -> bool:

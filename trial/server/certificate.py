@@ -53,7 +53,7 @@ class Certificate:
 
         Raises SettingsError if a file is missing, ssl.SSLError if the files do not fit, and the store's errors.
         """
-        with ThreadPoolExecutor(2) as pool:  # both at once: each takes two round trips, and participants wait
+        with ThreadPoolExecutor(2) as pool:  # both files at once: each takes two round trips, and participants wait
             chain, key = pool.map(self._store.get, (self._chain_key, self._private_key))
         key_has_chain = key is not None and b"-----BEGIN CERTIFICATE" in key
         if key is None or (chain is None and not key_has_chain):

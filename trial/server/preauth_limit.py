@@ -27,8 +27,8 @@ class PreauthLimitedSocket(socket.socket):
 
     def __init__(self, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # else asyncio does not set TCP_NODELAY
-        self._unauthenticated: dict[Any, socket.socket] = {}  # by the client's address, the oldest first
+        super().__init__(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # otherwise asyncio does not set TCP_NODELAY
+        self._unauthenticated: dict[Any, socket.socket] = {}  # connections by the client's address, the oldest first
         self.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self.bind((host, port))
@@ -47,7 +47,7 @@ class PreauthLimitedSocket(socket.socket):
             self._forget_closed()
         while len(self._unauthenticated) > MAX_UNAUTHENTICATED_SOCKETS:
             oldest = self._unauthenticated.pop(next(iter(self._unauthenticated)))
-            with contextlib.suppress(OSError):  # it may be closed already
+            with contextlib.suppress(OSError):  # the connection may be closed already
                 oldest.shutdown(socket.SHUT_RDWR)  # the event loop notices this, and closes it
         return connection, address
 

@@ -77,7 +77,7 @@ class TrialServer:
         )
         self._agent_ready: asyncio.Task[StartedAgent | None]
         self._failure = 1  # the exit status if an error ends the server
-        self._trials: list[TrialLoop] = []  # in their order; policies or callbacks may still run after a trial's end
+        self._trials: list[TrialLoop] = []  # in their order, also ended ones, whose policies or callbacks may still run
         self._finished_steps: set[str] = set()
         self._search: Search
         self._admission: Admission

@@ -43,7 +43,7 @@ function drawRows(header, first, bytes) {
   rows = first + count;
 }
 
-// Drops the pixels of a picture whose rows have not all come, and those of a picture of another size.
+// Drops the pixels if not all rows of their picture have come, or if it has another size.
 function beginPicture({ width, height, channels = 0 }) {
   if (rows > 0 && rows < height) pixels = null;
   rows = 0;

@@ -10,7 +10,7 @@ const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms for a connection to open; some firewalls neither let it through nor refuse it
 const ACK_EVERY = 8; // ms between acknowledgements; at high frame rates there would be too many
 const ACK_WAIT = 50; // ms for which an acknowledgement waits for another picture, if they come that quickly
-const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // by close code
+const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // why the connection ended, by close code
 
 let link = null; // the present connection; messages of earlier ones are ignored
 

@@ -118,7 +118,7 @@ function leaveLobby() {
   navigator.sendBeacon(find("again").action, new URLSearchParams(form));
 }
 
-// Marks the title of a page whose participant is matched, or removes the mark. On a hidden page they alternate.
+// Marks the page's title because its participant is matched, or removes the mark. On a hidden page it comes and goes.
 function callBack(calls) {
   const plain = document.title.replace(CALL, "");
   if (!lobby.waits) document.title = calls ? CALL + plain : plain;

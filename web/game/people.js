@@ -159,7 +159,7 @@ function noteEnd(message) {
   if (!message.episodes) delete message.score; // no game was played, so there is no score
   Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false, shown: READ });
   setText(find("leave-title"), TEXT.thanks);
-  setTimeout(() => setText(find("announce"), overlays.over.note), 500); // after the announcement of every end
+  setTimeout(() => setText(find("announce"), overlays.over.note), 500); // said later than what is announced at every end
 }
 
 find("reading-button")?.addEventListener("click", () => {

@@ -1,4 +1,4 @@
-// Games turn by turn: shows whose turn it is, and how much time is left.
+// Games that are played turn by turn: shows whose turn it is, and how much time is left.
 import { hooks } from "./hooks.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";

@@ -6,7 +6,7 @@ import { data } from "./page.js";
 
 function sayOwnWords(message) {
   if (!Object.hasOwn(data.said, message.error ?? "")) return;
-  message.error = data.said[message.error]; // for the hooks after this one
+  message.error = data.said[message.error]; // changed in the message, so that later hooks get it too
   showMessage(message.error);
 }
 

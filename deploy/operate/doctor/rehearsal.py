@@ -65,7 +65,7 @@ class Rehearsal:
         self._repository = Repository(platform.documents)
         self._name = f"rehearsal-{secrets.token_hex(6)}"
         self.user_id = ids.new_session_id() if project.has_sessions else self._name
-        self._seconds: dict[ServerState, float] = {}  # from the start message to each state of the server
+        self._seconds: dict[ServerState, float] = {}  # by state of the server: the seconds from the start message to it
         self.left: list[Finding] = []  # findings on what is left after an interruption
         self._record: Server | None = None
 

@@ -17,11 +17,11 @@ from console.problem import Problem
 from hippodrome.config import layout
 from hippodrome.config.layout import REQUIREMENTS
 
-LIMIT_BYTES = 1024**3  # of a project's own files, which each server pulls before its participant can play
+LIMIT_BYTES = 1024**3  # the size of a project's own files, which each server pulls before its participant can play
 LIMIT_FILES = 20_000
 
 # Left out at the top of the folder only. A server gets config.yml when it starts (TRIAL), and the bucket has the pages.
-# `make run` keeps participants' data in `data`, and `make try` those of its bots in `data-try`.
+# `make run` keeps participants' data in `data`, and `make try` keeps its bots' data in `data-try`.
 _TOP = {*layout.CONFIGS, *layout.PAGES, "data", "data-try", REQUIREMENTS}
 _ANYWHERE = {"__pycache__", "node_modules"}
 # Left out of the folder App of a clone of HIPPO Gym: its recordings, and the certificate that updateProject.py fetches.

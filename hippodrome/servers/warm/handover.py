@@ -45,7 +45,7 @@ class Handovers:
         warm_id, entry = found_in_pool
         found = self._repository.server(ids.server_label(project.id, warm_id))
         if found is None or found.server.state is not ServerState.READY:
-            return None  # it has ended; the sweep removes it from its pool
+            return None  # the warm server has ended; the sweep removes it from its pool
         warm_server, attempt = found.server, stored.server.attempt
         named = self._repository.update(
             stored,

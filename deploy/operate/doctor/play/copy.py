@@ -33,7 +33,7 @@ from protocol.keys import questions_folder
 ID = re.compile(r"rehearsal-[0-9a-f]{32}")  # no researcher names a study like this
 MAX_RUNTIME = 30  # minutes: no server lives longer, even if the rehearsal is killed
 OLD = timedelta(hours=2)  # a rehearsal takes minutes, so a copy of this age is a leftover
-TRIES = 20  # at writing the list of projects
+TRIES = 20  # attempts to write the list of projects
 CONTROLS = ("left", "right", "up", "down", "start", "pause")  # the controls of a game whose `trial` section has no `ui`
 
 

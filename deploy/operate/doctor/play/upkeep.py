@@ -26,7 +26,7 @@ from hippodrome.ports import DnsRecord, Topic
 from protocol.session import Member, SessionDocument
 
 READY = 420.0  # seconds until a server must be ready, a lost attempt included
-SOON = timedelta(seconds=75)  # from now until the moved timer; a timer fires within the minute after its time
+SOON = timedelta(seconds=75)  # the time from now until the moved timer; a timer fires within the minute after its time
 FIRED = 330.0  # seconds until the timer's server must be closed
 TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
 LEFTOVERS = 2  # a timer and a name, which the sweep has to remove
