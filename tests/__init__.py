@@ -1,1 +1,4 @@
-"""The tests. The package `slimevb`, which an example needs, installs a package `tests` too: without this file it came first."""
+"""The tests.
+
+The package `slimevb`, which an example needs, installs a package `tests` too. Without this file, that would be found first.
+"""

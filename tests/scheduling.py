@@ -1,7 +1,7 @@
 """Which tests a worker of pytest-xdist gets at a time, and in which order.
 
-Its own `loadgroup` gives a worker one test, begins with the groups of the most tests, and counts all that a worker has ever had
-before it gives the next test. For 10,000 tests all that takes 9 seconds of processor time more than `units`.
+pytest-xdist's own `loadgroup` gives a worker one test, begins with the groups of the most tests, and counts all that a
+worker has ever had before it gives the next test. For 10,000 tests all that takes 9 seconds of processor time more than `units`.
 """
 
 from __future__ import annotations

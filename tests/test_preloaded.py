@@ -1,4 +1,4 @@
-"""A process that was forked with its imports done is to its test what `python -m …` is."""
+"""A process that was forked with its imports done behaves in a test like `python -m …`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames in a real Chromium: the page draws them in order, and a picture that stands still exactly."""
+"""Frames in a real Chromium: the page draws them in order, and without loss if the picture stands still."""
 
 from __future__ import annotations
 

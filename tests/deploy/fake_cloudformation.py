@@ -1,12 +1,13 @@
 """A fake CloudFormation that follows a script: stacks, change sets and events in the shapes of the real answers.
 
-moto's CloudFormation says CREATE_COMPLETE of whatever it skips and never fails by itself. This one does what it is told:
-`operations` is what comes of the next execute, delete or continue, a list of steps; each look at the stack takes one.
+moto's CloudFormation says CREATE_COMPLETE of whatever it skips and never fails by itself. This fake does what
+it is told: `operations` says what follows from the next execute, delete or continue. It is a list of steps, of which
+each look at the stack takes one.
 
 Instead of a script, `making` and `deleting` may say of each resource what its service says to CloudFormation: "" if it
 did as it was told. So a world can refuse as AWS does (`tests/deploy/real_stack.py`).
 
-In states in which CloudFormation takes no change set, or no rollback, this one does not either.
+The fake refuses change sets and rollbacks in the states in which CloudFormation refuses them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What `register` needs of AWS beyond `Installed`: CodeBuild, pushes to ECR, and the function that registers.
 
 Gaps of moto that are bridged here: its CodeBuild takes no overrides, builds nothing and ends at the first look; its
-Lambda runs functions only with Docker. So builds are told here (queued, running, a log in CloudWatch, then an image in
+Lambda runs functions only with Docker. So a test says here what a build does (queued, running, a log in CloudWatch, then an image in
 moto's ECR, or a failure), and Invoke runs the real handler over the same account.
 """
 

@@ -1,4 +1,4 @@
-"""docs/first-hour.md, as far as servers have to run: in an installation that lives, with the example study as it is shipped.
+"""The parts of docs/first-hour.md for which servers have to run: in a running installation, with the example study.
 
 The commands are those that make runs for what the page says. The rest of the page is walked in `tests/ministack`.
 """

@@ -64,7 +64,7 @@ def test_a_project_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch:
     assert options.project_id("maze/") == options.project_id("./maze") == options.project_id(str(folder)) == "labyrinth"
     monkeypatch.chdir(folder)
     assert options.project_id(".") == "labyrinth"
-    with pytest.raises(Problem, match="has no config.yml"):
+    with pytest.raises(Problem, match=r"has no config\.yml"):
         options.project_id("..")
 
 

@@ -1,4 +1,4 @@
-"""Examples that the lines in their README change for two people: two bots play them to the end."""
+"""Examples, changed for two people by the lines in their README: two bots play them to the end."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Roles judge every call: what functions need they have, and what they do not need they have not.
+"""Roles judge every call: functions have the permissions that they need, and no others.
 
-All tests that run handlers on `MotoWorld` are judged (`testing/iam/enforcement.py`); here a walk through everything proves that each row of
-`WHO_MAY` is needed by somebody, that a permission taken away is missed, and what no walk tries.
+All tests that run handlers on `MotoWorld` are judged (`testing/iam/enforcement.py`). Here a walk through everything
+proves that some function needs each row of `WHO_MAY`, and that a call fails if its permission is taken away. Further
+tests try what no walk tries.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A function that is deployed is known everywhere that CONTRIBUTING.md, "A new Lambda function", names."""
+"""Each deployed function stands in all the places that CONTRIBUTING.md names ("A new Lambda function")."""
 
 from __future__ import annotations
 

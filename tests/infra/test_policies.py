@@ -1,4 +1,4 @@
-"""Least privilege in the template: nothing is a wildcard but what AWS knows no narrower word for."""
+"""Least privilege in the template: a wildcard stands only where AWS has no narrower word."""
 
 from __future__ import annotations
 

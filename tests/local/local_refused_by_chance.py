@@ -1,6 +1,6 @@
 """`python -m local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
 
-One of the first calls is refused in any case, so that no run goes without. Each refusal is a line `refused: …` on stderr.
+One of the first calls is refused in any case, so that each run has a refusal. Each refusal is a line `refused: …` on stderr.
 """
 
 from __future__ import annotations

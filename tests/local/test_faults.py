@@ -1,4 +1,4 @@
-"""On one machine: whichever call the system refuses, and wherever the process is killed, no server is lost sight of.
+"""On one machine: whichever call the system refuses, and wherever the process is killed, no server is forgotten.
 
 Each journey runs once to count its calls, then once for each of its fault points: a kind of call, which one of them, an
 error, how far it reaches (`testing/os_faults.py`). Afterwards the participant must have come to where they come without

@@ -1,4 +1,4 @@
-"""Whenever power fails: what was promised is on the disk, and nothing is there by half (docs/data.md)."""
+"""Whenever power fails: what was promised is on the disk, and no file is there in part (docs/data.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real `python -m local` that the system really refuses something: another file system, no more files, no room."""
+"""A real `python -m local` to which the system really refuses something: another file system, no more files, no room."""
 
 from __future__ import annotations
 

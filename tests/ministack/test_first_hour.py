@@ -1,6 +1,6 @@
 """docs/first-hour.md, walked on ministack: the real Makefile, commands, template and functions; two Pebbles for Let's Encrypt.
 
-An account and an emulator of its own, which is empty before and after. Its commands are typed into a shell as the page
+It has an account and an emulator of its own, which are empty before and after. Its commands are typed into a shell as the page
 has them, in its order; those for which servers have to run are in `tests/deploy/test_first_hour.py`.
 """
 

@@ -1,7 +1,7 @@
 """Sessions: participants who wait in a lobby, their servers, and what must hold for them.
 
 `SessionWorld` is the installation with a study that several participants play together; `always` and `ends_well` are
-what `checks.py` has for studies of one.
+what `checks.py` has for studies with one participant.
 """
 
 from __future__ import annotations

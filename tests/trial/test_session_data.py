@@ -1,4 +1,4 @@
-"""`data` and `erase` read the recordings of a real session: whose each entry is, and what belongs to one member alone."""
+"""`data` and `erase` read the recordings of a real session: to whom each entry belongs, and what concerns one member alone."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """An agent.py with two players, and a partner for one of them, for tests on real trial servers.
 
-An observation is the number of the step and a number that depends on the seed. The latter is never 0: there are policies of tests that answer
-zeros otherwise.
+An observation is the number of the step and a number that depends on the seed. The second number is
+never 0: with a 0, some tests' policies would answer zeros.
 """
 
 TWO = '''

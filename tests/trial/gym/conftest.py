@@ -1,4 +1,4 @@
-"""Fixtures: one server of environments, which tests share that leave it as it is, and its clients."""
+"""Fixtures: one server of environments for all tests that leave it as it is, and its clients."""
 
 from __future__ import annotations
 
