@@ -204,7 +204,7 @@ def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
         return None
     if not is_ours(found):
         raise Problem(
-            f"The stack {found['StackName']} in {account.region} is no installation of Hippodrome: it is left alone.",
+            f"The stack {found['StackName']} in {account.region} is no installation of Hippodrome: it stays as it is.",
             "Name another with --stack.",
         )
     return found

@@ -39,7 +39,7 @@ def stack_name(given: str) -> str:
         )
     if RESERVED_STACK_NAME.fullmatch(given):
         raise Problem(
-            f"An installation cannot be called {given}: AWS keeps that name to itself.",
+            f"An installation cannot be called {given}: AWS reserves that name.",
             "Choose another name (--stack, with make: STACK=).",
         )
     return given

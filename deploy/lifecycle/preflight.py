@@ -108,7 +108,9 @@ def _region(checked: AccountCheck) -> Iterator[Finding]:
 
 def _root(checked: AccountCheck) -> Iterator[Finding]:
     if checked.account.identity["Arn"].endswith(":root"):
-        yield look("credentials", "They are the root user's, who can do anything.", "Use a role or a user of your own.")
+        yield look(
+            "credentials", "They are the root user's, who may do everything.", "Use a role or a user of your own."
+        )
 
 
 def _executions(checked: AccountCheck) -> Iterator[Finding]:
@@ -120,7 +122,7 @@ def _executions(checked: AccountCheck) -> Iterator[Finding]:
         yield look(
             "Lambda",
             f"This account runs {free} functions at once: {pages} for participants' pages, {starts} to start servers. "
-            "That does for trying it out, and is slow with many people.",
+            "That is enough to try it out, but slow with many people.",
             f"Ask for more, and then deploy again: {quotas.request(account, quotas.EXECUTIONS, 1000)}",
         )
 

@@ -79,7 +79,7 @@ def test_the_name_of_a_stack_must_fit_its_bucket(name: str) -> None:
 @pytest.mark.parametrize("name", ["default", "Default", "xn--pilot", "sthree-x", "amzn-s3-demo-x"])
 def test_names_that_aws_reserves_are_refused(name: str) -> None:
     assert options.stack_name("default-2") == "default-2"
-    with pytest.raises(Problem, match="AWS keeps that name"):
+    with pytest.raises(Problem, match="AWS reserves that name"):
         options.stack_name(name)
 
 

@@ -133,7 +133,9 @@ def credentials(account: Account) -> Iterator[Finding]:
     name = identity["Arn"].rpartition(":")[2]
     if name == "root":
         yield look(
-            "credentials", f"The root user of account {account.id}.", "Use a role or user: root can do anything."
+            "credentials",
+            f"The root user of account {account.id}.",
+            "Use a role or another user: root may do everything.",
         )
     else:
         yield good("credentials", f"{name} in account {account.id}.")

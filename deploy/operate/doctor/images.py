@@ -116,11 +116,15 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
     repository = context.installation["Repository"]
     name, _, digest = image.partition("@")
     if not name.startswith(repository) or name[len(repository) : len(repository) + 1] not in ("", ":"):
-        yield look(check, f"runs an image of elsewhere: {image}.", "What is not in the repository is not looked at.")
+        yield look(
+            check,
+            f"runs an image of another repository: {image}.",
+            "`doctor` looks at images of the installation's repository only.",
+        )
         return
     tag = name[len(repository) + 1 :]
     if not digest:
-        yield look(check, f"names its image by a tag ({tag or 'latest'}), which may come to mean another one.", AGAIN)
+        yield look(check, f"names its image by a tag ({tag or 'latest'}), which may name another image later.", AGAIN)
     wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
     client, name_there = context.account.client("ecr"), repository.partition("/")[2]
     try:

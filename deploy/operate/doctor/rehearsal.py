@@ -190,7 +190,7 @@ class Rehearsal:
             found.append(
                 look(
                     CHECK,
-                    "The stop message was not acted upon: it was stopped from here.",
+                    "No function has acted on the stop message, so this command stopped the server.",
                     "See `python -m deploy logs stop_server`.",
                 )
             )

@@ -462,7 +462,7 @@ def test_images_with_weaknesses_are_remarks(world: Installed, account: Account) 
     assert any("by a tag (latest)" in text for text in texts)
     assert any("not in the repository" in text for text in texts)
     world.register(project(world, task_definition=definition(world, image="docker.io/library/python:3.13")))
-    assert "runs an image of elsewhere" in only(images.projects(context(account))).text
+    assert "runs an image of another repository" in only(images.projects(context(account))).text
 
 
 def test_a_study_on_another_port_than_the_installation_is_a_remark(world: Installed, account: Account) -> None:
