@@ -141,7 +141,7 @@ class Fetcher:
         done, _ = wait(running, return_when=FIRST_COMPLETED)
         collected = []
         for future in done:
-            files = future.result()  # may raise; then `_all` saves the results of the other workers
+            files = future.result()  # `result` may raise; then `_all` saves the results of the other workers
             work = running.pop(future)
             self._save(work, files)
             self._done += len(work.fetch)
@@ -273,7 +273,7 @@ def forget_gone(state: ExportState, folder: Path) -> int:
 
 def remove_empty(empty: Path, top: Path) -> None:
     """Remove this folder if it is empty, and then the empty folders above it, up to `top`, which stays."""
-    with contextlib.suppress(OSError):  # not empty
+    with contextlib.suppress(OSError):  # the folder is not empty
         while empty != top:
             empty.rmdir()
             empty = empty.parent

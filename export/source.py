@@ -147,7 +147,7 @@ class Folder:
                 continue
             try:
                 facts = entry.stat(follow_symlinks=False)
-            except FileNotFoundError:  # deleted after the scan
+            except FileNotFoundError:  # the file was deleted after the scan
                 continue
             regular = stat.S_ISREG(facts.st_mode)
             name = entry.name if regular else f"{entry.name} (no regular file)"

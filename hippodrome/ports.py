@@ -40,7 +40,7 @@ class RefusedDnsRecords(Exception):
     """The zone will never accept these `records`. The change with the id `change` has made the other changes."""
 
     def __init__(self, records: Sequence[DnsRecord], change: str) -> None:
-        super().__init__(f"{len(records)} names are refused")  # names may hold ids
+        super().__init__(f"{len(records)} names are refused")  # the message shows no names, since they may hold ids
         self.records, self.change = tuple(records), change
 
 

@@ -13,4 +13,4 @@ def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
 
 
 def _signing(platform: Platform) -> Signing:
-    return Signing(cast(SigningPlatform, platform))  # this function runs on AWS only
+    return Signing(cast(SigningPlatform, platform))  # AWS's platform, since this function runs on AWS only

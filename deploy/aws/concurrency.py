@@ -15,7 +15,7 @@ from botocore.exceptions import ClientError
 
 from deploy.aws.account import Account
 
-LEAST = 2  # the least that MaximumConcurrency takes
+LEAST = 2  # the smallest value that MaximumConcurrency takes
 USUAL = 20  # servers that start at once: ECS allows 20 RunTask a second, and a start takes about a second
 OTHERS = 2 * LEAST  # task_changed and stop_server: more would wait, since Route 53 takes a zone's changes one by one
 PARAMETER = "StartConcurrency"

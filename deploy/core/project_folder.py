@@ -52,7 +52,7 @@ def read(folder: Path, installation: Installation | None = None) -> ProjectFolde
         wrong = _with_lines(folder, [*_contradictions(config, installation)])
     if wrong:
         raise _mistakes(wrong)
-    registration = {**config.registration(), "useAWS": True}  # deploying a study implies it
+    registration = {**config.registration(), "useAWS": True}  # whatever config.yml says: a deployed study uses AWS
     remarks: list[str] = []
     if installation is not None:
         registration["awsSetup"] = {**registration["awsSetup"], **_aws_setup_of(installation)}

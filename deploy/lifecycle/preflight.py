@@ -27,7 +27,7 @@ from hippodrome.certificates.rules import names_of
 if TYPE_CHECKING:
     from deploy.core.project_folder import ProjectFolder
 
-FEW = 20  # servers at once; if the quota allows fewer, the advice is to ask AWS for more
+FEW = 20  # if the quota allows fewer servers at once, the advice is to ask AWS for more
 USUAL = 1.0  # vCPU of a server, if no study says how many
 
 

@@ -190,7 +190,7 @@ class Removal:
             return
         with screen.ProgressBars() as bar:
             task = bar.add_task("Removing task definitions", total=len(arns))
-            for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten
+            for start in range(0, len(arns), 10):  # DeleteTaskDefinitions takes ten at a time
                 chunk = arns[start : start + 10]
                 for arn in chunk:
                     _remove(ecs.deregister_task_definition, taskDefinition=arn)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 ROUNDS = 6  # rounds of erasing and looking again, at most
 WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS needs some more
-SETTLED = timedelta(seconds=60)  # the age of a server from which on ECS lists its task, if there is one
+SETTLED = timedelta(seconds=60)  # from this age of a server on, ECS lists its task if it has one
 SIGNING = 30  # seconds that `sign_requests` may take from reading a server's record to signing
 
 

@@ -51,7 +51,7 @@ class _Addresses(PageParser):
         for name, value in attrs:
             if name not in _LOADED.get(tag, ()):
                 continue
-            if name == "srcset":  # it has several addresses
+            if name == "srcset":  # this attribute has several addresses
                 starts = _ORIGIN.findall(value or "")
             else:
                 first = _ORIGIN.match((value or "").strip())

@@ -232,10 +232,10 @@ def main(
     ] = None,
 ) -> None:
     """Send simulated participants through the whole study of FOLDER, and check that everything arrives."""
-    os.umask(0o077)  # as `make run`: only their owner may read these files
+    os.umask(0o077)  # like `make run`: only their owner may read these files
     console = Console(highlight=False)
     for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)  # as Ctrl-C, which leaves nothing running
+        signal.signal(number, signal.default_int_handler)  # like Ctrl-C, after which nothing is left running
     began = time.monotonic()
     try:
         config = read_project(folder)

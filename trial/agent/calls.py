@@ -16,7 +16,7 @@ from trial.recordings import recording
 
 log = logging.getLogger("trial")
 
-_MAX_WARNINGS = 20  # about values that are too large for the recording
+_MAX_WARNINGS = 20  # the most warnings about values that are too large for the recording
 
 
 class Diverged(Exception):

@@ -10,7 +10,7 @@ from trial.core.effects import CloseRecording, Effect, LogAgentError, OpenRecord
 from trial.core.policies import FAILURES
 from trial.core.progress import TrialProgress
 
-_MAX_POLICY_FAILURES = 20  # the most different failures of policies that a trial reports
+_MAX_POLICY_FAILURES = 20  # the most failures of policies, each different, that a trial reports
 _MAX_ERROR = 2000  # the most characters of an error
 
 

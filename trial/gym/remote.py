@@ -101,7 +101,7 @@ class _Maker:
     url: str
     env_id: str
     metadata: dict[str, Any]
-    connection: dict[str, Any] = field(repr=False)  # may hold a token
+    connection: dict[str, Any] = field(repr=False)  # not in the text of this object, since it may hold a token
 
     def __call__(self, **options: Any) -> RemoteEnv:
         return RemoteEnv(self.url, self.env_id, **self.connection, **options)

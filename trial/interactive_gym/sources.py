@@ -32,7 +32,7 @@ _SERVER_FOLDERS = ("", "server", "interactive_gym/server")  # Interactive Gym's 
 _LEFT_OUT = {"__pycache__", "data", "node_modules"}
 _PACKAGE = re.compile(r"(?P<name>[A-Za-z0-9._-]+) *(?:$|[\[<>=!~;@#])")  # what may follow a name: PEP 508
 _INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
-_TAKEN = {"agent", "trial", "protocol"}  # modules on a server that no module of an experiment may hide
+_TAKEN = {"agent", "trial", "protocol"}  # a server's own modules, which no module of an experiment may hide
 _OF_THE_MACHINE = {"sitecustomize", "usercustomize"}
 """Modules that Python imports when it starts. Debian and Ubuntu have theirs outside Python's folders, below /etc."""
 

@@ -169,7 +169,7 @@ def _kind(image: bytes) -> tuple[str, tuple[int, int]]:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a very large image is refused below
+            warnings.simplefilter("ignore")  # Pillow warns of very large images, which are refused below
             with Image.open(io.BytesIO(image), formats=list(_TYPES)) as picture:
                 kind, size = _TYPES[str(picture.format)], picture.size
                 if max(size) <= MAX_SIDE:

@@ -51,7 +51,7 @@ class Builder:
         running = self._running(order)
         if running:
             screen.info("A build of the same content is running already; joining it.")
-        elif order.arrived():  # it ended a moment ago
+        elif order.arrived():  # the build ended a moment ago
             return
         else:
             self._upload(order)
