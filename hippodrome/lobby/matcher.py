@@ -58,7 +58,7 @@ class Matcher:
             new = candidate()
 
         def change(current: Question) -> Question:
-            late = current.candidates().keys() - question.candidates().keys()  # who came after the listing of the folder
+            late = current.candidates().keys() - question.candidates().keys()  # came after the folder was listed
             if new is not None:
                 current = questions.with_candidate(current, new)
             return questions.next_question(
