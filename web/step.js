@@ -158,6 +158,7 @@
   }
 
   let firstInvalid = null;
+  let named = null; // the field that the sentence below the form names
 
   // The browser moves to the first field without a valid answer, and shows a bubble for a moment; this sentence stays.
   function onInvalid(event) {
@@ -165,8 +166,18 @@
     firstInvalid = event.target;
     const name = nameForPeople(firstInvalid);
     const empty = firstInvalid.validity.valueMissing;
-    if (name) say(empty ? TEXT.missing(name) : TEXT.lookAgain(name), true);
+    if (name) {
+      named = firstInvalid;
+      say(empty ? TEXT.missing(name) : TEXT.lookAgain(name), true);
+    }
     setTimeout(() => { firstInvalid = null; });
+  }
+
+  function onInput() {
+    keepDraft();
+    if (!named?.validity.valid) return;
+    named = null;
+    say("");
   }
 
   // Sliders
@@ -211,8 +222,8 @@
   if (!form) return;
   restoreDraft();
   form.querySelectorAll("input[type=range]").forEach(showNumber);
-  form.addEventListener("input", keepDraft);
-  form.addEventListener("change", keepDraft);
+  form.addEventListener("input", onInput);
+  form.addEventListener("change", onInput);
   form.addEventListener("submit", onSubmit);
   form.addEventListener("invalid", onInvalid, true);
   window.addEventListener("pageshow", (event) => { if (event.persisted) idle(); });

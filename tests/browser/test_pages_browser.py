@@ -131,6 +131,28 @@ def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
     assert tab.evaluate("document.activeElement.name") == "r"
 
 
+def test_the_sentence_on_a_missing_answer_goes_when_the_answer_is_given(world: World, tab: Any) -> None:
+    world.source = (
+        "<label>Age <input name=age required></label>"
+        "<fieldset><legend>How are you?</legend><label><input type=radio name=r value=1 required> Fine</label>"
+        "<label><input type=radio name=r value=2> Tired</label></fieldset>"
+    )
+    tab.goto(world.url)
+    for answer, name in (("age", "Age"), ("r", "How are you?")):
+        tab.click("text=Continue")
+        assert tab.inner_text(".status") == f"An answer is missing: “{name}”"
+        if answer == "age":
+            tab.check("text=Tired")
+            tab.evaluate("document.querySelectorAll('[type=radio]').forEach((each) => { each.checked = false; })")
+            assert "Age" in tab.inner_text(".status"), "another answer does not take it away"
+            tab.fill("[name=age]", "30")
+        else:
+            tab.check("text=Tired")
+        assert tab.inner_text(".status") == ""
+    tab.click("text=Continue")
+    tab.wait_for_selector("text=Step 2 of 4")
+
+
 def test_without_a_connection_the_first_click_only_warns(world: World, lone_tab: Any) -> None:
     lone_tab.goto(world.url)
     lone_tab.context.set_offline(True)
