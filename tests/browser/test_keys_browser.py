@@ -102,10 +102,15 @@ def test_an_action_of_two_keys_has_a_button_if_neither_key_has_one(world: World,
 
 
 def test_labels_without_keys_are_the_texts_of_the_usual_buttons(world: World, tab: Any) -> None:
-    world.controls = {"labels": {"fire": "Serve", "left": "To the left"}}
+    world.trial = {"labels": {"fire": "Serve", "left": "To the left"}}
+    world.controls = world.trial
+    tab.set_viewport_size({"width": 1280, "height": 800})
     play(world, tab)
+    shot(tab, "1280-labels")
     assert tab.inner_text("#controls [data-action=fire]") == "Serve"
     assert tab.get_attribute("#controls [data-action=left]", "aria-label") == "To the left"
+    below = tab.evaluate("getComputedStyle(document.querySelector('.pad .left'), '::after').content")
+    assert below == '"To the left"', "also on a computer, where the page lists the keys without the project's texts"
 
 
 # Pages beside the game

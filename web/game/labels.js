@@ -1,12 +1,10 @@
-// The project's labels of arrows: on devices where the page does not list the keys, each stands below its arrow.
+// The project's labels of arrows: each stands below its arrow.
 import { hooks } from "./hooks.js";
 
 const captions = new CSSStyleSheet();
 captions.replaceSync(`
-@media (hover: none), (pointer: coarse) {
-  .pad .named { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
-  .pad .named::after { content: attr(aria-label); display: block; font-size: .65rem; overflow-wrap: anywhere; }
-}`);
+.pad .named { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
+.pad .named::after { content: attr(aria-label); display: block; font-size: .65rem; overflow-wrap: anywhere; }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, captions];
 
 hooks.message.push(({ labels }) => {
