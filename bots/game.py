@@ -152,7 +152,9 @@ class GameConnection:
         """Note what the server says of the game, and press the button that begins it or goes on."""
         play = self._play
         if message.get("error", NOT_POSSIBLE) != NOT_POSSIBLE:  # random keys cause NOT_POSSIBLE
-            self._report.troubles.append(f"the game says: {message['error']}")
+            trouble = f"the game says: {message['error']}"
+            if not message.get("done") or trouble not in self._report.troubles:  # the last message may say it again
+                self._report.troubles.append(trouble)
         if "UI" in message:
             self._turns = message.get("pace") == "turns"
             self._keys = RandomKeys(self._random, message)

@@ -552,6 +552,32 @@ def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: W
     wait_for_next_page(tab, within=4_000)
 
 
+FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+
+
+@pytest.mark.parametrize("own", [None, "Das Spiel ging kaputt."])
+def test_the_end_of_a_game_that_failed_says_so_until_the_participant_goes_on(
+    world: World, stopped_clock_tab: Any, own: str | None
+) -> None:
+    tab = stopped_clock_tab
+    world.more = {"texts": {"saidGameFailed": own}} if own else {}
+    play(world, tab)
+    world.step = 3
+    world.source = "<h1>Next page</h1>"
+    world.connections[0].send(json.dumps({"error": FAILED}))
+    world.connections[0].send(json.dumps({"state": "ended", "episode": 1, "score": 2}))
+    world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 2, "error": FAILED}))
+    tab.wait_for_selector("#overlay-score:visible:text('Your score: 2')")
+    said = own or FAILED
+    assert tab.inner_text("#overlay-hint") == said
+    assert tab.inner_text("#announce") == f"Your score: 2 {said}"
+    assert tab.inner_text("#trouble") == "", "not a second time"
+    tab.clock.run_for(60_000)
+    assert tab.is_visible("#overlay-hint")
+    tab.click("#overlay-button")
+    wait_for_next_page(tab, within=3_900)
+
+
 def test_a_participant_can_go_on_from_the_last_picture_at_once(world: World, stopped_clock_tab: Any) -> None:
     tab = stopped_clock_tab
     play(world, tab)

@@ -197,6 +197,21 @@ def test_no_message_covers_the_last_picture_and_its_score_is_announced(world: Wo
     assert phone.inner_text("#announce") == "Your total score in 3 games: 21"
 
 
+@pytest.mark.parametrize("size", [(320, 568), (360, 640), (568, 320), (740, 360)], ids=lambda size: f"{size[0]}")
+def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
+    world: World, phone: Any, size: tuple[int, int]
+) -> None:
+    play(world, phone, size, {}, ALL)
+    failed = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+    world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1, "error": failed}))
+    phone.wait_for_selector("#overlay-hint:visible:text('cannot go on')")
+    shot(phone, f"{size[0]}-failed")
+    over, stage = box(phone, "#overlay"), box(phone, ".stage")
+    assert over["y"] >= stage["y"], "the line above the picture is not covered"
+    assert over["y"] + over["height"] <= size[1]
+    assert phone.evaluate("(each => each.scrollHeight <= each.clientHeight)(document.getElementById('overlay'))")
+
+
 # Bad Wi-Fi
 
 HANGS = "The connection hangs. Please stay on this page."

@@ -196,7 +196,7 @@ class Client(TakesMessages):
             self.done = "done"
             return
         message = json.loads(data)
-        if "error" in message:
+        if "error" in message and "done" not in message:
             self.errors.append(message["error"])
         elif "UI" in message:
             self.controls = message

@@ -8,6 +8,7 @@ import pytest
 
 from protocol.exits import LATE_AGENT, NO_AGENT
 from trial.agent.agent import Agent, AgentAdapter
+from trial.core.trial import TRIAL_FAILED
 
 BASE = """
 import time
@@ -44,6 +45,8 @@ async def failed_client(server, open_client):
     assert "went wrong" in told
     assert "Traceback" not in told
     assert "boom" not in told
+    outcome = server.answer()["answers"]["outcome"]
+    assert client.done.get("error") == (TRIAL_FAILED if outcome == "failed" else None)
     return client
 
 

@@ -63,6 +63,8 @@ class SendDone:
     score: float
     outcome: str | None = None
     """In a session: how the trial has ended for this member."""
+    words: str | None = None
+    """A sentence that the participant must be able to read at the end; None if there is nothing to say."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -309,10 +309,14 @@ def _scores(score: float, episode_score: float, next_in: float | None) -> dict[s
     return {"score": tidy(score), "episodeScore": tidy(episode_score), **seconds(nextIn=next_in)}
 
 
-def done(episodes: int, score: float, outcome: str | None = None) -> str:
-    """Build the message that says that the trial is over. `outcome`: in a session, how it has ended for this member."""
-    fields = {"done": True, "episodes": episodes, "score": tidy(score)}
-    return json.dumps(fields if outcome is None else {**fields, "outcome": outcome})
+def done(episodes: int, score: float, outcome: str | None = None, words: str | None = None) -> str:
+    """Build the message that says that the trial is over. `outcome`: in a session, how it has ended for this member.
+
+    `words`: a sentence that the participant must be able to read at the end, such as what went wrong.
+    """
+    fields: dict[str, Any] = {"done": True, "episodes": episodes, "score": tidy(score)}
+    fields |= {} if outcome is None else {"outcome": outcome}
+    return json.dumps(fields if words is None else {**fields, "error": words})
 
 
 def error(words: str) -> str:

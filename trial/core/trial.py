@@ -524,7 +524,8 @@ class Trial:
         elif self.settings.session:
             answers = answers.get(human)
         result = records.result(self.progress, client.player, answers, in_session=bool(self.settings.session))
-        self._emit(SendDone(client.connection, *result))
+        outcome = self.progress.outcome if answers is None else answers.get("outcome")
+        self._emit(SendDone(client.connection, *result, words=TRIAL_FAILED if outcome == "failed" else None))
 
     def _take_effects(self) -> list[Effect]:
         effects = self._effects.copy()

@@ -107,7 +107,7 @@ class TrialLoop:
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
             SendPicture: self._send_picture,
-            SendDone: lambda effect: effect.connection.close_done(effect.episodes, effect.score, effect.outcome),
+            SendDone: self._send_done,
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: self._write_line,
             TellMoved: self._callbacks.tell_moved,
@@ -350,6 +350,10 @@ class TrialLoop:
         connection: Any = effect.connection
         connection.rate = effect.frame_rate
         connection.send_state(effect.text)
+
+    def _send_done(self, effect: SendDone) -> None:
+        connection: Any = effect.connection
+        connection.close_done(effect.episodes, effect.score, effect.outcome, effect.words)
 
     def _send_picture(self, effect: SendPicture) -> None:
         connection: Any = effect.connection

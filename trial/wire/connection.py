@@ -175,9 +175,9 @@ class Connection:
             self._closing = (code, last_words)
             self._wake.set()
 
-    def close_done(self, episodes: int, score: float, outcome: str | None = None) -> None:
+    def close_done(self, episodes: int, score: float, outcome: str | None = None, words: str | None = None) -> None:
         """Tell the client that the trial is over, then close. HIPPO's clients get the word `done` instead of JSON."""
-        self.close(_DONE, messages.done(episodes, score, outcome) if self.binary else "done")
+        self.close(_DONE, messages.done(episodes, score, outcome, words) if self.binary else "done")
 
     async def run(self) -> None:
         """Send until the connection is closed."""

@@ -3,13 +3,21 @@ import { hideMessage, overlays, showOverlay } from "./overlay.js";
 import { find, points, setText, showSection } from "./page.js";
 import { loadPage, pageAnswers, pause } from "./requests.js";
 
-// `result` is the server's last message; it lacks the score if the game was not played.
-export async function leave({ score, episodes } = {}) {
-  const scored = typeof score === "number";
-  const text = !scored ? "" : episodes > 1 ? TEXT.totalScore(episodes, points(score)) : TEXT.yourScore(points(score));
-  setText(find("leave-score"), text);
-  find("leave-score").hidden = !scored;
-  const seen = (scored || overlays.over.note ? lastPicture(text) : Promise.resolve()).then(() => showSection("leave"));
+// Shows the last picture until the participant goes on, at most for some seconds; if there is a note to read, for minutes.
+// The parts of the server's last message: it lacks the score if the game was not played; `error` says why it went wrong.
+export async function leave({ score, episodes, error } = {}) {
+  const text = score === undefined ? "" : episodes > 1 ? TEXT.totalScore(episodes, points(score)) : TEXT.yourScore(points(score));
+  if (error) Object.assign(overlays.over, { note: error, band: false });
+  const { note } = overlays.over;
+  showOverlay("over");
+  hideMessage();
+  for (const id of ["leave-score", "overlay-score"]) setText(find(id), text);
+  setText(find("announce"), note ? `${text} ${note}` : text);
+  const seen = new Promise((resolve) => {
+    setTimeout(resolve, note ? 600_000 : 4_000);
+    find("overlay-button").addEventListener("click", resolve);
+    find("overlay-button").focus({ preventScroll: true });
+  }).then(() => showSection("leave"));
   for (;;) {
     try {
       const answers = await pageAnswers();
@@ -20,16 +28,4 @@ export async function leave({ score, episodes } = {}) {
     }
     await pause(2_000);
   }
-}
-
-// Shows the last picture. Resolves after some seconds, or when the participant goes on.
-function lastPicture(text) {
-  showOverlay("over");
-  hideMessage();
-  for (const id of ["overlay-score", "announce"]) setText(find(id), text);
-  return new Promise((resolve) => {
-    setTimeout(resolve, overlays.over.shown);
-    find("overlay-button").addEventListener("click", resolve);
-    find("overlay-button").focus({ preventScroll: true });
-  });
 }

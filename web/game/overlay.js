@@ -12,7 +12,7 @@ export const overlays = {
   unreachable: { title: TEXT.unreachable, note: TEXT.unreachableNote },
   elsewhere: { title: TEXT.elsewhere, button: TEXT.playHere, note: TEXT.elsewhereNote },
   ended: { title: TEXT.saving, band: true },
-  over: { title: TEXT.over, button: TEXT.goOn, band: true, shown: 4_000 }, // ms, if the participant does not go on before
+  over: { title: TEXT.over, button: TEXT.goOn, band: true },
 };
 
 // Shows the overlay with that name; no overlay for names without one, such as "playing".

@@ -9,7 +9,6 @@ import { game } from "./state.js";
 
 const GLANCE = 3_000; // ms for which a participant may look at another page in the game
 const MAX_NAMES = 4; // if there are more players, the page shows their number
-const READ = 600_000; // ms for which the reason of an early end is shown, if the participant does not go on before
 const STATES = { here: "", reads: TEXT.reads, awaited: TEXT.awaited, away: TEXT.away, policy: TEXT.computer };
 const COVERS = ["gathering", "held", "begins"];
 
@@ -157,9 +156,8 @@ function showWhoReads() {
 function noteEnd(message) {
   if (!Object.hasOwn(ENDINGS, message.outcome)) return;
   if (!message.episodes) delete message.score; // no game was played, so there is no score
-  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false, shown: READ });
+  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false });
   setText(find("leave-title"), TEXT.thanks);
-  setTimeout(() => setText(find("announce"), overlays.over.note), 500); // said later than what is announced at every end
 }
 
 find("reading-button")?.addEventListener("click", () => {

@@ -35,7 +35,7 @@ from trial.core.ended import Episode
 from trial.core.flow_control import STALLED_SECONDS, Window
 from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
-from trial.core.trial import Phase, Trial
+from trial.core.trial import TRIAL_FAILED, Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import TrialSettings
 
@@ -176,6 +176,12 @@ def test_a_game_step_that_an_earlier_server_has_answered_is_done_at_once():
     driver.event("already_played", {"episodes": 2, "score": 340})
     assert driver.trial.finished
     assert driver.connect() == [SendDone("tab", 2, 340)]
+
+
+def test_a_client_that_comes_after_a_game_has_failed_is_told_so_with_the_end():
+    driver = Driver()
+    driver.event("already_played", {"episodes": 2, "score": 340, "outcome": "failed"})
+    assert driver.connect() == [SendDone("tab", 2, 340, words=TRIAL_FAILED)]
 
 
 # ---- clients
@@ -424,6 +430,8 @@ def test_an_agent_that_hangs_ends_the_trial_and_is_called_no_more():
     assert not driver.of(Call), "not even for the feedback"
     assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
     assert sent(driver.connect("tab again"))[1] == sent(effects)[0], "whoever comes now is told as well"
+    done = driver.event("answer_saved", driver.now)[-1]
+    assert done == SendDone("tab again", 0, 0, words=TRIAL_FAILED), "the end says so as well"
 
 
 def test_an_agent_that_hangs_on_feedback_ends_the_trial_after_the_episode():

@@ -165,6 +165,8 @@ def test_the_servers_messages_are_json_with_the_names_of_docs_wire(next_in):
         "episodeScore": 1,
     }
     assert json.loads(messages.done(2, 7.0)) == {"done": True, "episodes": 2, "score": 7}
+    failed = {"done": True, "episodes": 2, "score": 7, "error": "It failed."}
+    assert json.loads(messages.done(2, 7.0, words="It failed.")) == failed
     assert json.loads(messages.error("no")) == {"error": "no"}
 
 
