@@ -157,6 +157,7 @@ async def test_the_log_names_the_line_of_a_broken_helper(launch, open_client, tm
 async def test_a_trial_whose_start_never_returns_does_not_begin(launch, open_client):
     server = launch(BASE.replace("self.steps = 0", "time.sleep(1000)"), NAMES, START_SECONDS="1", USER_ID="P-slow")
     await assert_does_not_begin(server, open_client, "P-slow", status=LATE_AGENT)
+    assert "\nagent.py:6: AgentTimeout: no answer within 1 s\n" in server.log_text()
 
 
 def test_a_broken_agent_ends_a_server_without_clients(launch):
@@ -196,6 +197,20 @@ async def test_a_step_that_never_returns_ends_the_trial(launch, open_client):
     assert (answers["outcome"], answers["frames"]) == ("failed", 5)
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     assert [line["kind"] for line in lines] == ["header", "reset"] + ["step"] * 5 + ["error", "end"]
+    assert lines[-2]["error"] == "trial.core.effects.AgentTimeout: no answer within 1 s"
+
+
+async def test_the_log_names_the_line_in_which_a_step_never_returns(launch, open_client, tmp_path):
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent" / "my_helper.py").write_text("def search(user):\n    while True:\n        pass\n")
+    source = "import my_helper\n" + BASE.replace("self.steps += 1", "my_helper.search('P1')")
+    server = launch(source, NAMES, STEP_SECONDS="1")
+    await failed_client(server, open_client)
+    said = server.log_text()
+    assert re.search(r"\nmy_helper\.py:[23]: AgentTimeout: no answer within 1 s\n", said)
+    assert re.search(r'\nTraceback .*\n(  .*\n)*  File ".*agent\.py", line 11, in step\n', said)
+    assert "my_helper.search('(participant)')" in said
+    assert "P1" not in said
 
 
 async def test_a_step_that_hangs_does_not_delay_the_end_of_the_server(launch, open_client):

@@ -20,7 +20,7 @@ def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> s
     frames = whole[: -len(last)] if whole[-len(last) :] == last else whole
     indented = [part for part in last if part.startswith(" ")]  # a SyntaxError quotes the line of the file
     message = " ".join("".join(part for part in last if part not in indented).split())
-    message = message.removeprefix("trial.agent.agent.")
+    message = message.removeprefix("trial.agent.agent.").removeprefix("trial.core.effects.")
     place = where(error, folder)
     return without(private, "".join([*frames, *indented]) + (f"{place}: {message}" if place else message))
 

@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any, TypeVar
 
 from trial.core.effects import AgentTimeout
@@ -87,8 +88,9 @@ class Worker:
     def submit(self, function: Callable[[], Any], limit: float, done: Done) -> None:
         """Call the function on the thread, then `done` on the event loop with its result or exception.
 
-        If the function has not returned after `limit` seconds, `done` gets an AgentTimeout instead. `done` is called
-        exactly once. `submit` must be called from the event loop.
+        If the function has not returned after `limit` seconds, `done` gets an AgentTimeout instead, whose traceback
+        ends in the line in which the thread was then. `done` is called exactly once. `submit` must be called from the
+        event loop.
         """
         loop = asyncio.get_running_loop()
         if self._notifier is None or self._notifier.loop is not loop:
@@ -127,7 +129,17 @@ class Worker:
         if self._waiting:
             self._wake_at(loop, min(job.until for job in self._waiting))
         for job in late:
-            job.done(None, AgentTimeout(f"no answer within {job.limit:g} s"))
+            error = AgentTimeout(f"no answer within {job.limit:g} s")
+            job.done(None, error.with_traceback(self._where()))
+
+    def _where(self) -> TracebackType | None:
+        """Return the present stack of the function that the thread runs, as the traceback of an error raised there."""
+        frame = sys._current_frames().get(self._thread.ident or 0)
+        found: TracebackType | None = None
+        while frame is not None and frame.f_code is not _call.__code__:
+            found = TracebackType(found, frame, frame.f_lasti, frame.f_lineno or 0)
+            frame = frame.f_back
+        return None if frame is None else found
 
     async def call(self, function: Callable[[], T], *, limit: float) -> T:
         """Call the function on the thread. Return its result, or raise its exception.

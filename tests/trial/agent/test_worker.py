@@ -7,6 +7,8 @@ import gc
 import os
 import sys
 import threading
+import traceback
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -45,6 +47,33 @@ def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
     assert [name for name, _ in heard] == ["quick", "late", "slow"]
     assert str(heard[1][1]) == "no answer within 0.05 s"
     assert [heard[0][1], heard[2][1]] == ["quick", True]
+
+
+def test_a_function_that_is_late_is_told_with_the_line_in_which_the_thread_is() -> None:
+    async def work() -> AgentTimeout:
+        worker, free = Worker(), threading.Event()
+        try:
+            await worker.call(lambda: free.wait(PATIENCE), limit=0.05)
+        except AgentTimeout as error:
+            return error
+        finally:
+            free.set()
+            worker.close()
+        raise AssertionError
+
+    frames = traceback.extract_tb(asyncio.run(work()).__traceback__)
+    names = [frame.name for frame in frames]
+    assert names[-2:] == ["wait", "wait"]  # of the event and its condition
+    assert names[-3] == "<lambda>"
+    assert "_call" not in names
+    assert Path(frames[-3].filename).name == "test_worker.py"
+
+
+def test_a_function_that_is_late_while_the_thread_rests_has_no_line() -> None:
+    worker = Worker()
+    worker.close()
+    worker._thread.join()
+    assert worker._where() is None
 
 
 def test_the_limit_of_an_earlier_call_does_not_end_a_later_one() -> None:
