@@ -18,7 +18,8 @@ _HANDLER = re.compile(r"on[a-z]{3,}")
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
 _IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
-_BUTTONS = ("button", "reset", "submit", "image")  # inputs that need no name
+BUTTONS = ("button", "reset", "submit", "image")
+"""The types of inputs that need no name."""
 _LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
@@ -33,13 +34,14 @@ class Tags(PageParser):
         self._own = f"/steps/{config.project.id}/" if config else None
         self._hosts = frozenset(config.project.allowed_hosts) if config else None
         self._found: list[Diagnostic] = []
+        self._unnamed: list[tuple[int, str]] = []  # line and tag of each field without a name
         self._styling = False
 
     def read(self, source: str) -> list[Diagnostic]:
         """Return the problems of a page's tags. Values with Jinja expressions are not checked."""
         self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
         self.close()
-        return self._found
+        return [*self._found, *self._without_a_name()]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = {name: value.strip() for name, value in attributes_of(attrs).items()}
@@ -67,8 +69,19 @@ class Tags(PageParser):
         kind = given.get("type", "").lower() if tag == "input" else tag
         if kind == "file":
             self._mistake("files cannot be sent; take this field out")
-        elif tag in ("input", "select", "textarea") and kind not in _BUTTONS and not given.get("name"):
-            self._remark(f"this <{tag}> has no name, so what is entered there is never sent")
+        elif tag in ("input", "select", "textarea") and kind not in BUTTONS and not given.get("name"):
+            self._unnamed.append((self.getpos()[0], tag))
+
+    def _without_a_name(self) -> list[Diagnostic]:
+        """One remark on all fields without a name: whoever forgets it for one field often does so for all."""
+        if not self._unnamed:
+            return []
+        (first, tag), count = self._unnamed[0], len(self._unnamed)
+        fields = f"this <{tag}> has" if count == 1 else f"{count} fields have"
+        message = f"{fields} no name, so what is entered there is never sent"
+        if count > 1:
+            message += f": {_lines(sorted({line for line, _ in self._unnamed}))}"
+        return [Diagnostic(self._label, first, "", message, remark=True)]
 
     def _style(self, text: str) -> None:
         for found in _IN_STYLE.finditer(text):
@@ -131,3 +144,9 @@ class Tags(PageParser):
 
     def _mistake(self, message: str) -> None:
         self._found.append(Diagnostic(self._label, self.getpos()[0], "", message))
+
+
+def _lines(numbers: list[int]) -> str:
+    """The numbers of lines in words: "line 2", "lines 2, 4 and 5"."""
+    *others, last = numbers
+    return f"lines {', '.join(map(str, others))} and {last}" if others else f"line {last}"

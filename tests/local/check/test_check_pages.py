@@ -243,6 +243,19 @@ def test_good_questions_and_tags_get_no_finding(folder: Path) -> None:
     assert looked(folder) == []
 
 
+def test_fields_without_a_name_are_one_remark_for_each_page(folder: Path) -> None:
+    page(folder, "<input>\n<textarea></textarea><select></select>\n<input name='x'>\n<input type=radio value=a>")
+    assert looked(folder) == [
+        "steps/hello.html:1: remark: 4 fields have no name, so what is entered there is never sent: lines 1, 2 and 4"
+    ]
+    page(folder, "<input>\n<input>", "bye")
+    assert len(looked(folder)) == 2
+    page(folder, "\n<input><input>", "bye")
+    assert looked(folder)[1] == (
+        "steps/bye.html:2: remark: 2 fields have no name, so what is entered there is never sent: line 2"
+    )
+
+
 def test_earlier_answers_are_available_to_pages(folder: Path) -> None:
     page(
         folder,
