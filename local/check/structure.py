@@ -1,4 +1,4 @@
-"""Checks a page as a whole: radio buttons that exclude each other, tags left open, values inside scripts."""
+"""Checks a page as a whole: questions that share a name, tags left open, values inside scripts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from hippodrome.config import Diagnostic
 from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
+from local.check.tags import BUTTONS
 from protocol.values import printable
 
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
@@ -33,7 +34,7 @@ def check_structure(label: str, source: str) -> list[Diagnostic]:
     reader = _Reader(label)
     reader.feed(text)
     reader.close()
-    found += reader.radios()
+    found += [*reader.radios(), *reader.mixed()]
     if _STEP not in text:  # each branch of an {% if %} may open a tag that is closed once
         found += reader.open_tags()
         found += _comments(label, text)
@@ -79,12 +80,14 @@ class _Radio:
 
 
 class _Reader(PageParser):
-    """Notes the radio buttons of a page and the tags that are not closed."""
+    """Notes the names of the fields of a page, its radio buttons, and the tags that are not closed."""
 
     def __init__(self, label: str) -> None:
         super().__init__()
         self._label = label
         self._radios: dict[str, list[_Radio]] = {}
+        self._kinds: dict[tuple[str, int], bool] = {}  # by name and blocks: whether the first field is a radio button
+        self._mixed: dict[str, int] = {}  # by name: the line of the first field that is of the other kind
         self._open: list[tuple[str, int]] = []
         self._left: list[tuple[str, int]] = []
         self._strays: list[tuple[str, int]] = []
@@ -102,12 +105,18 @@ class _Reader(PageParser):
             self._fieldsets.append(self._count)
         elif tag == "tr":
             self._row += 1
-        elif tag == "input" and given.get("type", "").strip().lower() == "radio":
-            name = given.get("name", "")
-            if name and spans.MARK not in name and _STEP not in name:
-                fieldset = self._fieldsets[-1] if self._fieldsets else 0
-                radio = _Radio(self.getpos()[0], given.get("value"), self._blocks, fieldset, self._row)
-                self._radios.setdefault(name, []).append(radio)
+        elif tag in ("input", "select", "textarea"):
+            name, kind = given.get("name", ""), given.get("type", "").strip().lower() if tag == "input" else tag
+            if name and spans.MARK not in name and _STEP not in name and kind not in BUTTONS:
+                self._field(name, kind == "radio", given.get("value"))
+
+    def _field(self, name: str, is_radio: bool, value: str | None) -> None:
+        line = self.getpos()[0]
+        if is_radio:
+            fieldset = self._fieldsets[-1] if self._fieldsets else 0
+            self._radios.setdefault(name, []).append(_Radio(line, value, self._blocks, fieldset, self._row))
+        if self._kinds.setdefault((name, self._blocks), is_radio) != is_radio:
+            self._mixed.setdefault(name, line)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
@@ -151,6 +160,18 @@ class _Reader(PageParser):
                     "give each a name of its own"
                 )
                 yield Diagnostic(self._label, again.line, "", message)
+
+    def mixed(self) -> Iterator[Diagnostic]:
+        """Yield remarks: radio buttons that share their name with a field of another kind, such as a slider.
+
+        Only fields between the same {% … %} are compared.
+        """
+        for name, line in self._mixed.items():
+            message = (
+                f"an earlier question has the name {printable(name, 40)} too, so both answers are stored under it, as "
+                "a list; give each a name of its own"
+            )
+            yield Diagnostic(self._label, line, "", message, remark=True)
 
     @staticmethod
     def _second_question(radios: list[_Radio]) -> _Radio | None:

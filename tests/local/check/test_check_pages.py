@@ -243,6 +243,37 @@ def test_good_questions_and_tags_get_no_finding(folder: Path) -> None:
     assert looked(folder) == []
 
 
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (radio("q", "a", "b"), '<input type="range" name="q">'),
+        ('<input type="range" name="q">\n', radio("q", "a", "b")),
+        (radio("q", "a", "b"), '<textarea name="q"></textarea>'),
+        (radio("q", "a", "b"), '<select name="q"><option>1</option></select>'),
+        (radio("q", "a", "b"), '<input name="q">'),
+    ],
+)
+def test_a_radio_button_and_another_field_of_the_same_name_are_remarked(folder: Path, first: str, second: str) -> None:
+    page(folder, f"<h1>Hello</h1>\n{first}\n{second}")
+    said = "steps/hello.html:4: remark: an earlier question has the name q too, so both answers are stored under it, "
+    assert looked(folder) == [f"{said}as a list; give each a name of its own"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        radio("q", "a", "b") + '<input type="range" name="r"><button name="q" value="c">Go</button>',
+        "{% if group %}" + radio("q", "a", "b") + '{% else %}<input type="range" name="q">{% endif %}',
+        '{% for i in range(2) %}<input type="radio" name="q{{ i }}" value="a">{% endfor %}<input name="q{{ group }}">',
+        '<input type="checkbox" name="q" value="a"><input type="checkbox" name="q" value="b">',
+        '<input name=""><input type="radio" name="" value="a">',
+    ],
+)
+def test_radio_buttons_beside_fields_of_other_names_get_no_remark(folder: Path, text: str) -> None:
+    page(folder, text)
+    assert not [line for line in looked(folder) if "an earlier question" in line]
+
+
 def test_fields_without_a_name_are_one_remark_for_each_page(folder: Path) -> None:
     page(folder, "<input>\n<textarea></textarea><select></select>\n<input name='x'>\n<input type=radio value=a>")
     assert looked(folder) == [
