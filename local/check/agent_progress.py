@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from local.check.outside import Outside
-from local.check.pace import Pace
+from local.check.pace import PLAY_STEPS, Pace
 from trial.recordings import recording
 
-PLAY_STEPS = 5_000  # the most steps in each group
 REPORT_BYTES = 2**20  # a report of this size begins anew
 
 

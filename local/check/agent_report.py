@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 import signal
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ from hippodrome.config import Config, Diagnostic, agent_imports, layout, remarks
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
 from local.check.agent_file import label_of, line_of
-from local.check.pace import Pace
+from local.check.pace import PLAY_STEPS, Pace
 from local.check.remedies import remedy
 from local.check.wording import short
 from protocol import environment as variables
@@ -23,6 +24,7 @@ from protocol.values import KeyPath, printable
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
+ENDLESS = 120.0  # seconds of a participant's play, or PLAY_STEPS, without an end of an episode that get a remark
 
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
@@ -66,6 +68,7 @@ class AgentReport:
             *self._undrawn(),
             *self._outside(),
             *self._too_large(),
+            *self._endless(),
             *self._idle(),
             *self._turns(),
             *self._nobody_matched(),
@@ -168,6 +171,23 @@ class AgentReport:
         message = (
             f"{value['name']!r} in {value['where']} is too large for the recording ({value['size']} bytes; all values "
             "of a step may have a megabyte as JSON): its size is recorded instead"
+        )
+        return [self._at(self._place_of("step"), message, remark=True)]
+
+    def _endless(self) -> list[Diagnostic]:
+        """A remark on episodes that never end, for the first group only.
+
+        With one episode and a button `stop`, participants may be meant to play as long as they like.
+        """
+        report, trial = self._report, self._config.trial
+        steps = report.get("steps", 0)
+        if not report.get("over") or report.get("episodes") or self._group or trial.most_steps < math.inf:
+            return []
+        if steps < min(PLAY_STEPS, ENDLESS * trial.starting_frame_rate) or (trial.max_episodes == 1 and trial.ui.stop):
+            return []
+        message = (
+            f"no episode ended within {steps} steps; if that is not intended, step() must return terminated or "
+            "truncated, or maxSteps or episodeSeconds under trial must end episodes"
         )
         return [self._at(self._place_of("step"), message, remark=True)]
 

@@ -1,8 +1,10 @@
-"""How fast an agent plays: its process measures it, and `make check` reports it."""
+"""How fast and how long an agent plays: its process measures it, and `make check` reports it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+PLAY_STEPS = 5_000  # the most steps in each group
 
 
 @dataclass

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hippodrome.config import read_project
 from local.check import agent as agent_check
-from local.check.agent_report import slowness
+from local.check.agent_report import AgentReport, slowness
 from local.check.pace import Pace
 from testing.exploration import sample
 from testing.waiting import until
@@ -108,6 +110,52 @@ def test_check_says_how_long_it_played_a_game_without_an_end(folder: Path, monke
     said: list[str] = []
     assert agent_check.try_agent(folder, read_project(folder), 60, said.append) == []
     assert re.fullmatch(r"played: 0 of 1 episodes to the end, \d+ steps \(its time was over\)", said[0])
+
+
+ENDLESS = (
+    r"agent\.py:21: remark: no episode ended within \d+ steps; if that is not intended, step\(\) must return terminated "
+    "or truncated, or maxSteps or episodeSeconds under trial must end episodes"
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "remarked"),
+    [
+        ([("maxEpisodes: 1", "maxEpisodes: 2")], True),
+        ([(", stop: true", ", stop: false")], True),
+        ([], False),  # the participant ends the only episode
+        ([("maxEpisodes: 1", "maxEpisodes: 2\n  maxSteps: 90000")], False),
+        ([("maxEpisodes: 1", "maxEpisodes: 2\n  episodeSeconds: 9000")], False),
+    ],
+)
+def test_episodes_that_never_end_are_remarked(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, changes: list[tuple[str, str]], remarked: bool
+) -> None:
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
+    agent(folder, "self.n >= 30", "False")
+    config(folder, "startingFrameRate: 60", "startingFrameRate: 1")
+    for old, new in changes:
+        config(folder, old, new)
+    found = tried(folder)
+    assert len(found) == remarked
+    assert all(re.fullmatch(ENDLESS, line) for line in found)
+
+
+@pytest.mark.parametrize(
+    ("told", "remarked"),
+    [
+        ({"steps": 3_599}, False),
+        ({"steps": 3_600}, True),  # two minutes of play
+        ({"steps": 9_000, "episodes": 1}, False),
+        ({"steps": 9_000, "over": False, "error": {"type": "E", "text": "", "file": "", "line": 0}}, False),
+    ],
+)
+def test_an_episode_that_was_not_played_for_long_may_end(folder: Path, told: dict[str, Any], remarked: bool) -> None:
+    config(folder, "maxEpisodes: 1", "maxEpisodes: 2")
+    config(folder, "startingFrameRate: 60", "startingFrameRate: 30")
+    (folder / "report").write_text(json.dumps({"over": True, "call": "step", "episodes": 0, **told}) + "\n")
+    report = AgentReport(folder, read_project(folder), folder, 60, None)
+    assert any("no episode ended" in str(problem) for problem in report.problems(0)) == remarked
 
 
 def test_a_method_that_is_nearly_a_callback_is_remarked_on(folder: Path) -> None:
