@@ -20,6 +20,9 @@ from protocol.values import path_text
 DEFAULT_GAME = "ALE/MsPacman-v5"
 """The game of a server that is started by hand and whose settings name none. A registered study always names one."""
 
+STEP_SECONDS = 30.0
+"""Seconds in which the agent must take a step or begin an episode, and draw it. `make check` waits no longer either."""
+
 
 class SettingsError(ValueError):
     """The environment or the section `trial` cannot be used. The message names the key and says what is wrong."""
@@ -74,7 +77,7 @@ class TrialSettings:
     agent_dir: Path = Path(".")
     spool: Path | None = None
     start_seconds: float = 300.0
-    step_seconds: float = 30.0
+    step_seconds: float = STEP_SECONDS
     hello_seconds: float = 10.0
     linger_seconds: float = 2.0
     recordings_first_seconds: float = 120.0
@@ -155,7 +158,7 @@ class TrialSettings:
             agent_dir=agent_dir,
             spool=Path(env[variables.SPOOL]).resolve() if env.get(variables.SPOOL) else None,
             start_seconds=_number(env, variables.START_SECONDS, 300.0),
-            step_seconds=_number(env, variables.STEP_SECONDS, 30.0),
+            step_seconds=_number(env, variables.STEP_SECONDS, STEP_SECONDS),
             hello_seconds=_number(env, variables.HELLO_SECONDS, 10.0),
             linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
             recordings_first_seconds=_number(env, variables.RECORDINGS_FIRST_SECONDS, 120.0),

@@ -12,48 +12,80 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.model.matching import MATCH
+from local.check import waiting
 from local.check.agent_report import AgentReport
 from local.check.earlier_answers import EarlierAnswers
 from local.inherited import inherited_environment
 from protocol import environment as variables
 from protocol.handover import Handover
 from trial.server import process_group
+from trial.settings import STEP_SECONDS
 
 SECONDS = 120.0  # seconds in which all calls of the agent must return, in each group
+CALL_SECONDS = STEP_SECONDS  # seconds in which a single call of step, reset or render must return
 PLAY_SECONDS = 20.0  # seconds of playing, in all groups together; the start is not counted
 
 _STACK_SECONDS = 10.0  # seconds more, in which the agent's process must have written down where it hangs
 _SESSION = f"s.{'0' * 20}"
 
 
+class InterruptedCall(KeyboardInterrupt):
+    """The user has interrupted the agent in a call, which `problem` names with its line."""
+
+    def __init__(self, problem: Diagnostic) -> None:
+        super().__init__()
+        self.problem = problem
+
+
 def try_agent(
-    folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
+    folder: Path,
+    config: Config,
+    seconds: float = SECONDS,
+    say: Callable[[str], None] = lambda line: None,
+    say_long: Callable[[str], None] = lambda line: None,
 ) -> list[Diagnostic]:
     """Let the agent play in each group (Hippodrome's agent, if the project has none), and return its problems.
 
     `say` gets a line for each group: how far the agent played. After a mistake in one group the others are not tried.
+    `say_long` gets a line for each call that takes long. Raises InterruptedCall for a KeyboardInterrupt in a call.
     """
     folder = folder.resolve()
     found: list[Diagnostic] = []
     for group in config.each_group:
         with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
             place = Path(temporary)
-            environment = _environment(folder, config, place, seconds, group)
-            environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
-            status = _run(place, environment, layout.agent_folder(folder).resolve(), seconds + _STACK_SECONDS)
-            report = AgentReport(folder, config, place, seconds, group)
+            report, status = _try(folder, config, place, seconds, group, say_long=say_long)
             found += [problem for problem in report.problems(status) if problem not in found]
             if report.played:
                 say(report.how_far())
         if any(not problem.remark for problem in found):
             break
     return found
+
+
+def _try(
+    folder: Path, config: Config, place: Path, seconds: float, group: int | None, *, say_long: Callable[[str], None]
+) -> tuple[AgentReport, int | None]:
+    """Let the agent play in one group. Return its report and the exit status of its process."""
+    environment = _environment(folder, config, place, seconds, group)
+    environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
+    code = layout.agent_folder(folder).resolve()
+    report_now = partial(AgentReport, folder, config, place, seconds, group)
+    try:
+        status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
+    except KeyboardInterrupt:
+        problem = report_now().interrupted()
+        if problem is None:
+            raise
+        raise InterruptedCall(problem) from None
+    return report_now(), status
 
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
@@ -78,6 +110,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
         "SECONDS": str(seconds),
+        "CALL_SECONDS": str(CALL_SECONDS),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
 
@@ -103,14 +136,19 @@ def _question(folder: Path, config: Config) -> dict[str, Any]:
     return {"players": players, "waiting": waiting}
 
 
-def _run(place: Path, environment: Mapping[str, str], folder: Path, seconds: float) -> int | None:
+def _run(
+    place: Path, environment: Mapping[str, str], folder: Path, seconds: float, long: Callable[[], None]
+) -> int | None:
     """Run the agent's process; return its exit status, or None if it had to be killed."""
-    with (place / "output").open("wb") as output:
-        return process_group.run(
-            [sys.executable, "-P", "-m", "local.check.agent_process", str(place / "report")],
-            seconds,
+    report = place / "report"
+    with (
+        (place / "output").open("wb") as output,
+        process_group.started(
+            [sys.executable, "-P", "-m", "local.check.agent_process", str(report)],
             env=environment,
             cwd=folder,
             stdout=output,
             stderr=subprocess.STDOUT,
-        )
+        ) as process,
+    ):
+        return waiting.wait(process, seconds, report, long)

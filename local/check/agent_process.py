@@ -7,18 +7,17 @@ Runs in a process of its own, since the agent may hang or end Python. `local/che
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import json
 import os
 import sys
 import threading
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar
 
 from local.check import idle
 from local.check.agent_progress import AgentProgress
+from local.check.deadline import Deadline
 from local.check.game import CheckedGame
 from local.check.one_player import OnePlayer
 from local.check.outside import Outside
@@ -64,35 +63,11 @@ class _EarlyEnviron(os._Environ[str]):
                 self.lines.append(place)
 
 
-class _Deadline:
-    """Ends the process when the time is over, and writes down in which line each thread was."""
-
-    def __init__(self, stack: IO[str], seconds: float) -> None:
-        self._stack, self._at = stack, time.monotonic() + seconds
-        self._set(seconds)
-
-    @contextlib.contextmanager
-    def within(self, seconds: float) -> Iterator[None]:
-        """Within the block, the time is over after so many seconds, if not earlier."""
-        self._set(min(seconds, self._left))
-        try:
-            yield
-        finally:
-            self._set(self._left)
-
-    @property
-    def _left(self) -> float:
-        return max(0.001, self._at - time.monotonic())  # faulthandler refuses 0
-
-    def _set(self, seconds: float) -> None:
-        faulthandler.dump_traceback_later(seconds, exit=True, file=self._stack)
-
-
-def _try(report: Path, deadline: _Deadline) -> None:
+def _try(report: Path, deadline: Deadline) -> None:
     """Let the agent play, and write to the report how far it got."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = AgentProgress(report, folder, Outside(config.scene), _EarlyEnviron.lines)
+    progress = AgentProgress(report, folder, Outside(config.scene), _EarlyEnviron.lines, deadline)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     given = _handover()
     group = given.group if given else _group()
@@ -112,7 +87,7 @@ def _try(report: Path, deadline: _Deadline) -> None:
         return joint.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
-    if question and not _matches(adapter, question, progress, deadline):
+    if question and not progress.call("match", lambda: _match(adapter, question, progress)):
         return
     progress.known = _actions(player, config)
     if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
@@ -133,15 +108,6 @@ def _try(report: Path, deadline: _Deadline) -> None:
         _note_idle(joint, players, config, progress)
         if game.close():
             progress.over()
-
-
-def _matches(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress, deadline: _Deadline) -> bool:
-    """Whether `match` returns a correct answer within the time that it has on a server."""
-    progress.known["within"] = match.SECONDS
-    with deadline.within(match.SECONDS):
-        went_well = progress.call("match", lambda: _match(adapter, question, progress))
-    del progress.known["within"]
-    return went_well
 
 
 def _match(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress) -> None:
@@ -254,7 +220,7 @@ def _foreign_actions(env: Any, actions: range) -> list[int]:
 
 def _main(report: Path) -> None:
     with report.with_suffix(".stack").open("w") as stack:
-        deadline = _Deadline(stack, float(os.environ.pop("SECONDS")))
+        deadline = Deadline(stack, *(float(os.environ.pop(name)) for name in ("SECONDS", "CALL_SECONDS")))
         thread = threading.Thread(
             target=_try, args=[report, deadline], daemon=True
         )  # as in a server, not the main thread

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from local.check.deadline import Deadline
 from local.check.outside import Outside
 from local.check.pace import PLAY_STEPS, Pace
 from trial.recordings import recording
@@ -29,9 +30,18 @@ class AgentProgress:
     """
 
     def __init__(
-        self, report: Path, folder: Path, outside: Outside, early: Sequence[tuple[str, str, int]] = ()
+        self,
+        report: Path,
+        folder: Path,
+        outside: Outside,
+        early: Sequence[tuple[str, str, int]] = (),
+        deadline: Deadline | None = None,
     ) -> None:
-        """`early`: the project's lines that read the participant too early: variable, file, line. It may still grow."""
+        """`early`: the project's lines that read the participant too early: variable, file, line. It may still grow.
+
+        `deadline` limits each call.
+        """
+        self._deadline = deadline
         self._report, self._folder, self._outside = report, folder, outside
         self._early = early
         self._file: io.FileIO | None = None
@@ -60,7 +70,8 @@ class AgentProgress:
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
         """Report the name, call the function and keep its `result`. Return False if it raised, which is reported."""
-        self._write(call=name)
+        within = self._deadline.begin(name) if self._deadline else None
+        self._write(call=name, within=within)
         try:
             self.result = function()
         except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure too

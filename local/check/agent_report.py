@@ -14,6 +14,7 @@ from typing import Any
 from hippodrome.config import Config, Diagnostic, agent_imports, layout, remarks
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
+from local.check import waiting
 from local.check.agent_file import label_of, line_of
 from local.check.pace import PLAY_STEPS, Pace
 from local.check.remedies import remedy
@@ -24,6 +25,7 @@ from protocol.values import KeyPath, printable
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
+INTERRUPTED = 1.0  # seconds that a call must have taken to be named when it is interrupted
 ENDLESS = 120.0  # seconds of a participant's play, or PLAY_STEPS, without an end of an episode that get a remark
 
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
@@ -46,6 +48,7 @@ class AgentReport:
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
         self._group = group
+        self._waited = waiting.call_seconds(place / "report")
         self._code = layout.agent_folder(folder).resolve()
         self._label = label_of(folder)
         try:
@@ -87,6 +90,20 @@ class AgentReport:
         episodes, steps, most = report.get("episodes", 0), report.get("steps", 0), self._config.trial.max_episodes
         rest = "" if not report.get("over") or episodes >= most else " (its time was over)"
         return f"played{where}: {episodes} of {most} episodes to the end, {steps} steps{rest}"
+
+    def still(self) -> str:
+        """Return a line that names the call that has not come back yet."""
+        call = self._call()
+        return f"still {call} …" if self._report.get("call") == "policies" else f"still in {call} …"
+
+    def interrupted(self) -> Diagnostic | None:
+        """Return the call that the user has interrupted; None if it had begun just before."""
+        if not self._report or self._waited < INTERRUPTED:
+            return None
+        hung = self._hung(self._stack())
+        return self._at(
+            hung, f"{self._call()} had not come back after {self._waited:.0f} s{self._where()}: interrupted"
+        )
 
     def _where(self) -> str:
         """The place in the game, in parentheses; empty before the second step of the first group."""
@@ -186,8 +203,8 @@ class AgentReport:
         if steps < min(PLAY_STEPS, ENDLESS * trial.starting_frame_rate) or (trial.max_episodes == 1 and trial.ui.stop):
             return []
         message = (
-            f"no episode ended within {steps} steps; if that is not intended, step() must return terminated or "
-            "truncated, or maxSteps or episodeSeconds under trial must end episodes"
+            f"no episode ended within {steps} steps of random play; if that is not intended, step() must return "
+            "terminated or truncated, or maxSteps or episodeSeconds under trial must end episodes"
         )
         return [self._at(self._place_of("step"), message, remark=True)]
 
@@ -253,6 +270,8 @@ class AgentReport:
                 message = f"{call} has not come back within {self._allowed:g} s{self._where()}"
                 if report.get("call") == "match":
                     message += ": a server waits no longer, and matches nobody"
+                elif report.get("within"):
+                    message += ": a server waits no longer either"
                 if hung is None and player is not None:
                     return [self._in_config(self._player(player), message)]
                 return [self._at(hung, message)]
@@ -274,7 +293,7 @@ class AgentReport:
     @property
     def _allowed(self) -> float:
         """The seconds that the last call had."""
-        within: float = self._report.get("within", self._seconds)
+        within: float = self._report.get("within") or self._seconds
         return min(self._seconds, within)
 
     def _of_players(self, error: Mapping[str, Any], place: tuple[str, int] | None) -> Diagnostic | None:

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import pty
 import re
+import select
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -12,11 +19,14 @@ import pytest
 
 from hippodrome.config import read_project
 from local.check import agent as agent_check
+from local.check import waiting
 from local.check.agent_report import AgentReport, slowness
 from local.check.pace import Pace
 from testing.exploration import sample
+from testing.preloaded import interruptible
 from testing.waiting import until
 from tests.local.check.checking import agent, config, looked, page, run, tried
+from tests.local.conftest import ROOT
 
 pytestmark = pytest.mark.usefixtures("forked")
 
@@ -113,8 +123,8 @@ def test_check_says_how_long_it_played_a_game_without_an_end(folder: Path, monke
 
 
 ENDLESS = (
-    r"agent\.py:21: remark: no episode ended within \d+ steps; if that is not intended, step\(\) must return terminated "
-    "or truncated, or maxSteps or episodeSeconds under trial must end episodes"
+    r"agent\.py:21: remark: no episode ended within \d+ steps of random play; if that is not intended, step\(\) must "
+    "return terminated or truncated, or maxSteps or episodeSeconds under trial must end episodes"
 )
 
 
@@ -367,6 +377,97 @@ def test_an_agent_that_hangs_is_reported(folder: Path) -> None:
     began = time.monotonic()
     assert tried(folder, 4) == ["agent.py:8: step(0) has not come back within 4 s"]
     assert time.monotonic() - began < 10
+
+
+@pytest.mark.parametrize(
+    ("old", "line", "call"),
+    [
+        ("self.n += 1", 8, "step(0)"),
+        ("self.n = 0", 5, "reset()"),
+        ("return np.zeros((16, 16, 3), np.uint8)", 11, "render()"),
+    ],
+)
+def test_a_single_call_is_given_up_when_a_server_gives_it_up(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, old: str, line: int, call: str
+) -> None:
+    assert agent_check.CALL_SECONDS == 30
+    monkeypatch.setattr(agent_check, "CALL_SECONDS", 1.5)
+    agent(folder, "import numpy as np", "import time; import numpy as np; time.sleep(2)")  # the start may take longer
+    agent(folder, old, "time.sleep(1000)")
+    said = f"agent.py:{line}: {call} has not come back within 1.5 s: a server waits no longer either"
+    assert tried(folder) == [said]
+
+
+def test_calls_that_take_less_than_the_limit_may_take_longer_together(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(agent_check, "CALL_SECONDS", 3.0)
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
+    agent(folder, "self.n += 1", "import time; time.sleep(0.9); self.n += 5")
+    assert not [line for line in tried(folder) if "has not come back" in line]
+
+
+def test_a_call_that_takes_long_is_named_while_it_runs_and_when_it_is_interrupted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waiting, "LONG", 1.5)
+    agent(folder, "self.n += 1", "import time; self.n += 1; time.sleep(1000 if self.n == 3 else 0)")
+    said: list[str] = []
+
+    def interrupts(line: str) -> None:
+        said.append(line)
+        raise KeyboardInterrupt
+
+    with pytest.raises(agent_check.InterruptedCall) as interrupted:
+        agent_check.try_agent(folder, read_project(folder), 60, say_long=interrupts)
+    call = re.fullmatch(r"still in (step\([01]\)) …", said[0])
+    assert call
+    assert re.fullmatch(
+        rf"agent\.py:8: {re.escape(call[1])} had not come back after \d+ s \(episode 1, after 2 steps in all\): interrupted",
+        str(interrupted.value.problem),
+    )
+
+
+def test_calls_that_come_back_soon_are_not_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(waiting, "LONG", 3.0)
+    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
+    agent(folder, "self.n += 1", "import time; time.sleep(0.4); self.n += 3")
+    said: list[str] = []
+    agent_check.try_agent(folder, read_project(folder), 60, say_long=said.append)
+    assert said == []
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_ctrl_c_names_the_call_and_its_line(folder: Path, terminal: bool) -> None:
+    agent(folder, "self.n += 1", "import time; time.sleep(1000)")
+    keyboard, screen = pty.openpty() if terminal else os.pipe()
+    check = subprocess.Popen(
+        [sys.executable, "-m", "local.check", str(folder)],
+        cwd=ROOT,
+        stdout=screen,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=interruptible,  # noqa: PLW1509 - it sets a signal and no more
+    )
+    os.close(screen)
+    shown = b""
+    try:
+        awaited = b"still in step(0) \xe2\x80\xa6" if terminal else b"trying agent.py"
+        while awaited not in shown:
+            shown += os.read(keyboard, 1000)
+        if not terminal:
+            time.sleep(7)
+            assert not select.select([keyboard], [], [], 0)[0]
+        check.send_signal(signal.SIGINT)
+        assert check.wait(30) == 130
+        with contextlib.suppress(OSError):  # a terminal that nobody has open any more
+            while part := os.read(keyboard, 1000):
+                shown += part
+    finally:
+        check.kill()
+        check.wait()
+        os.close(keyboard)
+    (last,) = re.findall(r"agent\.py:8: .*", shown.decode())
+    assert re.fullmatch(r"agent\.py:8: step\(0\) had not come back after \d+ s: interrupted\r?", last)
 
 
 def test_processes_of_the_agent_end_with_the_check(folder: Path, tmp_path: Path) -> None:
