@@ -104,7 +104,7 @@ test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 	@$(PYTEST)
 
 .PHONY: quick
-quick: $(VENV)/dev ## run the tests of the pure core and the services, in less than a minute
+quick: $(VENV)/dev $(MINISTACK)/ready ## run the tests of the pure core and the services, in less than a minute
 	@$(PYTEST) $(QUICK)
 
 # With SEED=0 the examples differ each time; hypothesis prints the line that repeats a failure.
