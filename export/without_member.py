@@ -90,7 +90,7 @@ class _Erased:
     def _is_theirs(self, line: Mapping[str, Any]) -> bool:
         kind = line.get("kind")
         if kind == "presence":
-            # A line with a `seed` stays: whoever repeats the game needs it for the policy that replaced the member.
+            # A line with a `seed` stays: a repetition of the game needs it for the policy that replaced the member.
             return self._is(line.get("player")) and "seed" not in line
         if kind == "ping":
             trips = line.get("roundTrip")

@@ -35,8 +35,8 @@ def command(
 ) -> int:
     """Print a signed link for each participant, as CSV: userId,link. Nothing is changed.
 
-    Whoever opens a link is that participant: give each link to one person only. The same id always gives the same link,
-    for as long as the project is registered.
+    A person who opens a link is that participant: give each link to one person only. The same id always gives the same
+    link, for as long as the project is registered.
     """
     from deploy.core.study_selection import project_id  # noqa: PLC0415 - only here
 

@@ -218,8 +218,8 @@ def _owner_environment(project: Project, record: Server, settings: Settings) -> 
     deadline = record.deadline
     if record.is_warm_server:
         owner = {environment.WARM_SERVER: "on"}
-        # So much later, because whoever is assigned the server at the last moment still gets all of maxRuntime, and a
-        # session also the time to wait for its members.
+        # So much later, because a participant who is assigned the server at the last moment still gets all of
+        # maxRuntime, and a session also the time to wait for its members.
         deadline += lifetime_asked_for(project, settings)
     elif record.is_of_session:
         owner = {environment.SESSION: record.user_id}

@@ -73,7 +73,7 @@ class Tags(PageParser):
             self._unnamed.append((self.getpos()[0], tag))
 
     def _without_a_name(self) -> list[Diagnostic]:
-        """One remark on all fields without a name: whoever forgets it for one field often does so for all."""
+        """One remark on all fields without a name: a name that is missing once is often missing everywhere."""
         if not self._unnamed:
             return []
         (first, tag), count = self._unnamed[0], len(self._unnamed)
