@@ -240,6 +240,30 @@ def test_step_pages_work_without_javascript(world: World, chromium: Any) -> None
 # The game
 
 
+MARK = "getComputedStyle(document.querySelector('.stages [aria-current]'), '::before').boxShadow"
+
+
+def test_the_mark_of_the_stage_beats_with_the_clock_and_nothing_is_drawn_in_between(
+    world: World, stopped_clock_tab: Any
+) -> None:
+    """An animation would keep a phone drawing for as long as the participant waits."""
+    tab = stopped_clock_tab
+    world.step = 2
+    tab.goto(world.url)
+    tab.wait_for_selector(".stages:visible")
+    marks = []
+    for _ in range(4):
+        marks.append(tab.evaluate(MARK))
+        assert tab.evaluate("document.getAnimations().length") == 0
+        tab.clock.run_for(1_000)
+    assert marks[:2] == marks[2:]
+    assert marks[0] != marks[1]
+    tab.emulate_media(reduced_motion="reduce")
+    still = tab.evaluate(MARK)
+    tab.clock.run_for(1_000)
+    assert tab.evaluate(MARK) == still
+
+
 def test_the_page_goes_from_waiting_to_the_game_without_a_reload(world: World, tab: Any) -> None:
     world.step = 2
     tab.goto(world.url)

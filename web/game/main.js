@@ -14,7 +14,7 @@ import { loadPage, pause, pollUntilAnswered } from "./requests.js";
 import { game } from "./state.js";
 import { showStatus } from "./status.js";
 import { clearDrafts } from "./storage.js";
-import { isOver, noteRestart, pollDelay, restartedFor, showClock, showWaiting } from "./waiting.js";
+import { beat, isOver, noteRestart, pollDelay, restartedFor, showWaiting } from "./waiting.js";
 
 const HANGS = TEXT.hangs;
 const SILENT = 4_500; // ms without a message in a game, although the server was asked
@@ -103,7 +103,7 @@ function checkForHang() {
 }
 
 clearDrafts();
-setInterval(() => find("wait").hidden || showClock(), 1_000);
+setInterval(() => find("wait").hidden || beat(), 1_000);
 setInterval(checkForHang, 1_000);
 setInterval(countDown, 200);
 find("again").addEventListener("submit", noteRestart);

@@ -36,7 +36,13 @@ export function showWaiting(state) {
   waiting.stage = state.state;
 }
 
-export function showClock() {
+// Once a second.
+export function beat() {
+  find("wait").classList.toggle("beat");
+  showClock();
+}
+
+function showClock() {
   const seconds = Math.max(0, Math.round((performance.now() - waiting.since) / 1000));
   find("elapsed").textContent = TEXT.waiting(duration(seconds));
   if (!waiting.typical) return;
