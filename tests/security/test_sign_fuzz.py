@@ -15,7 +15,7 @@ from testing import aws_events, exploration
 from tests.security.hostile import TEXTS
 from tests.security.test_servers_without_rights import MALLORY, Site
 
-BODIES = 1_000 * max(exploration.TIMES, 1)
+BODIES = exploration.examples(1_000)
 TOWN = Site()
 OWN, CREDENTIAL = TOWN.mallory.name, TOWN.credential
 ANSWER = f"maze/users/{MALLORY}/answers/3.json"

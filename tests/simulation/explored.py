@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import pytest
 
-from testing.exploration import sample
+from testing.exploration import sample_of_each
 from testing.simulation import faults
 from testing.simulation.faults import SimulatedJourney
 from testing.simulation.world import SimulatedWorld
 
 
 def assert_no_fault_does_harm(journey: SimulatedJourney, seed: int, tried: int | None = None) -> None:
-    """Run the journey with a fault at so many of its calls (without a number, at a thirtieth of them): each run must end well."""
+    """Run the journey with each kind of fault at one of `tried` calls: each run must end well.
+
+    Without a number, at one of 150 calls, and of more than 600 calls at four.
+    """
     points = faults.points(journey, seed)
     assert len(points) > 100
-    tried = tried or max(24 * len(faults.FAULTS), len(points) // 30)
-    outcomes = [faults.run(journey, seed, point)[1] for point in sample(points, tried)]
+    tried = tried or max(150, len(points) // len(faults.FAULTS) // 4)
+    outcomes = [
+        faults.run(journey, seed, point)[1] for point in sample_of_each(points, tried, lambda point: point.fault)
+    ]
     assert all("crash" in outcome.story or "reply lost" in outcome.story for outcome in outcomes)
     bad = [outcome for outcome in outcomes if not outcome.well]
     assert not bad, f"{len(bad)} of {len(outcomes)}; the first: {bad[0]}"
