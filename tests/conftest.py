@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import shutil
 import signal
 import socketserver
 import time
@@ -18,7 +19,7 @@ from _pytest.unraisableexception import gc_collect_iterations_key
 from werkzeug.serving import BaseWSGIServer
 
 from testing import exploration, memoized_aws
-from tests.forked_workers import pytest_xdist_setupnodes  # noqa: F401 - it is a hook
+from tests import files_in_memory, forked_workers
 from tests.scheduling import interleaved
 
 TESTS = Path(__file__).resolve().parent
@@ -42,8 +43,14 @@ ONE_AFTER_ANOTHER = (
 
 Of two places that fit a test, the longer one counts.
 """
-WAITING = ("tests/e2e/", "tests/examples/", "tests/local/", "tests/trial/")
-"""Folders whose tests mostly wait for processes. They run beside tests that compute: a machine is best used by both at once."""
+WAITING = (
+    ("tests/e2e/", "tests/trial/test_", "tests/trial/wire/"),
+    ("tests/examples/", "tests/local/", "tests/trial/interactive_gym/"),
+)
+"""Two kinds of tests that wait for processes: nearly all the time, and mostly.
+
+They run beside tests that compute, and beside each other: a machine is best used by all kinds at once.
+"""
 _PLACES = sorted(
     ((place, number) for number, places in enumerate(ONE_AFTER_ANOTHER) for place in places),
     key=lambda entry: -len(entry[0]),
@@ -76,13 +83,16 @@ def _turn(item: pytest.Item) -> int:
 
 
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
-    """Groups first; then the files of both kinds, `WAITING` or not. The last tests are none that wait while the machine has no more to do."""
+    """Groups first; then files of all kinds, `WAITING` or not. The last tests are none that wait while the machine has no more to do."""
     others = Counter(sorted(_file(item) for item in items if _group(item.nodeid) is None))
     places = {
-        file: place * (0.85 if file.startswith(WAITING) else 1)
-        for file, place in interleaved(others, lambda file: file.startswith(WAITING)).items()
+        file: place * (1 if _waiting(file) is None else 0.85) for file, place in interleaved(others, _waiting).items()
     }
     return sorted(items, key=lambda item: (_turn(item), places.get(_file(item), 0), item.path))
+
+
+def _waiting(file: str) -> int | None:
+    return next((kind for kind, places in enumerate(WAITING) if file.startswith(places)), None)
 
 
 def _file(item: pytest.Item) -> str:
@@ -129,6 +139,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return InUnits(config, log, _group)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: Sequence[Any]) -> None:
+    """Before the workers start, decide where their temporary files are and how they start."""
+    if folder := files_in_memory.use():
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    forked_workers.pytest_xdist_setupnodes(config, specs)
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
     """What is imported by now stays: the garbage collector need not look through it again and again (8 % of the time).
 
@@ -140,8 +158,14 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Look for garbage once when all is over; pytest's five times take each worker seconds and find no more."""
-    config.stash[gc_collect_iterations_key] = 1
+    """Do not look for garbage when all is over: pytest would five times, and nobody reads what it finds then."""
+    config.stash[gc_collect_iterations_key] = 0
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish() -> None:
+    """Python itself looks for garbage twice at its end, which takes each worker seconds. It need not look through what is left."""
+    gc.freeze()
 
 
 _BEGUN = time.monotonic()
