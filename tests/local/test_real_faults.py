@@ -32,7 +32,15 @@ from tests.local.walk import Walker, at_the_game
 from trial.recordings import recording
 
 Make = Callable[..., Local]
-SHARED = Path("/dev/shm")
+OTHER = next(
+    (
+        place
+        for place in (Path("/dev/shm"), Path("/var/tmp"))
+        if place.is_dir() and place.stat().st_dev != Path(tempfile.gettempdir()).stat().st_dev
+    ),
+    None,
+)
+"""A folder on another file system than that of the temporary files."""
 linux = pytest.mark.skipif(
     sys.platform != "linux", reason="the limits of a running process are changed with prlimit(2)"
 )
@@ -84,12 +92,12 @@ def goes_on(here: Local, walker: Walker) -> None:
 
 
 @pytest.mark.skipif(
-    not SHARED.is_dir() or SHARED.stat().st_dev == Path(tempfile.gettempdir()).stat().st_dev,
+    OTHER is None,
     reason="there is no other file system here; test_faults.py has the same with links that are refused",
 )
 def test_a_study_goes_on_with_its_state_on_another_file_system(local: Make) -> None:
     here = local(frames=240, holds=120)
-    other = Path(tempfile.mkdtemp(dir=SHARED))
+    other = Path(tempfile.mkdtemp(dir=OTHER))
     try:
         (here.place / ".hippodrome").symlink_to(other)
         here.run()
