@@ -13,7 +13,10 @@ from trial.recordings.recording import read
 
 
 class HeldStudy(StudyProcess):
-    """A `StudyProcess` whose imports are done when it starts. With `port`, it can be started again at the same port."""
+    """A `StudyProcess` whose imports are done when it starts, and those of its servers, too (`forked_servers.py`).
+
+    With `port`, it can be started again at the same port.
+    """
 
     def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
         super().__init__(folder, data, log=log)
@@ -21,7 +24,8 @@ class HeldStudy(StudyProcess):
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         options["env"] = {**options["env"], "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT)}
-        return preloaded.start("local", [*arguments, "--port", str(self._port)], **options)  # the last --port counts
+        arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
+        return preloaded.start("testing.forked_servers", arguments, starts=True, **options)
 
     def steps_written(self, owner: str = "*") -> int:
         """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""

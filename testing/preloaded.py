@@ -50,6 +50,7 @@ OTHERS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
 
 _ASKS = "ASKS_FOR_PROCESSES"  # the variable with the file descriptor at which a process asks its forker for others
 _asks_at = os.environ.pop(_ASKS, "")
+_ROOM = "ROOM"  # a long variable and a long argument: room for those that `forked_servers.py` lets the system show
 
 
 class Forked:
@@ -207,7 +208,11 @@ def _forker(kind: str) -> socket.socket:
     """Return a socket to the forker of this kind (a key of `OTHERS`, or empty), which ends with the tests."""
     if _asks_at and not kind:
         return socket.socket(fileno=int(_asks_at))
-    return _new_forker(kind, ROOT, _environment(kind))
+    return new_forker(_modules(kind), ROOT, _environment(kind))
+
+
+def _modules(kind: str) -> Sequence[str]:
+    return OTHERS[kind][0] if kind else LOADED
 
 
 def start_all() -> None:
@@ -225,7 +230,7 @@ def _forker_of_copy(kind: str, root: Path, env: Mapping[str, str]) -> socket.soc
 @functools.cache
 def _forker_of_code(kind: str, root: Path, read: tuple[tuple[str, str], ...], _code: str) -> socket.socket:
     others = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON") and name not in _SIZE}
-    return _new_forker(kind, root, {**others, **dict(read)})
+    return new_forker(_modules(kind), root, {**others, **dict(read)})
 
 
 def _state_of_code(root: Path) -> str:
@@ -234,17 +239,19 @@ def _state_of_code(root: Path) -> str:
     return hashlib.sha256(repr([(path, s.st_mtime_ns, s.st_size) for path, s in files]).encode()).hexdigest()
 
 
-def _new_forker(kind: str, root: Path, env: Mapping[str, str]) -> socket.socket:
+def new_forker(modules: Sequence[str], root: Path, env: Mapping[str, str]) -> socket.socket:
+    """Start a forker that has loaded these modules, those of the project from `root`. It ends when the socket is closed."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     with theirs:
         subprocess.Popen(
             [
                 *(sys.executable, "-m", "testing.preloaded", str(theirs.fileno()), str(root)),
-                *(OTHERS[kind][0] if kind else LOADED),
+                *modules,
+                " " * 2000,
             ],
             cwd=ROOT,
-            env=env,
+            env={**env, _ROOM: " " * 8000},
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
         )
@@ -331,10 +338,11 @@ def _text(number: int, errors: str) -> io.TextIOWrapper:
 
 def _main() -> dict[str, Any] | None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests'; they end this process
+    del os.environ[_ROOM]
     before = dict(os.environ)
     sys.path[0] = sys.argv[2]
     with socket.socket(fileno=int(sys.argv[1])) as requests:
-        for name in sys.argv[3:]:
+        for name in sys.argv[3:-1]:
             importlib.import_module(name)
             if name == AGENT or name.endswith(".__main__"):
                 del sys.modules[name]  # it runs as the main module
