@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 def server() -> Iterator[GymServerProcess]:
     """A server with the environments of `odd_environments.py`, and limits that a test can reach."""
     limits = ("--seconds", "1", "--environments", "8", "--processes", "4", "--megabytes", "300")
-    with gym_server("--import", "odd_environments", *limits, env={"PYTHONPATH": str(HERE)}) as found:
+    with gym_server("--import", "odd_environments", *limits, cwd=HERE) as found:
         yield found
 
 

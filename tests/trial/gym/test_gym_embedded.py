@@ -251,7 +251,7 @@ def test_a_server_of_the_tests_ends_by_ctrl_c_where_their_shell_ignores_it() -> 
     """A shell starts its background jobs with SIGINT ignored, and processes inherit that."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with gym_server() as found:
+        with gym_server(anew=True) as found:
             began = time.monotonic()
         assert time.monotonic() - began < 10
         assert not Path(f"/proc/{found.pid}").exists()

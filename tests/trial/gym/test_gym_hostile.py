@@ -35,7 +35,7 @@ def nothing_stays_behind(server: GymServerProcess) -> Iterator[None]:
 def patient_server() -> contextlib.AbstractContextManager[GymServerProcess]:
     """Return a server of its own, which gives environments ten minutes for each call."""
     odd = ("--import", "odd_environments", "--seconds", "600")
-    return gym_server(*odd, env={"PYTHONPATH": str(Path(__file__).parent)})
+    return gym_server(*odd, cwd=Path(__file__).parent)
 
 
 def descendants(server: GymServerProcess) -> list[psutil.Process]:

@@ -61,7 +61,7 @@ def test_the_command_of_the_documentation_converts_the_recordings() -> None:
 
 def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) -> None:
     with (
-        gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
+        gym_server("--record", str(tmp_path), *ODD, cwd=HERE) as server,
         TextClient(server.url + "?form=gymnasium") as client,
     ):
         made = client.make("Odd/Continuous-v0", num_envs=2)
@@ -76,7 +76,7 @@ def test_the_environments_of_a_vector_are_recorded_one_by_one(tmp_path: Path) ->
 
 def test_an_environment_of_gyms_old_kind_is_recorded(tmp_path: Path) -> None:
     with (
-        gym_server("--record", str(tmp_path), *ODD, env={"PYTHONPATH": str(HERE)}) as server,
+        gym_server("--record", str(tmp_path), *ODD, cwd=HERE) as server,
         TextClient(server.url) as client,
     ):
         made = client.make("Odd/Old-v0")
