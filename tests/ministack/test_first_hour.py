@@ -102,7 +102,7 @@ def test_problems_are_reported_in_the_words_of_the_page(
 
 def types(newcomer: Newcomer, command: str, exit_code: int = 0, answer: str = "") -> None:
     """Run a command of the page, and check that it prints what the page shows."""
-    code, printed = newcomer.types(command, answer=answer)
+    code, printed = newcomer.types(command, answer=answer, anew=command == "make doctor")
     assert code == exit_code, printed
     assert first_hour.differs(first_hour.shown()[command], printed) == "", printed
 
