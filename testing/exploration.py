@@ -4,7 +4,8 @@
 the same verdict within minutes. `make hunt` sets the environment variable HUNT, and runs only
 
 * tests with the mark `hunt`, which `make test` leaves out,
-* tests with the mark `explores`, which then take all their cases instead of a sample (`sample`),
+* tests with the mark `explores`, which then take all their cases instead of a sample (`sample`), or the Chromium that
+  people have instead of the one without windows,
 * hypothesis tests, with 2 * HUNT times as many examples, different ones each time; the same ones with HUNT_SEED.
 """
 

@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import json
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 from bots.links import with_user
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from testing import exploration
 from testing.browser import ARGUMENTS, NoChromium, chromium_path, headless_path
 from testing.held_study import HeldStudy
 from tests.browser.world import PATIENCE, SHOTS, world  # noqa: F401 - a fixture
@@ -22,10 +24,10 @@ from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 HERE = Path(__file__).parent
-WHOLE_STUDIES = (
-    *("test_study.py", "test_german_study.py", "test_two_participants.py", "test_two_players_browser.py"),
-    *("test_examples.py", "test_gridworld_browser.py", "test_teaching.py"),
+LOOK_EVERY = (
+    50  # ms between two looks of `Page.wait_for_function`; by default the page draws and looks 60 times a second
 )
+WHOLE_STUDIES = ("test_study.py", "test_two_participants.py")
 
 
 class SharedBrowser:
@@ -33,6 +35,7 @@ class SharedBrowser:
 
     def __init__(self) -> None:
         self._open = contextlib.ExitStack()
+        self._playwright: Any = None
         self._browser: Any = None
         self._path = ""
 
@@ -43,19 +46,23 @@ class SharedBrowser:
         """
         path = path or self._path or headless_path()
         if self._browser is None or not self._browser.is_connected() or path != self._path:
-            from playwright.sync_api import sync_playwright
+            if self._playwright is None:
+                from playwright.sync_api import Page, sync_playwright
 
-            self.close()
+                Page.wait_for_function.__kwdefaults__["polling"] = LOOK_EVERY
+                self._playwright = self._open.enter_context(sync_playwright())
+            if self._browser is not None:
+                self._browser.close()
+            self._browser = self._playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
             self._path = path
-            playwright = self._open.enter_context(sync_playwright())
-            self._browser = playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
-            self._open.callback(self._browser.close)
         return self._browser
 
     def close(self) -> None:
-        """End the browser, if it runs."""
-        self._browser, self._path = None, ""
-        self._open.close()
+        """End the browser and Playwright, if they run."""
+        with self._open:
+            if self._browser is not None:
+                self._browser.close()
+        self._playwright, self._browser, self._path = None, None, ""
 
 
 SHARED_BROWSER = SharedBrowser()
@@ -75,11 +82,11 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 def chromium(request: pytest.FixtureRequest) -> Iterator[Any]:
     """The browser. Without one, its tests are skipped; with BROWSER_TESTS=required they fail.
 
-    Participants walk through whole studies in the Chromium that people have; other tests of pages need no window.
-    Contexts that a file leaves open are closed after its last test.
+    Participants walk through whole studies in the Chromium that people have: some in `make test`, all in `make hunt`.
+    Other tests of pages need no window. Contexts that a file leaves open are closed after its last test.
     """
     try:
-        whole = request.path.name in WHOLE_STUDIES
+        whole = request.path.name in WHOLE_STUDIES or exploration.TIMES
         browser = SHARED_BROWSER.browser(chromium_path() if whole else headless_path())
     except NoChromium:
         if os.environ.get("BROWSER_TESTS") == "required":
@@ -226,6 +233,53 @@ def replace_lines(project: Path, changes: Mapping[str, str]) -> None:
     for line, instead in changes.items():
         assert config.read_text().count(line) == 1, line
         config.write_text(config.read_text().replace(line, instead))
+
+
+GAMES_TO_END = """
+
+class Agent(Agent):
+    games = 0
+
+    def reset(self, seed=None):
+        self.games += 1
+        return super().reset(seed)
+
+    def step(self, actions):
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        for player, action in actions.items():
+            if action:
+                (self.notes / f"{player} has moved").touch()
+        over = (self.notes / f"game {self.games} is over").exists()
+        return observations, rewards, terminations | {"__all__": over}, truncations, infos
+"""
+
+
+class GamesToEnd:
+    """Notes between a test and the games of a copy of examples/two-players: the test ends a game, and learns who has moved."""
+
+    def __init__(self, project: Path) -> None:
+        self._notes = project.parent / "notes"
+        self._notes.mkdir()
+        agent = project / "agent.py"
+        text = agent.read_text(encoding="utf-8")
+        agent.unlink()  # a link to the example's
+        notes = f"    notes = __import__('pathlib').Path({str(self._notes)!r})\n"
+        agent.write_text(text + GAMES_TO_END.replace("    games = 0\n", f"    games = 0\n{notes}"), encoding="utf-8")
+
+    @contextlib.contextmanager
+    def over(self, game: int) -> Iterator[None]:
+        """End this game of each session that plays within the block."""
+        note = self._notes / f"game {game} is over"
+        note.touch()
+        yield
+        note.unlink()
+
+    def wait_until_moved(self, page: Any, player: str) -> None:
+        """Wait until the player has moved, in any game."""
+        until = time.monotonic() + PATIENCE / 1000
+        while not (self._notes / f"{player} has moved").exists():
+            assert time.monotonic() < until, player
+            page.wait_for_timeout(50)
 
 
 @pytest.fixture(scope="module")

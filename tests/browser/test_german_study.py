@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,9 +15,10 @@ from bots.links import with_user
 from hippodrome.model.texts import ENGLISH, PLACE
 from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
 from testing.held_study import HeldStudy
+from tests.browser.conftest import GamesToEnd
 from tests.browser.world import FLAWS, SHOTS
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 
 GERMAN: dict[str, str] = yaml.safe_load((ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8"))["project"][
     "texts"
@@ -106,8 +108,8 @@ class Person:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
-    """The example for two, with pages and texts in German."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `project`: the example for two, with pages and texts in German."""
     folder = tmp_path_factory.mktemp("german")
     copy_of(ROOT / "examples" / "two-players", folder / "project")
     (folder / "project" / "steps").unlink()
@@ -126,6 +128,17 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
         "playerNames": {"red": "Rot", "blue": "Blau"},
     }
     config.write_text(json.dumps(tree), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def games(folder: Path) -> GamesToEnd:
+    """Ends games before their time is over."""
+    return GamesToEnd(folder / "project")
+
+
+@pytest.fixture(scope="module")
+def study(folder: Path, games: GamesToEnd) -> Iterator[StudyProcess]:
     held = HeldStudy(folder / "project", folder / "data")
     held.start()
     yield held
@@ -148,7 +161,7 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Callable[[str, int], Pe
     assert [person.complaints for person in people] == [[] for _ in people]
 
 
-def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, int], Person]) -> None:
+def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, int], Person], games: GamesToEnd) -> None:
     phone, wide = come("bo", 360), come("ada", 1280)
     for person in (phone, wide):
         person.check_german("consent")
@@ -177,11 +190,12 @@ def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, in
     for person in (wide, phone):
         person.wait_for_text("#overlay-title", "Spiel 1 von 2 ist vorbei")
         person.check_german("break")
-    for person in (wide, phone):
-        person.wait_for_text("#overlay-title", "Das Spiel ist vorbei")
-        person.wait_for_text("#overlay-score", "Ihre Punkte in 2 Spielen: ")
-        person.check_german("over")
-        person.page.click("#overlay-button")
+    with games.over(2):
+        for person in (wide, phone):
+            person.wait_for_text("#overlay-title", "Das Spiel ist vorbei")
+            person.wait_for_text("#overlay-score", "Ihre Punkte in 2 Spielen: ")
+            person.check_german("over")
+            person.page.click("#overlay-button")
     for person in (wide, phone):
         person.page.wait_for_selector("body[data-step='4']")
         person.check_german("survey")

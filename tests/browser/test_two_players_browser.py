@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 
 from bots.links import with_user
-from local.rehearsal.study_process import StudyProcess
-from tests.browser.conftest import Hold, note_texts, wait_for_noted
+from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from testing.held_study import HeldStudy
+from tests.browser.conftest import GamesToEnd, Hold, note_texts, replace_lines, wait_for_noted
 from tests.browser.world import PATIENCE, SHOTS
 from trial.recordings.recording import read
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SHORT = {
     "  maxEpisodes: 3\n": "  maxEpisodes: 1\n",
-    "  episodeSeconds: 60\n": "  episodeSeconds: 25\n",
     "  absent: 15\n": "  absent: 4\n",
     "  countdown: 3\n": "  countdown: 2\n",
     "  patience: 30\n": "  patience: 300\n",  # on a busy machine the second participant may come late
@@ -33,9 +33,26 @@ Come = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def study(hold: Hold) -> StudyProcess:
-    """The example with a short game."""
-    return hold("two-players", SHORT)
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the example with one game."""
+    project = tmp_path_factory.mktemp("two-players") / "project"
+    copy_of(ROOT / "examples" / "two-players", project)
+    replace_lines(project, SHORT)
+    return project
+
+
+@pytest.fixture(scope="module")
+def games(project: Path) -> GamesToEnd:
+    """Ends the game."""
+    return GamesToEnd(project)
+
+
+@pytest.fixture(scope="module")
+def study(project: Path, games: GamesToEnd) -> Iterator[StudyProcess]:
+    held = HeldStudy(project, project.parent / "data")
+    held.start()
+    yield held
+    held.clear()
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +106,7 @@ def recorded(study: StudyProcess, session: str) -> list[dict[str, Any]]:
     return [line for file in files for line in read(file.read_bytes())]
 
 
-def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProcess) -> None:
+def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProcess, games: GamesToEnd) -> None:
     wide = come("ada", 1280)
     wait_for_text(wide, "#lobby-here", "You are the first of 2")
     phone = come("bo", 360)
@@ -108,9 +125,12 @@ def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProce
     for _ in range(3):
         wide.keyboard.press("ArrowRight", delay=200)
         phone.get_by_role("button", name="Left", exact=True).tap()
-    for page in (wide, phone):
-        page.wait_for_selector("body[data-step='4']")
-        page.wait_for_selector("text=How did it go?")
+    for colour in colours:
+        games.wait_until_moved(wide, colour)
+    with games.over(1):
+        for page in (wide, phone):
+            page.wait_for_selector("body[data-step='4']")
+            page.wait_for_selector("text=How did it go?")
     ada, bo = answer(study, "ada"), answer(study, "bo")
     assert [(each["outcome"], each["player"]) for each in (ada, bo)] == [("finished", colour) for colour in colours]
     assert ada["session"] == bo["session"]
@@ -122,7 +142,9 @@ def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProce
     assert walked == {colours[0]: {"right"}, colours[1]: {"left"}}  # each participant moved only their own figure
 
 
-def test_a_participant_who_goes_away_is_waited_for_replaced_and_let_in_again(come: Come, study: StudyProcess) -> None:
+def test_a_participant_who_goes_away_is_waited_for_replaced_and_let_in_again(
+    come: Come, study: StudyProcess, games: GamesToEnd
+) -> None:
     wide, phone = come("cy", 1280), come("di", 360)
     for page in (wide, phone):
         page.wait_for_function(PLAYS)
@@ -136,8 +158,9 @@ def test_a_participant_who_goes_away_is_waited_for_replaced_and_let_in_again(com
     phone.goto(with_user(study.link, "di"))
     wait_for_noted(wide, "#trouble", "The other participant is back")
     phone.wait_for_function(PLAYS)
-    for page in (wide, phone):
-        page.wait_for_selector("body[data-step='4']")
+    with games.over(1):
+        for page in (wide, phone):
+            page.wait_for_selector("body[data-step='4']")
     lines = recorded(study, answer(study, "cy")["session"])
     gone = answer(study, "di")["player"]
     what = [line["what"] for line in lines if line["kind"] == "presence" and line["player"] == gone]
