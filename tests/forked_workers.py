@@ -101,6 +101,13 @@ def _collect(args: Sequence[str]) -> str:
     return ""
 
 
+def _load() -> None:
+    """Load what most workers will load."""
+    from testing import moto_world
+
+    moto_world.load()
+
+
 def _begin_again(asked: socket.socket, why: str) -> NoReturn:
     """Become a process that has imported nothing. Its workers do what they do without it, and report what is wrong."""
     print(f"Each worker imports the tests itself: {why}", file=sys.stderr)
@@ -163,6 +170,8 @@ def _main() -> bool:
             preloaded.start_all()  # several workers will need each
         if args and (why := _collect(args)):
             _begin_again(asked, why)
+        if args == [TESTS.name]:
+            _load()
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the workers'
         # numpy's OpenBLAS and pyarrow's allocator have threads, and prepare for forks.
         warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)

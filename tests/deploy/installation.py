@@ -24,6 +24,11 @@ from typing import Any
 
 import msgspec
 import pytest
+from moto.cloudformation.models import cloudformation_backends
+from moto.cloudwatch.models import cloudwatch_backends
+from moto.ecr.models import ecr_backends
+from moto.s3.models import s3_backends
+from moto.sns.models import sns_backends
 
 from deploy.__main__ import main
 from deploy.aws.account import Account, open_account
@@ -71,20 +76,24 @@ class Installed(MotoWorld):
         self.server = ""
 
     def _build(self) -> None:
+        """As in `MotoWorld`, as moto's own objects."""
         super()._build()
         self._secure_bucket()
-        self.repository = self.client("ecr").create_repository(repositoryName=STACK)["repository"]["repositoryUri"]
-        self.alarm_topic = self.client("sns").create_topic(Name="hippodrome-alarms")["TopicArn"]
-        self.client("cloudwatch").put_metric_alarm(
-            AlarmName="hippodrome-dead-letters",
-            AlarmActions=[self.alarm_topic],
-            Namespace="AWS/SQS",
-            MetricName="ApproximateNumberOfMessagesVisible",
-            Statistic="Maximum",
-            Period=60,
-            EvaluationPeriods=1,
-            Threshold=0,
-            ComparisonOperator="GreaterThanThreshold",
+        ecr = ecr_backends[ACCOUNT][self.region]
+        self.repository = ecr.create_repository(STACK, ACCOUNT, {}, {}, "MUTABLE", []).uri
+        self.alarm_topic = str(sns_backends[ACCOUNT][self.region].create_topic("hippodrome-alarms").arn)
+        cloudwatch_backends[ACCOUNT][self.region].put_metric_alarm(
+            name="hippodrome-dead-letters",
+            alarm_actions=[self.alarm_topic],
+            namespace="AWS/SQS",
+            metric_name="ApproximateNumberOfMessagesVisible",
+            statistic="Maximum",
+            period=60,
+            evaluation_periods=1,
+            threshold=0,
+            comparison_operator="GreaterThanThreshold",
+            description=None,  # type: ignore[arg-type]
+            dimensions=[],
         )
         self.stack(self.template())
 
@@ -93,16 +102,11 @@ class Installed(MotoWorld):
 
         Gap: moto ignores the conditions of a bucket policy, so the policy that requires TLS would refuse every request.
         """
-        s3, bucket = self.client("s3"), self.env["BUCKET"]
+        s3, bucket = s3_backends[ACCOUNT]["aws"], self.env["BUCKET"]
         names = ["BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets"]
-        s3.put_public_access_block(Bucket=bucket, PublicAccessBlockConfiguration=dict.fromkeys(names, True))
-        s3.put_bucket_versioning(Bucket=bucket, VersioningConfiguration={"Status": "Enabled"})
-        s3.put_bucket_encryption(
-            Bucket=bucket,
-            ServerSideEncryptionConfiguration={
-                "Rules": [{"ApplyServerSideEncryptionByDefault": {"SSEAlgorithm": "AES256"}}]
-            },
-        )
+        s3.put_public_access_block(bucket, dict.fromkeys(names, "true"))
+        s3.put_bucket_versioning(bucket, "Enabled")
+        s3.put_bucket_encryption(bucket, {"Rule": {"ApplyServerSideEncryptionByDefault": {"SSEAlgorithm": "AES256"}}})
 
     # -- the stack ------------------------------------------------------------------------------------------------
 
@@ -155,8 +159,8 @@ class Installed(MotoWorld):
         }
 
     def stack(self, template: dict[str, Any], name: str = STACK) -> None:
-        self.client("cloudformation").create_stack(
-            StackName=name, TemplateBody=json.dumps(template), Tags=[{"Key": "hippodrome:stack", "Value": name}]
+        cloudformation_backends[ACCOUNT][self.region].create_stack(
+            name, json.dumps(template), {}, notification_arns=[], tags={"hippodrome:stack": name}
         )
 
     def change(self, **outputs: str) -> None:
@@ -166,8 +170,6 @@ class Installed(MotoWorld):
 
     def stack_status(self, status: str, name: str = STACK) -> None:
         """Set the status of the stack."""
-        from moto.cloudformation.models import cloudformation_backends
-
         for stack in cloudformation_backends[ACCOUNT][self.region].stacks.values():
             if stack.name == name:
                 stack.status = status
