@@ -17,7 +17,8 @@ import pytest
 from PIL import Image
 
 from local.rehearsal.study_process import ROOT
-from tests.browser.world import FLAWS, PATIENCE, World, deflated_zeros, shot
+from tests.browser.world import FLAWS, PATIENCE, RED, World, deflated_zeros, pack, shot
+from tests.browser.world import play as open_game
 from tests.trial.conftest import Running
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
@@ -142,6 +143,39 @@ def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -
     tab.wait_for_function("() => new Set(seen.map((place) => place.toFixed(4))).size > 5")
     seen = tab.evaluate("seen")
     assert seen == sorted(seen)
+
+
+COUNT_DRAWINGS = """(() => {
+    const { fillRect } = CanvasRenderingContext2D.prototype;
+    window.drawings = 0; // each begins with the background
+    CanvasRenderingContext2D.prototype.fillRect = function (...box) { window.drawings += 1; fillRect.apply(this, box); };
+})()"""
+
+
+def test_a_scene_is_only_drawn_if_an_object_has_changed(world: World, tab: Any) -> None:
+    world.subprotocol, world.trial = "hippodrome.3", {"scene": SCENE}
+    world.controls |= {"scene": SCENE | {"coordinates": "relative"}, "assets": []}
+    tab.add_init_script(COUNT_DRAWINGS)
+    open_game(world, tab)
+    shown = []
+
+    def show(number: int, **scene: Any) -> None:
+        world.connections[0].send(b"\x04" + struct.pack("!I", number) + json.dumps(scene).encode())
+        world.wait_for({"ack": number})
+        shown.append((tab.evaluate("drawings"), tab.evaluate(SHOWN, [0.25, 0.25])))
+
+    sun = {"type": "circle", "x": 0.25, "y": 0.25, "radius": 30, "color": "#bfe3f2"}
+    show(3, new=True, set={"sun": sun})
+    show(4)
+    show(5, hud="Caught: 3")
+    assert tab.inner_text("#scene-hud") == "Caught: 3"
+    show(6, set={"sun": {"color": "#f6c445"}})
+    world.connections[0].send(pack(7, RED * 4))  # a frame in between, and the scene again
+    world.wait_for({"ack": 7})
+    show(8)
+    show(9, gone=["sun"])
+    day, evening, night = "#bfe3f2", "#f6c445", "#000000"
+    assert shown == [(1, day), (1, day), (1, day), (2, evening), (3, evening), (4, night)]
 
 
 def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> None:

@@ -27,13 +27,14 @@ export function prepare(scene, changed) {
   repaint = changed;
 }
 
-// Shows this canvas, in the shape of the scene.
+// Shows this canvas, in the shape of the scene. Returns whether it was hidden.
 export function place() {
   const ratio = String(picture.width / picture.height);
   if (document.body.style.getPropertyValue("--ratio") !== ratio) shapePicture(ratio);
-  if (!easel.hidden) return;
+  if (!easel.hidden) return false;
   easel.hidden = false;
   fit();
+  return true;
 }
 
 // Hides this canvas, so that the canvas of the frames shows.

@@ -34,7 +34,7 @@ async function unpackScene(kind, buffer) {
   return { draw: () => change(scene) };
 }
 
-// Applies the changes of a scene, and draws it at once: the screen shows it at its next refresh.
+// Applies the changes of a scene, and draws it at once, if objects have changed: the screen shows it at its next refresh.
 function change(scene) {
   const now = performance.now();
   if (scene.new) things.clear();
@@ -55,8 +55,8 @@ function change(scene) {
     setText(hud, scene.hud);
     hud.hidden = !scene.hud;
   }
-  place();
-  show(now);
+  const changed = scene.new || scene.set || scene.gone || scene.order;
+  if (place() || changed) show(now);
 }
 
 // The changed object. With a tween it moves to its new values from those that are shown now.
