@@ -2,12 +2,13 @@
 
 A trial server takes longer to import numpy and gymnasium than most tests take with it. So one process makes the imports
 once, and forks for each test (it is called the forker here). A forked process has its own memory, files, time, signals and
-session, and the system shows them as its own; only its command line is the forker's. Tests of the first moments of a
-process start it as users do.
+session, and the system shows them as its own; only its command line is the forker's, and it ends without freeing its
+modules. Tests of the first moments of a process start it as users do.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import gc
@@ -22,6 +23,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -351,9 +353,32 @@ def _main() -> dict[str, Any] | None:
         return _serve(requests, dict(os.environ.items() - before.items()))  # gymnasium sets one for pygame
 
 
+def _run(wanted: Mapping[str, Any]) -> int:
+    """Run the module or script. Returns the exit code."""
+    try:
+        if _is_script(wanted["module"]):
+            _run_script(Path(wanted["module"]).absolute())
+        else:
+            runpy.run_module(wanted["module"], run_name="__main__", alter_sys=True)
+    except SystemExit as ended:
+        if not isinstance(ended.code, int | None):
+            raise
+        return ended.code or 0
+    return 0
+
+
+def _end(code: int) -> None:
+    """End this process as Python does, except that the modules are not freed: that takes longer than most processes run."""
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    with contextlib.suppress(OSError, ValueError):  # Python reports it at its own end, which follows
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code & 0xFF)
+
+
 if __name__ == "__main__":
-    wanted = _main()
-    if wanted and _is_script(wanted["module"]):
-        _run_script(Path(wanted["module"]).absolute())
-    elif wanted:
-        runpy.run_module(wanted["module"], run_name="__main__", alter_sys=True)
+    if wanted := _main():
+        code = _run(wanted)
+        _end(code)
+        sys.exit(code)

@@ -138,6 +138,46 @@ def test_all_output_of_a_forked_process_is_read_and_its_end_awaited(begin: Any) 
         silent.communicate(timeout=0.5)
 
 
+ENDS = """
+import atexit, os, sys, threading, time
+atexit.register(lambda: print("at exit"))
+threading.Thread(target=lambda: [time.sleep(0.2), print("a thread")]).start()
+threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+print("main")
+CODE
+"""
+
+
+@pytest.mark.parametrize(
+    ("statement", "code", "error"),
+    [
+        ("", 0, ""),
+        ("sys.exit()", 0, ""),
+        ("sys.exit(300)", 44, ""),
+        ("sys.exit(-1)", 255, ""),
+        ("sys.exit('a reason')", 1, "a reason\n"),
+        ("raise ValueError('a mistake')", 1, "ValueError: a mistake\n"),
+        ("os.close(1); sys.exit(3)", 120, ""),
+    ],
+)
+@pytest.mark.parametrize("way", ["forked", "started"])
+def test_a_forked_process_ends_as_any_process_does(
+    tmp_path: Path, way: str, statement: str, code: int, error: str
+) -> None:
+    """After its threads and `atexit`, with all output written."""
+    (tmp_path / "ends.py").write_text(ENDS.replace("CODE", statement))
+    env = {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "PYTHONUNBUFFERED": ""}
+    env |= {} if way == "forked" else {"PYTHONHASHSEED": "0"}
+    with (tmp_path / "errors").open("w") as errors:
+        process = preloaded.start("ends", cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=errors)
+        assert isinstance(process, preloaded.Forked) == (way == "forked")
+        said, _ = process.communicate(timeout=60)
+    if "close" not in statement:
+        assert said == "main\na thread\nat exit\n"
+        assert (tmp_path / "errors").read_text().endswith(error)
+    assert process.returncode == code
+
+
 STARTS = """
 import json, os, subprocess
 from testing import preloaded
