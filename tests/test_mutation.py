@@ -128,7 +128,7 @@ def test_a_mutant_that_never_ends_is_killed(project: Path) -> None:
     mutants = Mutants("core.py", ENDLESS)
     changes = {mutant.becomes: mutant for mutant in map(mutants.__getitem__, range(len(mutants)))}
     tests = {"core.py": ["test_core.py"]}
-    quick = Runner(project, seconds=3, idle=120)
+    quick = Runner(project, seconds=1, idle=120)
     assert [killed for _, killed in quick.judge([changes["continue"]], tests)] == [True]
     assert [killed for _, killed in Runner(project).judge([changes["if step > 10:"]], tests)] == [False]
 
