@@ -119,14 +119,13 @@ class Local:
             cat = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file) if self.through_pipe else None
             output = cat.stdin if cat else file
             self.process = preloaded.start(
-                "testing.forked_servers",
+                "local",
                 [str(self.folder), "--port", "0", *options],
                 cwd=self.place,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60"},
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                starts=True,
             )
         return self.process
 
