@@ -24,9 +24,8 @@ from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 HERE = Path(__file__).parent
-LOOK_EVERY = (
-    50  # ms between two looks of `Page.wait_for_function`; by default the page draws and looks 60 times a second
-)
+LOOK_EVERY = 50
+"""ms between two looks of `Page.wait_for_function`. By default it looks 60 times a second, and has the page draw as often."""
 WHOLE_STUDIES = ("test_study.py", "test_two_participants.py")
 
 
