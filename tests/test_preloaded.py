@@ -141,9 +141,11 @@ def test_all_output_of_a_forked_process_is_read_and_its_end_awaited(begin: Any) 
 ENDS = """
 import atexit, os, sys, threading, time
 atexit.register(lambda: print("at exit"))
-threading.Thread(target=lambda: [time.sleep(0.2), print("a thread")]).start()
+done = threading.Event()
+threading.Thread(target=lambda: [done.wait(), time.sleep(0.2), print("a thread")]).start()
 threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
 print("main")
+done.set()
 CODE
 """
 

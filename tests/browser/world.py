@@ -22,6 +22,7 @@ from websockets.sync.server import serve
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import frame, pages
 from local.rehearsal.study_process import ROOT
+from testing.waiting import until
 
 SHOTS = ROOT / "shots"
 PATIENCE = 45_000  # ms
@@ -107,9 +108,9 @@ class World:
         return [command for command in self.commands("command") if command != "requestUI"]
 
     def wait_for(self, message: dict[str, Any]) -> None:
-        until = time.monotonic() + PATIENCE / 1000
+        end = time.monotonic() + PATIENCE / 1000
         while message not in self.received:
-            assert time.monotonic() < until, self.received
+            assert time.monotonic() < end, self.received
             time.sleep(0.02)
 
     # the trial server
@@ -218,6 +219,7 @@ def tell(world: World, **said: Any) -> None:
         world.trial_state = {
             name: value for name, value in said.items() if name not in ("nextIn", "startsIn", "timeLeft")
         }
+    until(lambda: world.connections)  # the page shows the game before it is connected
     world.connections[0].send(json.dumps(said))
 
 
@@ -231,8 +233,8 @@ def deflated_zeros(number: int) -> bytes:
 
 def wait_for_reconnection(world: World, tab: Any) -> None:
     """Wait until the page has closed its connection and plays on another."""
-    until = time.monotonic() + 60
+    end = time.monotonic() + 60
     while len(world.connections) < 2:
-        assert time.monotonic() < until
+        assert time.monotonic() < end
         tab.wait_for_timeout(50)
     tab.wait_for_selector("#overlay-button:visible")

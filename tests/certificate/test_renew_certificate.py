@@ -108,6 +108,7 @@ def test_the_functions_role_allows_its_calls_and_no_other_role_allows_its_writes
     Renewal(platform.documents, platform.challenges, platform.now, PLACE).obtain(
         RenewalRequest(DOMAIN, pebble.directory, trusted=pebble.trusted)
     )
+    platform.documents.delete(ACCOUNT)  # so that all must be proved again (see `lose_account`)
     now = platform.now
     monkeypatch.setattr(platform, "now", lambda: now() + timedelta(days=61))
     installed.use(platform)
