@@ -9,15 +9,20 @@ import sys
 import threading
 import traceback
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import pytest
 
-from testing.waiting import PATIENCE
+from testing.waiting import PATIENCE, until_async
 from trial.agent.worker import Worker
 from trial.core.effects import AgentTimeout
 
 Heard = list[tuple[str, Any]]
+
+
+def _names(told: TracebackType | None) -> list[str]:
+    return [frame.name for frame in traceback.extract_tb(told)]
 
 
 def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
@@ -50,10 +55,17 @@ def test_each_function_has_its_own_limit_and_is_given_up_once() -> None:
 
 
 def test_a_function_that_is_late_is_told_with_the_line_in_which_the_thread_is() -> None:
+    at_the_event = ["<lambda>", "wait", "wait"]  # the event waits for its condition
+
     async def work() -> AgentTimeout:
-        worker, free = Worker(), threading.Event()
+        worker, free, loop, later = Worker(), threading.Event(), asyncio.get_running_loop(), [0.0]
+        clock = loop.time
+        loop.time = lambda: clock() + later[0]  # type: ignore[method-assign]
+        call = asyncio.ensure_future(worker.call(lambda: free.wait(PATIENCE), limit=1000.0))
         try:
-            await worker.call(lambda: free.wait(PATIENCE), limit=0.05)
+            await until_async(lambda: _names(worker._where())[-3:] == at_the_event)
+            later[0] = 2000.0
+            await call
         except AgentTimeout as error:
             return error
         finally:
@@ -61,12 +73,10 @@ def test_a_function_that_is_late_is_told_with_the_line_in_which_the_thread_is() 
             worker.close()
         raise AssertionError
 
-    frames = traceback.extract_tb(asyncio.run(work()).__traceback__)
-    names = [frame.name for frame in frames]
-    assert names[-2:] == ["wait", "wait"]  # of the event and its condition
-    assert names[-3] == "<lambda>"
-    assert "_call" not in names
-    assert Path(frames[-3].filename).name == "test_worker.py"
+    told = asyncio.run(work()).__traceback__
+    assert _names(told)[-3:] == at_the_event
+    assert "_call" not in _names(told)
+    assert Path(traceback.extract_tb(told)[-3].filename).name == "test_worker.py"
 
 
 def test_a_function_that_is_late_while_the_thread_rests_has_no_line() -> None:
