@@ -2,7 +2,7 @@
 
 The tests write thousands of small files and have many of them synced, as the product promises. On a disk that takes a tenth
 of their time. So a run with several workers has its temporary files in Linux's /dev/shm, and deletes them at its end.
-A run without workers, such as that of one test whose files somebody wants to see, has them where they always are.
+A run without workers has them in the system's usual folder, and keeps them: run one test so to look at its files.
 """
 
 from __future__ import annotations
