@@ -1,7 +1,7 @@
 """`python -m trial.check FILE [SECONDS]` checks that the image holds what the agent needs. Its Dockerfile runs this.
 
 FILE holds the keys of the section `trial` with which the agent is started, as JSON. The agent is loaded, starts its
-game, begins an episode, draws it and takes one step, as in a server, but in a process of its own, which is killed after
+game, begins an episode, draws it and takes one step, as in a server, but in a process of its own, which ends after
 SECONDS. In a game of several players, each policy is also asked for one action.
 
 If this fails because a package, a module, a system library or a policy's file is missing, no participant could play:
@@ -12,13 +12,13 @@ memory.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,8 @@ from protocol import environment
 from protocol.trial import TrialSection
 from protocol.trial_check import check
 from trial.agent import tracebacks
+from trial.agent.worker import Worker
+from trial.core.effects import AgentTimeout
 from trial.server import process_group
 
 if TYPE_CHECKING:
@@ -40,6 +42,7 @@ PACKAGE = "the package that brings "
 """Precedes the name of a missing module in the advice: the image does not know which package has the module."""
 
 _SECONDS = 60.0
+_GRACE = 5.0  # seconds in which a process whose time is over can write in which line the agent is
 _LIMIT = 300  # characters of an error's message
 _ENVIRONMENT = {
     environment.PROJECT_ID: "check",
@@ -78,8 +81,8 @@ def main(file: Path, seconds: float) -> int:
 def _run(file: Path, report: Path, seconds: float) -> int | None:
     """Try the agent in a process, and return the process's exit status; None if it had to be killed."""
     return process_group.run(
-        [sys.executable, "-m", "trial.check", "--agent", str(file), str(report)],
-        seconds,
+        [sys.executable, "-m", "trial.check", "--agent", str(file), str(report), str(seconds)],
+        seconds + _GRACE,
         env={**os.environ, **_ENVIRONMENT, environment.TRIAL: file.read_text()},
         stdout=subprocess.DEVNULL,  # a builder truncates a long log, and our line would be lost
         stderr=subprocess.DEVNULL,
@@ -89,13 +92,16 @@ def _run(file: Path, report: Path, seconds: float) -> int | None:
 # In the agent's process
 
 
-def _try(file: Path, report: Path) -> None:
+async def _try(file: Path, report: Path, seconds: float) -> None:
     """Let the agent play one step, and write the result to the file `report`."""
-    folder = Path(os.environ[environment.AGENT_DIR]).resolve()
+    folder, worker = Path(os.environ[environment.AGENT_DIR]).resolve(), Worker()
     try:
-        _play(folder, json.loads(file.read_text()))
+        await worker.call(lambda: _play(folder, json.loads(file.read_text())), limit=seconds)
         result: dict[str, Any] = {"well": True}
-    except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure like another
+    except AgentTimeout as error:
+        place = tracebacks.where(error, folder)
+        result = {"failed": f"it has not come back within {seconds:g} s{f', and is in {place}' if place else ''}"}
+    except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
         failure = f"{tracebacks.where(error, folder) or 'agent.py'}: {_words(error)}"
         remedy = _remedy(error)
         result = {"lacks": f"{failure}{REMEDY}{remedy}"} if remedy else {"failed": failure}
@@ -183,14 +189,8 @@ def _words(error: BaseException) -> str:
     return printable if len(printable) <= _LIMIT else f"{printable[:_LIMIT]}…"
 
 
-def _agent(file: Path, report: Path) -> None:
-    thread = threading.Thread(target=_try, args=[file, report], daemon=True)  # a server's agent has such a thread, too
-    thread.start()
-    thread.join()
-    os._exit(0)  # does not wait for threads that the agent has started
-
-
 if __name__ == "__main__":
     if sys.argv[1] == "--agent":
-        _agent(Path(sys.argv[2]), Path(sys.argv[3]))
+        asyncio.run(_try(Path(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4])))
+        os._exit(0)  # does not wait for threads that the agent has started
     sys.exit(main(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else _SECONDS))
