@@ -196,6 +196,7 @@ class GameConnection:
             began = began or time.monotonic()
             played = time.monotonic() - began if self._turns else self._play.seconds
             if self._seconds and played >= self._seconds and self._may_stop:
+                self._play.stopped = True
                 await self._send({"command": "stop"})
                 return
             for message in keys.move():

@@ -24,6 +24,7 @@ class PlayedStep:
     score: float = 0
     episodes: int = 0
     done: bool = False
+    stopped: bool = False  # the bot stopped the game after as many seconds as it plays
 
     @property
     def received_rate(self) -> float | None:

@@ -200,6 +200,7 @@ def _rehearse_and_report(
         found,
         left,
         time.monotonic() - began,
+        play=crowd.play,
         recorded=config.trial.s3upload,
         live=config.project.live or bool(study and crowd.play > 0),  # the copy for bots is live
         warnings=functions.warnings() if functions else (),

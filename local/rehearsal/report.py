@@ -29,6 +29,7 @@ def report(
     left: Leftovers | None,
     seconds: float,
     *,
+    play: float,
     recorded: bool = True,
     live: bool = True,
     warnings: Sequence[str] = (),
@@ -36,13 +37,14 @@ def report(
 ) -> bool:
     """Print the table and what went wrong; return whether everything is as it should be.
 
-    `recorded`: whether the study keeps recordings. `live`: whether participants get in. `warnings` come from the
-    functions' log; `crashes` are the errors of agent.py. `found` is None if the folder of the data is not known, and
-    `left` is None if nobody looked for servers that are left over.
+    `play`: after how many seconds a bot stops its game; 0: never. `recorded`: whether the study keeps recordings.
+    `live`: whether participants get in. `warnings` come from the functions' log; `crashes` are the errors of agent.py.
+    `found` is None if the folder of the data is not known, and `left` is None if nobody looked for servers that are
+    left over.
     """
     table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")
     for name, value in [
-        *_played(reports, found),
+        *_played(reports, found, play),
         *_found(reports, found, recorded=recorded, live=live),
         *([("servers left over", str(max(left.processes, len(left.records))))] if left else []),
     ]:
@@ -72,21 +74,25 @@ def _title(reports: Sequence[BotReport], seconds: float) -> str:
     return f"Rehearsal with {len(reports)} bot{'s' if len(reports) != 1 else ''}, {seconds:.0f} s"
 
 
-def _played(reports: Sequence[BotReport], found: Verification | None) -> Rows:
+def _played(reports: Sequence[BotReport], found: Verification | None, play: float) -> Rows:
     """The rows of what the bots have seen."""
-    plays = [play for bot in reports for play in bot.plays]
+    plays = [each for bot in reports for each in bot.plays]
     rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
     rows += _together(reports)
+    if stopped := sum(each.stopped for each in plays):
+        rows.append(
+            ("games stopped early", f"{_of(stopped, len(plays))}: a bot plays {play:g} s (`--play 0`: to the end)")
+        )
     if plays:
-        rows.append(("wait on the game page", _spread([play.waited for play in plays])))
+        rows.append(("wait on the game page", _spread([each.waited for each in plays])))
     if found and found.starts:
         rows.append(("server: request to ready", _spread(found.starts)))
-    rates = [rate for play in plays if (rate := play.received_rate)]
+    rates = [rate for each in plays if (rate := each.received_rate)]
     if rates:
-        frame_rates = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
-        amount = sum(play.bytes for play in plays)
+        frame_rates = ", ".join(sorted({str(each.frame_rate) for each in plays if each.frame_rate}))
+        amount = sum(each.bytes for each in plays)
         rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {frame_rates} set"))
-        rows.append(("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB"))
+        rows.append(("frames received", f"{sum(each.frames for each in plays)}, {amount / 1e6:.1f} MB"))
     return rows
 
 

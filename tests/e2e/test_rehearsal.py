@@ -57,7 +57,7 @@ def test_bots_walk_through_the_example_project(tmp_path: Path) -> None:
     process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="local.rehearsal")
     text = said(process)
     assert process.returncode == 0, text
-    for line in ("ui.stop", "2 of 2", "6 of 6", "of 30 set", "none"):
+    for line in ("ui.stop", "2 of 2: a bot plays 2 s (`--play 0`: to the end)", "6 of 6", "of 30 set", "none"):
         assert line in text
     assert servers_of(tmp_path / "data") == []
     assert len([*(tmp_path / "data").glob("ms-pacman/users/*/trials/*/*.gz")]) == 2
