@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import re
+import signal
 import statistics
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from protocol.trial_keys import keys
 from protocol.trial_sections import Ui
 from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end
+from trial.core.flow_control import STALLED_SECONDS
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
@@ -261,6 +263,24 @@ async def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_cl
         await client.play(10)
         client.acks = False
         await client.until(lambda: client.state["state"] == "paused", 8)
+
+
+async def test_a_server_that_could_not_run_for_some_seconds_does_not_take_a_page_that_has_answered_for_gone(
+    launch, open_client
+):
+    server = launch(trial={"startingFrameRate": 60})
+    async with open_client(server.address) as client:
+        await client.play(10)
+        client.acks = False
+        await client.see(1)
+        server.process.send_signal(signal.SIGSTOP)
+        await client.watch(0.5)  # what was under way
+        client.acks = True
+        await client.say(ack=client.frames[-1][1])
+        await client.watch(STALLED_SECONDS)
+        server.process.send_signal(signal.SIGCONT)
+        await client.see(30)
+        assert "paused" not in client.states
 
 
 async def test_a_client_that_never_acknowledges_gets_frames(launch, open_client):

@@ -16,6 +16,8 @@ from trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
 
+_LOOK_AGAIN = 0.1  # seconds from the first look that finds a client stalled to the one that counts
+
 
 @dataclass(slots=True)
 class Client:
@@ -26,6 +28,20 @@ class Client:
     player: str
     sent: tuple[object, ...] = ()
     """The values (`Clients.state_of`) that the client was sent last."""
+    stalled_since: float | None = None
+    """When a look at this client found it stalled first; None if the last look did not."""
+
+    def stalled(self, now: float) -> bool:
+        """Return whether the client has stopped acknowledging frames, and had when it was looked at before.
+
+        One look is not enough: if this process could not run for some seconds, the acknowledgements of that time have
+        come, and are read only afterwards.
+        """
+        if not self.window.stalled(now):
+            self.stalled_since = None
+        elif self.stalled_since is None:
+            self.stalled_since = now
+        return self.stalled_since is not None and now - self.stalled_since >= _LOOK_AGAIN
 
 
 class Clients:
@@ -76,7 +92,7 @@ class Clients:
 
     def stalled(self, now: float) -> list[Client]:
         """Return the clients that have stopped acknowledging frames."""
-        return [client for client in self.by_human.values() if client.window.stalled(now)]
+        return [client for client in self.by_human.values() if client.stalled(now)]
 
     def send(self, client: Client, text: str) -> None:
         """Send a message to one client."""

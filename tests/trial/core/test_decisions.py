@@ -35,6 +35,7 @@ from trial.core.ended import Episode
 from trial.core.flow_control import STALLED_SECONDS, Window
 from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
+from trial.core.progress import PlayState
 from trial.core.trial import TRIAL_FAILED, Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import TrialSettings
@@ -241,8 +242,35 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     driver.wait(STALLED_SECONDS)
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
+    driver.step()
+    assert driver.trial.progress.state is PlayState.PLAYING, "its acknowledgement may have come, and be read next"
+    driver.wait(0.05)
+    driver.wait(0.15)
     assert [type(effect) for effect in driver.step()] == [WriteLine, SendPicture, WriteLog, SendState]
+    assert driver.trial.progress.state is PlayState.PAUSED
     assert driver.trial.wake_at is None
+
+
+def test_a_client_whose_acknowledgement_is_read_late_does_not_hold_the_game():
+    window = Window()
+    driver = Driver().begin()
+    driver.reset()
+    driver.connect(window=window)
+    driver.say(command="start")
+    window.sent(1, driver.now)
+    window.acknowledged(1, driver.now + 0.01)
+    driver.step()
+    window.sent(2, driver.now)
+    driver.now += 10 * STALLED_SECONDS  # this process could not run
+    driver.step()
+    window.acknowledged(2, driver.now)
+    window.sent(3, driver.now)
+    driver.step()
+    driver.step()
+    assert driver.trial.progress.state is PlayState.PLAYING
+    driver.now += 10 * STALLED_SECONDS
+    driver.step()
+    assert driver.trial.progress.state is PlayState.PLAYING, "each time anew"
 
 
 def test_a_refused_message_gets_a_sentence():
