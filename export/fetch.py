@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from export import keys, recording, scrub
+from export.interruption import interruption
 from export.keys import Item, KeyKind
 from export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
 from export.recording_columns import when
@@ -75,11 +76,12 @@ class Fetcher:
         for left in self.incoming.iterdir():
             left.unlink()
         self._state.begin_run()
-        with self._state.in_transactions() as commit:
-            self._all(tally, commit)
+        with self._state.in_transactions() as commit, interruption() as check:
+            self._all(tally, commit, check)
         return tally
 
-    def _all(self, tally: Tally, commit: Callable[[], None]) -> None:
+    def _all(self, tally: Tally, commit: Callable[[], None], check: Callable[[], None]) -> None:
+        """Fetch and save all files. `check` is called often, and may raise KeyboardInterrupt."""
         running: dict[Future[list[SourceFile]], Work] = {}
         committed = time.monotonic()
         pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
@@ -96,13 +98,14 @@ class Fetcher:
                 begin(self._work(work.then, tally, members(self._state, work.then.user)))
 
         def collect() -> None:
-            for work in self._collect(running):
+            for work in self._collect(running, check):
                 follow(work)
 
         try:
             for unit in units(self._project, lines(self._source, self._project, self._state)):
                 while unit.is_session and any(isinstance(work.owner, ExportedParticipant) for work in running.values()):
                     collect()  # the participants of a session must be known first
+                check()
                 begin(self._work(unit, tally))
                 while len(running) >= MAX_WAITING:
                     collect()
@@ -111,6 +114,7 @@ class Fetcher:
                     committed = time.monotonic()
             while running:
                 collect()
+            check()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, work in running.items():
@@ -137,8 +141,11 @@ class Fetcher:
         self._progress(self._listed, self._done)
         return Work(unit.user, owner, fetch, unchanged, then)
 
-    def _collect(self, running: dict[Future[list[SourceFile]], Work]) -> list[Work]:
-        done, _ = wait(running, return_when=FIRST_COMPLETED)
+    def _collect(self, running: dict[Future[list[SourceFile]], Work], check: Callable[[], None]) -> list[Work]:
+        done: set[Future[list[SourceFile]]] = set()
+        while not done:
+            check()
+            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
         collected = []
         for future in done:
             files = future.result()  # `result` may raise; then `_all` saves the results of the other workers
