@@ -22,6 +22,7 @@ from local.backend.task_process import Emit, Say, Shared, TaskProcess
 from local.backend.task_record import HOST, TaskFolder, TaskRecord, claim_of
 from protocol import disk
 
+KILLED_SECONDS = 5.0  # in which a server must be gone after SIGKILL, when local mode ends
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, the default of ECS and of `STOP_SECONDS` (on AWS: 120)
 KEPT_TASKS, KEPT_LOGS = 200, 50  # the most records and logs of stopped servers that are kept
 
@@ -172,7 +173,10 @@ class ProcessTasks:
             self._prune()
 
     def close(self, seconds: float = 5.0) -> None:
-        """End every server now, SIGTERM first; return when all are gone, at the latest a second after `seconds`."""
+        """End every server: SIGTERM now, and SIGKILL after `seconds`. Return when all are gone.
+
+        If one is not gone KILLED_SECONDS after SIGKILL, return all the same.
+        """
         with self._lock:
             self._closing = True
             running = [server for server in self._all() if server.task.status != "STOPPED"]
@@ -184,7 +188,7 @@ class ProcessTasks:
         for server in running:
             if not server.gone.is_set():
                 server.kill_at_once()
-        until = time.monotonic() + 1
+        until = time.monotonic() + KILLED_SECONDS
         for server in running:
             server.gone.wait(max(0.0, until - time.monotonic()))
         self._shared.closed.set()
