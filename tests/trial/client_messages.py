@@ -12,6 +12,8 @@ from websockets.exceptions import ConnectionClosed
 
 from testing.waiting import PATIENCE
 
+_TOLD = ("states", "state", "errors", "done", "acks")
+
 
 class TakesMessages:
     """A client that receives its messages one by one, in `take`."""
@@ -23,10 +25,14 @@ class TakesMessages:
         raise NotImplementedError
 
     async def until(self, true: Any, seconds: float = PATIENCE) -> None:
-        """Take messages until `true()` is true; TimeoutError after `seconds`."""
-        async with asyncio.timeout(seconds):
-            while not true():
-                await self.take()
+        """Take messages until `true()` is true. Raises TimeoutError after `seconds`, with what the client has seen last."""
+        try:
+            async with asyncio.timeout(seconds):
+                while not true():
+                    await self.take()
+        except TimeoutError as error:
+            error.add_note(f"{ {name: seen for name, seen in vars(self).items() if name in _TOLD} }")
+            raise
 
     async def watch(self, seconds: float) -> None:
         """Take messages for `seconds`."""

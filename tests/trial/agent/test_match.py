@@ -7,7 +7,6 @@ import contextlib
 import json
 import re
 import textwrap
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
