@@ -57,8 +57,6 @@ _PLACES = sorted(
 )
 
 
-_NEVER = 1_000_000_000
-
 gc.disable()  # until all is imported; see `pytest_collection_finish`
 # A shell's background jobs inherit SIGINT as ignored, `make test` tells the commands of its tests that they are
 # part of it and which Python it takes, and a shell may have a path for Python: all would change what the processes that
@@ -156,17 +154,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """
     gc.freeze()
     gc.enable()
-    gc.set_threshold(10_000, 20, _NEVER)
-
-
-def pytest_runtest_logfinish() -> None:
-    """Look for garbage among all objects between two tests, and never within one.
-
-    On a busy machine that takes seconds, and a server takes a client that is silent for 3 s for gone. What is left stays.
-    """
-    if gc.get_count()[2] >= 20:
-        gc.collect()
-        gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 def pytest_configure(config: pytest.Config) -> None:
