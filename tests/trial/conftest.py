@@ -275,7 +275,8 @@ def launch(tmp_path: Path) -> Any:
     for running in started:
         running.process.kill()
         running.process.wait()
-        print(running.log_text())  # pytest shows it if the test failed
+        if running.log.exists():
+            print(running.log_text())  # pytest shows it if the test failed
 
 
 @pytest.fixture
