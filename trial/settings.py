@@ -23,6 +23,9 @@ DEFAULT_GAME = "ALE/MsPacman-v5"
 STEP_SECONDS = 30.0
 """Seconds in which the agent must take a step or begin an episode, and draw it. `make check` waits no longer either."""
 
+STALLED_SECONDS = 3.0
+"""A client that acknowledges frames counts as lost or hidden if it leaves one without acknowledgement for so long."""
+
 
 class SettingsError(ValueError):
     """The environment or the section `trial` cannot be used. The message names the key and says what is wrong."""
@@ -79,6 +82,7 @@ class TrialSettings:
     start_seconds: float = 300.0
     step_seconds: float = STEP_SECONDS
     hello_seconds: float = 10.0
+    stalled_seconds: float = STALLED_SECONDS
     linger_seconds: float = 2.0
     recordings_first_seconds: float = 120.0
     stop_seconds: float = 30.0
@@ -160,6 +164,7 @@ class TrialSettings:
             start_seconds=_number(env, variables.START_SECONDS, 300.0),
             step_seconds=_number(env, variables.STEP_SECONDS, STEP_SECONDS),
             hello_seconds=_number(env, variables.HELLO_SECONDS, 10.0),
+            stalled_seconds=_number(env, variables.STALLED_SECONDS, STALLED_SECONDS),
             linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
             recordings_first_seconds=_number(env, variables.RECORDINGS_FIRST_SECONDS, 120.0),
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),

@@ -106,6 +106,7 @@ class Running:
             "TLS": "off",
             "LINGER_SECONDS": "0.2",
             "HELLO_SECONDS": "60",  # tests at the same time make the machine slow
+            "STALLED_SECONDS": "60",
             "AGENT_DIR": str(agent_dir),
             "PYTHONPATH": str(ROOT),
         }

@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 
 from tests.trial.sessions import answer, launch_formed, member, recordings
+from trial.settings import STALLED_SECONDS
 
+AS_PLAYED = str(STALLED_SECONDS)
 pytestmark = pytest.mark.timeout(90)
 
 
@@ -23,7 +25,7 @@ def people_seen_by(client: Any) -> dict[str, str]:
 
 
 async def test_a_page_that_stops_answering_is_away_and_returns_by_its_acknowledgement_alone(launch):
-    server = launch_formed(launch, trial={"startingFrameRate": 20})
+    server = launch_formed(launch, trial={"startingFrameRate": 20}, STALLED_SECONDS=AS_PLAYED)
     async with member(server, "anna") as anna, member(server, "bert") as bert:
         await until_both_play(anna, bert)
         await anna.until(lambda: len(anna.frames) > 5)
@@ -78,7 +80,7 @@ async def test_a_policy_of_agent_py_takes_a_lost_members_place_and_gives_it_back
 @pytest.mark.parametrize("forged", ["none", "of what was not sent", "before it is shown"])
 async def test_whatever_a_member_acknowledges_the_other_sees_the_game_go_on(launch, forged):
     """Acknowledgements control the pace of a member's own pictures alone."""
-    server = launch_formed(launch, trial={"startingFrameRate": 20})
+    server = launch_formed(launch, trial={"startingFrameRate": 20}, STALLED_SECONDS=AS_PLAYED)
 
     async def forge(bert):
         while forged != "none":

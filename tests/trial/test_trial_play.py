@@ -16,7 +16,7 @@ from protocol.trial_keys import keys
 from protocol.trial_sections import Ui
 from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end
-from trial.core.flow_control import STALLED_SECONDS
+from trial.settings import STALLED_SECONDS
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
@@ -258,7 +258,7 @@ async def test_a_slow_client_gets_fewer_frames_and_no_late_ones(launch, open_cli
 
 
 async def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_client):
-    server = launch()
+    server = launch(STALLED_SECONDS=str(STALLED_SECONDS))
     async with open_client(server.address) as client:
         await client.play(10)
         client.acks = False
@@ -268,7 +268,7 @@ async def test_the_game_of_a_page_that_stops_answering_is_paused(launch, open_cl
 async def test_a_server_that_could_not_run_for_some_seconds_does_not_take_a_page_that_has_answered_for_gone(
     launch, open_client
 ):
-    server = launch(trial={"startingFrameRate": 60})
+    server = launch(trial={"startingFrameRate": 60}, STALLED_SECONDS=str(STALLED_SECONDS))
     async with open_client(server.address) as client:
         await client.play(10)
         client.acks = False

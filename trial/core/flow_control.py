@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-STALLED_SECONDS = 3.0
-"""A client that acknowledges frames counts as lost or hidden if it leaves one without acknowledgement for so long."""
+from trial.settings import STALLED_SECONDS
 
 _WIDEST = 15  # the most frames under way, however long the round trip is
 
@@ -18,7 +17,8 @@ class Window:
     A client that has never acknowledged a frame is limited by its write buffer alone.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stalled_seconds: float = STALLED_SECONDS) -> None:
+        self._stalled_seconds = stalled_seconds
         self._under_way: deque[tuple[int, float, bool]] = deque()  # id, time, and whether it is the id's first message
         self._round_trip = math.inf  # the shortest round trip so far
         self._together = False  # whether the last acknowledgement was for several frames
@@ -64,4 +64,4 @@ class Window:
 
     def stalled(self, now: float) -> bool:
         """Whether the client has stopped acknowledging frames, after it has acknowledged some."""
-        return bool(self._under_way) and now - self._under_way[0][1] > STALLED_SECONDS and self.acknowledging
+        return bool(self._under_way) and now - self._under_way[0][1] > self._stalled_seconds and self.acknowledging

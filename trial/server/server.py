@@ -237,7 +237,11 @@ class TrialServer:
         trial = self._trial_of(hello.step)
         drawing = self._drawing
         connection = Connection(
-            websocket, lossless=self.settings.trial.lossless, assets=drawing.assets, draw=drawing.draw
+            websocket,
+            lossless=self.settings.trial.lossless,
+            stalled_seconds=self.settings.stalled_seconds,
+            assets=drawing.assets,
+            draw=drawing.draw,
         )
         sender = asyncio.create_task(connection.run())
         self._connections[connection] = sender

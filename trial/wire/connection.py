@@ -22,6 +22,7 @@ from trial.pictures.encoder import Encoder
 from trial.pictures.picture import Picture
 from trial.pictures.scene import Scene
 from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
+from trial.settings import STALLED_SECONDS
 from trial.wire.inbound import Inbound
 from trial.wire.player_socket import PlayerSocket
 
@@ -56,13 +57,14 @@ class Connection:
         websocket: ServerConnection,
         *,
         lossless: bool = False,
+        stalled_seconds: float = STALLED_SECONDS,
         assets: Assets | None = None,
         draw: Callable[[Scene], frames.Frame] | None = None,
     ) -> None:
         self.websocket = websocket
         self._direct = websocket if isinstance(websocket, PlayerSocket) else None
         self._loop = asyncio.get_running_loop()
-        self.window = Window()
+        self.window = Window(stalled_seconds)
         self.binary = websocket.subprotocol in SUBPROTOCOLS
         self.acknowledges_again: Callable[[int], None] | None = None
         """A function that is called when a client that had stopped acknowledging frames acknowledges one, with its

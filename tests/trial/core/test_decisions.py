@@ -32,13 +32,13 @@ from trial.core.effects import (
     WriteLog,
 )
 from trial.core.ended import Episode
-from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.flow_control import Window
 from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
 from trial.core.progress import PlayState
 from trial.core.trial import TRIAL_FAILED, Phase, Trial
 from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.settings import TrialSettings
+from trial.settings import STALLED_SECONDS, TrialSettings
 
 ROOT = Path(__file__).parents[3]
 SPACE = ("noop", "up", "right")

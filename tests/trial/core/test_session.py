@@ -7,11 +7,12 @@ import pytest
 from tests.trial.session_driver import SessionDriver
 from trial.core import messages
 from trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SendDone, WriteLog
-from trial.core.flow_control import STALLED_SECONDS, Window
+from trial.core.flow_control import Window
 from trial.core.message_log import MESSAGES_KEPT
 from trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
+from trial.settings import STALLED_SECONDS
 
 POLICY = {"afterAbsent": "policy", "substitute": "random"}
 
