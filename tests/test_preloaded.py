@@ -68,7 +68,7 @@ def begin(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
 def test_a_forked_process_has_only_its_own_arguments_and_variables(begin: Any, tmp_path: Path) -> None:
     process = begin("7", stderr=subprocess.STDOUT, start_new_session=True)
     assert process.stdout.read() == "out\nerr\n"
-    assert process.wait(20) == process.returncode == 7
+    assert process.wait(60) == process.returncode == 7
     told = json.loads((tmp_path / "told.json").read_text())
     assert told.pop("variables").items() >= {"WORD": "given"}.items()
     assert told == {
@@ -96,7 +96,7 @@ def test_the_output_of_a_forked_process_is_buffered_by_default(tmp_path: Path) -
             assert process.poll() is None
             time.sleep(0.01)
         process.kill()
-        process.wait(20)
+        process.wait(60)
         seen.append((tmp_path / "log").read_text())
     assert seen == ["", "out\n"]
 
@@ -109,23 +109,23 @@ def test_a_forked_process_ends_by_a_signal_and_can_be_waited_for(begin: Any, num
     with pytest.raises(subprocess.TimeoutExpired):
         process.wait(0.01)
     process.send_signal(number)
-    assert process.wait(20) in (-number, 1)  # 1: KeyboardInterrupt, told by hand
+    assert process.wait(60) in (-number, 1)  # 1: KeyboardInterrupt, told by hand
     process.send_signal(number)  # and nothing happens
 
 
 def test_a_signal_to_a_process_that_is_ending_is_no_error(begin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     process = begin("0", stderr=subprocess.STDOUT)
     if isinstance(process, preloaded.Forked):
-        monkeypatch.setattr(process, "poll", lambda: [process.wait(20), None][1])  # it ends meanwhile
+        monkeypatch.setattr(process, "poll", lambda: [process.wait(60), None][1])  # it ends meanwhile
     process.kill()
-    assert process.wait(20) in (0, -signal.SIGKILL)
+    assert process.wait(60) in (0, -signal.SIGKILL)
 
 
 def test_each_forked_process_has_its_own_variables_and_memory(begin: Any) -> None:
     first, second = begin(stderr=subprocess.STDOUT), begin(stderr=subprocess.STDOUT)
     assert first.pid != second.pid
     first.kill()
-    first.wait(20)
+    first.wait(60)
     assert second.poll() is None
 
 

@@ -29,7 +29,7 @@ class Pinging(threading.Thread):
         self._begun = threading.Event()
         self._over = asyncio.Event()
         self.start()
-        assert self._begun.wait(10)
+        assert self._begun.wait(60)
 
     def run(self) -> None:
         self._loop.run_until_complete(self._serve())
@@ -45,7 +45,7 @@ class Pinging(threading.Thread):
 
     def end(self) -> None:
         self._loop.call_soon_threadsafe(self._over.set)
-        self.join(10)
+        self.join(60)
 
 
 @pytest.fixture

@@ -137,7 +137,7 @@ class Local:
     def text(self) -> str:
         return self.output.read_text()
 
-    def wait_for_text(self, pattern: str, seconds: float = 20) -> re.Match[str]:
+    def wait_for_text(self, pattern: str, seconds: float = 60) -> re.Match[str]:
         """Wait until the terminal shows a match of this pattern."""
         until = time.monotonic() + seconds
         while not (found := re.search(pattern, self.text())):
@@ -153,7 +153,7 @@ class Local:
     def end(self, number: int = signal.SIGINT) -> int:
         assert self.process
         self.process.send_signal(number)
-        return self.process.wait(30)
+        return self.process.wait(60)
 
     def servers(self) -> list[str]:
         """Return the names of servers that have a process."""

@@ -57,7 +57,7 @@ def test_open_folders_of_an_earlier_version_are_closed_or_reported(local: Make) 
 def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(local: Make, where: str) -> None:
     here = local()
     (here.place / "file").write_text("no folder")
-    assert here.begin("--data", where).wait(20) == 1
+    assert here.begin("--data", where).wait(60) == 1
     assert f"The study cannot run with the data in {where}: Not a directory." in here.text()
     assert "DATA=FOLDER" in here.text()
     assert "Traceback" not in here.text()

@@ -66,7 +66,7 @@ def begun(here: Local) -> tuple[Walker, dict[str, Any]]:
     with walker.connect(state) as game:
         game.send(json.dumps({"command": "start"}))
         for _ in range(60):
-            game.recv(timeout=10)
+            game.recv(timeout=60)
         (part,) = (here.state / "spool").rglob("*.part")
         until(lambda: any(line["kind"] == "step" for line in recording.read(part.read_bytes())))
     return walker, state

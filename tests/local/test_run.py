@@ -90,7 +90,7 @@ def test_after_a_kill_during_a_game_the_participant_goes_on(local: Make) -> None
     seen = len(played)
     until(lambda: len(played) >= seen + 30, 60)
     enough.set()
-    playing.join(30)
+    playing.join(60)
     assert not playing.is_alive()
     until(lambda: "<h1>bye</h1>" in again.page(), 60)
     again.answer(word="two")
@@ -165,7 +165,7 @@ def test_ctrl_c_ends_it_whichever_thread_the_signal_reaches(local: Make) -> None
     *_, other = sorted(int(thread.name) for thread in Path(f"/proc/{here.process.pid}/task").iterdir())
     assert other != here.process.pid
     assert ctypes.CDLL(None, use_errno=True).syscall(TGKILL, here.process.pid, other, signal.SIGINT) == 0
-    assert here.process.wait(20) == 0
+    assert here.process.wait(60) == 0
 
 
 def test_an_agent_that_hangs_does_not_hold_up_ctrl_c(local: Make) -> None:
@@ -187,7 +187,7 @@ def test_a_second_run_on_the_same_data_is_refused(local: Make) -> None:
     here = local().run()
     other = Local(here.folder, here.place)
     other.output = here.place / "other.txt"
-    assert other.begin().wait(20) == 1
+    assert other.begin().wait(60) == 1
     assert f"already runs with the data in data, at {here.url}" in other.text()
     assert here.process
     assert here.process.poll() is None
@@ -207,7 +207,7 @@ def test_mistakes_in_the_project_are_reported_and_nothing_starts(local: Make) ->
     here = local()
     config = here.folder / "config.yml"
     config.write_text(config.read_text().replace("maxEpisodes: 1", "maxEpisodes: none"))
-    assert here.begin().wait(20) == 1
+    assert here.begin().wait(60) == 1
     assert "config.yml:10: trial.maxEpisodes" in here.text()
     assert "Traceback" not in here.text()
 
@@ -285,7 +285,7 @@ def _group(here: Local) -> int:
     return int(json.loads(task.read_text())["pid"])
 
 
-def _gone(here: Local, seconds: float = 15) -> None:
+def _gone(here: Local, seconds: float = 60) -> None:
     until(lambda: not here.servers(), seconds)
 
 
@@ -421,7 +421,7 @@ def test_after_ctrl_c_the_participant_is_told_that_the_study_was_stopped(local: 
 def test_a_folder_without_a_study_is_reported(local: Make) -> None:
     here = local()
     here.folder = here.place
-    assert here.begin().wait(20) == 1
+    assert here.begin().wait(60) == 1
     assert "config.yml" in here.text()
     assert "Traceback" not in here.text()
 
@@ -429,7 +429,7 @@ def test_a_folder_without_a_study_is_reported(local: Make) -> None:
 def test_an_unusable_data_folder_is_reported(local: Make) -> None:
     here = local()
     (here.place / "data").write_text("a file")
-    assert here.begin().wait(20) == 1
+    assert here.begin().wait(60) == 1
     assert "The study cannot run with the data in data" in here.text()
     assert "Traceback" not in here.text()
 
@@ -437,11 +437,11 @@ def test_an_unusable_data_folder_is_reported(local: Make) -> None:
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.0.7"])
 def test_an_address_of_another_machine_is_refused_in_a_sentence(local: Make, host: str) -> None:
     here = local()
-    assert here.begin("--host", host).wait(20) == 1
+    assert here.begin("--host", host).wait(60) == 1
     assert f"A study cannot run at {host}" in here.text()
 
 
 def test_an_invalid_origin_is_refused_in_a_sentence(local: Make) -> None:
     here = local()
-    assert here.begin("--origin", "localhost:3000").wait(20) == 1
+    assert here.begin("--origin", "localhost:3000").wait(60) == 1
     assert "Write it like http://localhost:3000" in here.text()

@@ -137,7 +137,7 @@ class Running:
         folder = self.store / "study/users/P1/trials" / server
         return {path.name: recording.read(path.read_bytes()) for path in sorted(folder.glob(pattern))}
 
-    def wait(self, seconds: float = 15) -> int:
+    def wait(self, seconds: float = 60) -> int:
         return self.process.wait(seconds)
 
     def terminate(self) -> None:

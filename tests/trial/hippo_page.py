@@ -99,7 +99,7 @@ class HippoPage(TakesMessages):
         until = self.frame_count + more
         await self.until(lambda: self.frame_count >= until)
 
-    async def closed(self, seconds: float = 15) -> int | None:
+    async def closed(self, seconds: float = 60) -> int | None:
         """Take messages until the connection is closed, which also opens the window; return the code."""
         code = await super().closed(seconds)
         self.ended = True

@@ -45,7 +45,7 @@ async def test_answers_wait_for_a_recording_that_cannot_be_stored_only_for_a_whi
     time.sleep(1)  # well after LINGER_SECONDS
     assert server.process.poll() is None, "the recording is not stored yet"
     in_the_way.unlink()
-    assert server.wait(25) == 0
+    assert server.wait(60) == 0
     (lines,) = recordings(server.store).values()
     assert lines[-1]["kind"] == "end"
 
@@ -75,7 +75,7 @@ async def test_a_participant_alone_keeps_the_answer_too(launch, tmp_path):
         await client.stop()
     assert server.answer()["answers"]["outcome"] == "stopped"
     in_the_way.unlink()
-    assert server.wait(25) == 0
+    assert server.wait(60) == 0
     assert server.recordings()
 
 
@@ -131,7 +131,7 @@ async def test_an_answer_that_is_refused_for_ever_does_not_keep_the_server_beyon
         await seen_by_both(anna, bert)
         await anna.stop()
         assert await bert.closed() == 1001
-    assert server.wait(25) == 0
+    assert server.wait(60) == 0
     assert "ending: deadline" in server.log_text()
     assert answer(server.store, "anna")["answers"]["outcome"] == "stopped"
 

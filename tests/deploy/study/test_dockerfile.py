@@ -150,7 +150,7 @@ def test_the_files_of_the_image_can_play_a_game(recipe: Recipe, folder: Path, tm
 
         client = asyncio.run(play())
         assert client.frame is not None
-        assert container.process.wait(20) == 0, container.process.communicate()
+        assert container.process.wait(60) == 0, container.process.communicate()
     finally:
         container.process.kill()
         container.process.communicate()
@@ -166,7 +166,7 @@ def test_sigterm_ends_the_server_of_the_image(recipe: Recipe, folder: Path, tmp_
     try:
         container.port()
         container.process.terminate()
-        assert container.process.wait(20) == 0
+        assert container.process.wait(60) == 0
     finally:
         container.process.kill()
         container.process.communicate()

@@ -44,7 +44,7 @@ class Functions:
     def bodies(self) -> list[Any]:
         return [json.loads(record["body"]) for event in self.events for record in event["Records"]]
 
-    def wait(self, count: int, seconds: float = 10) -> None:
+    def wait(self, count: int, seconds: float = 60) -> None:
         """Wait until the handlers have received so many records."""
         with self.came:
             assert self.came.wait_for(lambda: len(self.bodies()) >= count, seconds), self.bodies()

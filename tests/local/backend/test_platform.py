@@ -39,7 +39,7 @@ def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkey
     assert came["sweep"][0]["detail-type"] == "Scheduled Event"
     for thread in set(threading.enumerate()) - before:
         if thread.name.startswith(("queue", "timers", "task", "end")):
-            thread.join(10)
+            thread.join(60)
             assert not thread.is_alive(), thread.name
 
 

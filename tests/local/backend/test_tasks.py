@@ -63,7 +63,7 @@ class Here:
         self.made.append(made)
         return made
 
-    def wait(self, status: str, name: str = NAME, seconds: float = 15) -> dict[str, Any]:
+    def wait(self, status: str, name: str = NAME, seconds: float = 60) -> dict[str, Any]:
         """Wait for the event with this status. Returns its detail."""
         until = time.monotonic() + seconds
         while True:
@@ -517,11 +517,11 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
     give(here)
     with connect(f"ws://127.0.0.1:{port}/", proxy=None) as player:
         player.send(json.dumps({"userId": "P1", "token": "secret", "step": "3"}))
-        assert "actionSpace" in json.loads(player.recv(10))
+        assert "actionSpace" in json.loads(player.recv(60))
         player.send('{"command": "start"}')
         [part] = (here.state / "spool").rglob("*.part")
         while [line["kind"] for line in recording.read(part.read_bytes())].count("step") <= 20:
-            player.recv(10)
+            player.recv(60)
         kill(here)
     stopped = here.wait("STOPPED")
     assert stopped["containers"][0]["exitCode"] == 137

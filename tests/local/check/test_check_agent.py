@@ -458,7 +458,7 @@ def test_ctrl_c_names_the_call_and_its_line(folder: Path, terminal: bool) -> Non
             time.sleep(7)
             assert not select.select([keyboard], [], [], 0)[0]
         check.send_signal(signal.SIGINT)
-        assert check.wait(30) == 130
+        assert check.wait(60) == 130
         with contextlib.suppress(OSError):  # a terminal that nobody has open any more
             while part := os.read(keyboard, 1000):
                 shown += part

@@ -156,7 +156,7 @@ def test_a_function_that_returns_when_its_loop_has_ended_does_no_harm() -> None:
     asyncio.run(work())
     free.set()
     worker.close()
-    worker._thread.join(10)
+    worker._thread.join(60)
     assert not worker._thread.is_alive()
 
 

@@ -458,7 +458,7 @@ async def test_answers_come_on_the_event_loop_in_the_order_of_the_questions() ->
         await until_async(lambda: len(answers) == 3)
     assert answers == [(0, 0, None), (1, 1, None), (2, 2, None)]
     assert (policy.seeds, policy.threads, len(loops)) == ([5], {"policy player_1"}, 3)
-    assert policy.closed.wait(10)
+    assert policy.closed.wait(60)
 
 
 async def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() -> None:
@@ -476,7 +476,7 @@ async def test_a_policy_is_closed_also_if_the_event_loop_ends_as_it_answers() ->
         thread._loop = Ended()  # type: ignore[assignment]
         thread.ask(1, 1, {}, None)
         await until_async(lambda: told)
-    assert policy.closed.wait(10)
+    assert policy.closed.wait(60)
     assert answers == []
 
 
