@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import struct
 import time
 import zlib
@@ -142,43 +141,6 @@ def test_frames_of_mixed_kinds_are_drawn_in_order(newer_world: World, tab: Any) 
         exact = np.broadcast_to(np.roll(picture, 6, 1), (80, 60, 3))
         wait_until(tab, lambda exact=exact: np.array_equal(pixels(tab, 60, 80), exact))
     assert len(newer_world.connections) == 1
-
-
-def test_only_rows_that_change_are_drawn(newer_world: World, tab: Any) -> None:
-    tab.add_init_script(
-        """const put = CanvasRenderingContext2D.prototype.putImageData;
-        window.put = [];
-        CanvasRenderingContext2D.prototype.putImageData = function (...parts) {
-            window.put.push(parts.slice(4, 7).filter((_, place) => place !== 1));
-            put.apply(this, parts);
-        };"""
-    )
-    play(newer_world, tab)
-    encoder, numbers = Encoder(lossy=False), itertools.count(3)
-
-    def drawn(picture: Frame) -> list[list[int]]:
-        """Send the picture; return the first row and the number of rows of each part that is drawn."""
-        number = next(numbers)
-        tab.evaluate("window.put.length = 0")
-        newer_world.connections[0].send(encoder.encode(picture.copy(), number))
-        newer_world.wait_for({"ack": number})
-        assert np.array_equal(pixels(tab, 60, 80), np.broadcast_to(picture, (80, 60, 3)))
-        found: list[list[int]] = tab.evaluate("window.put")
-        return found
-
-    for picture in (texture(1), texture(1)[:, :, :1]):
-        assert drawn(picture) == [[0, 80]]
-        for place in ([0, 0], [79, 59], [40, 30], [[7, 9], [59, 0]]):
-            picture[tuple(place)] ^= 255
-            rows = sorted(np.ravel(place[0]))
-            assert drawn(picture) == [[rows[0], rows[-1] - rows[0] + 1]]
-        assert drawn(picture) == []
-    blurred = np.full((80, 60, 1), 90, np.uint8)
-    number = next(numbers)
-    newer_world.connections[0].send(header(JPEG, blurred, number) + jpeg(blurred))
-    newer_world.wait_for({"ack": number})
-    picture[3, 3] ^= 255
-    assert drawn(picture) == [[0, 80]], "the picture that is shown is not the one that the difference is to"
 
 
 def test_a_burst_of_frames_is_acknowledged_and_the_newest_is_shown(newer_world: World, tab: Any) -> None:

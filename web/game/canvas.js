@@ -8,7 +8,6 @@ const context = canvas.getContext("2d", { alpha: false });
 let size = ""; // width, height and channels of the picture that is shown
 let pixels = null; // the last lossless picture: one or three bytes for each pixel
 let rows = 0; // how many rows have come of a lossless picture that comes in parts
-let exact = false; // whether the canvas shows just these pixels
 let imageData = null;
 
 // Forgets the picture: the next frame cannot be a difference to it.
@@ -20,19 +19,16 @@ export function forgetPicture() {
 export function drawPixels(header, { first, bytes }) {
   if (header.kind === ROWS) return drawRows(header, first, bytes);
   beginPicture(header);
-  if (header.kind === KEY) {
-    pixels = bytes;
-    putRows(0, header.height, header);
-  } else if (pixels) putChanges(bytes, header);
-  else throw new Error("no such frame");
-  exact = true;
+  if (header.kind === KEY) pixels = bytes;
+  else if (!pixels) throw new Error("no such frame");
+  else for (let i = 0; i < bytes.length; i += 1) pixels[i] ^= bytes[i];
+  putRows(0, header.height, header);
 }
 
 // Draws a lossy picture; null: only takes over its size. The pixels of the last lossless picture stay: the next frame may
 // be a difference to them.
 export function drawPicture(header, picture) {
   beginPicture(header);
-  exact = false;
   if (picture) context.drawImage(picture, 0, 0);
 }
 
@@ -45,7 +41,6 @@ function drawRows(header, first, bytes) {
   pixels.set(bytes, first * width * channels);
   putRows(first, count, header);
   rows = first + count;
-  exact = rows === height;
 }
 
 // Drops the pixels if not all rows of their picture have come, or if it has another size.
@@ -64,18 +59,6 @@ function beginPicture({ width, height, channels = 0 }) {
 export function shapePicture(ratio) {
   document.body.style.setProperty("--ratio", ratio);
   document.body.classList.toggle("wide", ratio > 1);
-}
-
-// Changes the pixels by a difference. Draws the rows from the first to the last that changes; all, if others are shown.
-function putChanges(bytes, header) {
-  let [start, end] = [0, bytes.length];
-  while (start < end && bytes[start] === 0) start += 1;
-  while (end > start && bytes[end - 1] === 0) end -= 1;
-  for (let i = start; i < end; i += 1) pixels[i] ^= bytes[i];
-  const line = header.width * header.channels;
-  const first = exact ? Math.floor(start / line) : 0;
-  const count = (exact ? Math.ceil(end / line) : header.height) - first;
-  if (count > 0) putRows(first, count, header);
 }
 
 function putRows(first, count, { width, height, channels }) {
