@@ -300,7 +300,8 @@ def _serve(requests: socket.socket, told_by_imports: Mapping[str, str]) -> dict[
             if asks and asked:
                 asks.close()
                 asking[asked.fileno()] = asked
-            told.send(str(pid).encode())
+            with contextlib.suppress(OSError):  # the process that asked may have been killed
+                told.send(str(pid).encode())
             running[os.pidfd_open(pid)] = told, pid
 
 

@@ -21,7 +21,7 @@ CHANGES = {
     "afterAbsent: policy\n": "afterAbsent: end\n",
     # On a busy machine the second participant may come late, and a page needs seconds to load again.
     "  patience: 30\n": "  patience: 300\n",
-    "  absent: 15  ": "  absent: 30  ",
+    "  absent: 15\n": "  absent: 30\n",
 }
 
 
