@@ -179,4 +179,6 @@ def _call(function: Callable[[], Any]) -> tuple[Any, Exception | None]:
     except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
         return None, error
     except BaseException as error:  # noqa: BLE001 - as above
-        return None, RuntimeError(repr(error)).with_traceback(error.__traceback__)
+        ended = RuntimeError(repr(error)).with_traceback(error.__traceback__)
+        ended.__cause__ = error.__cause__
+        return None, ended

@@ -10,14 +10,15 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping
+import traceback
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from protocol.keys import QUESTION_ID, groups_key, waiting_key
 from protocol.session import MAX_PLAYERS
 from trial.agent import match
 from trial.agent.match import BadGroups
-from trial.agent.tracebacks import report, where
+from trial.agent.tracebacks import where
 from trial.agent.worker import Worker
 from trial.core.effects import AgentTimeout
 from trial.recordings.store import Store, short_error
@@ -86,7 +87,8 @@ class Matching:
             self._log_once(logging.ERROR, f"{text}; this server calls it no more")
             return []
         except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
-            text = report(error, folder, _private(question))
+            # Its message is left out, since it may quote an answer.
+            text = f"{''.join(traceback.format_tb(error.__traceback__))}{where(error, folder)}: {type(error).__name__}"
             self._log_once(logging.ERROR, f"match() failed, and nobody is matched\n{text}")
             return []
         if problem:
@@ -97,24 +99,6 @@ class Matching:
         if text not in self._logged and len(self._logged) < 100:
             self._logged.add(text)
             log.log(level, "%s", text)
-
-
-def _private(question: Mapping[str, Any]) -> list[str]:
-    """Return what an error of `match` must not tell the log: the ids of those who wait, and the texts they answered.
-
-    A text of up to three letters stays: it says little of a person, and may be a word of any traceback.
-    """
-    answers = (value for each in question["waiting"] for value in _values(each.get("answers")))
-    return [*(each["id"] for each in question["waiting"]), *(text for text in answers if len(text) > 3)]
-
-
-def _values(answers: Any) -> Iterator[str]:
-    """Yield the texts in answers, which are dicts and lists of any depth."""
-    if isinstance(answers, str):
-        yield answers
-    elif isinstance(answers, Mapping | list):
-        for each in answers.values() if isinstance(answers, Mapping) else answers:
-            yield from _values(each)
 
 
 def read(body: bytes) -> dict[str, Any] | None:

@@ -115,32 +115,34 @@ async def test_a_match_that_raises_matches_no_participants_and_is_reported(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert await stored_answer(tmp_path, lambda waiting: waiting[0]["answers"]["age"]) == {"groups": []}
-    assert "KeyError: 'age'" in caplog.text
+    assert "KeyError" in caplog.text
+    assert "waiting[0]" in caplog.text
 
 
 async def test_an_error_of_match_tells_the_log_no_answer(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    about = {"age": "forty-one", "seen": ["the red one"], "sure": "no", "more": {"name": "Ada"}}
+    about = {"age": "forty-one", "income": 31415, "told": "a line\r\nanother"}
     waiting = [{"id": name, "answers": about} for name in ("label-one", "label-two")]
     question = json.dumps(QUESTION | {"waiting": waiting}).encode()
 
     def failing(waiting: list[dict[str, Any]]) -> list[Any]:
-        raise ValueError(f"no number: {waiting[0]['answers']} of {waiting[0]['id']}")
+        raise ValueError(f"no number: {waiting}")
 
     assert await stored_answer(tmp_path, failing, question=question) == {"groups": []}
-    assert "ValueError: no number: {'age': '(participant)', 'seen': ['(participant)'], 'sure': 'no'" in caplog.text
-    assert not any(word in caplog.text for word in ("forty-one", "red", "label-one"))
+    assert "in failing" in caplog.text
+    assert "ValueError" in caplog.text
+    assert not any(word in caplog.text for word in ("forty-one", "31415", "another", "label-one"))
 
 
 async def test_a_match_that_hangs_is_given_up_and_its_line_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(match, "SECONDS", 0.1)
+    monkeypatch.setattr(match, "SECONDS", 1.0)
     file = tmp_path / "agent.py"
-    file.write_text("import time\ndef match(waiting):\n    time.sleep(1)\n")
+    file.write_text("import time\ndef match(waiting):\n    time.sleep(20)\n")
     found: dict[str, Any] = {}
     exec(compile(file.read_text(), file, "exec"), found)
     assert await stored_answer(tmp_path, found["match"]) == {"groups": []}
-    assert "match() has not returned within 0.1 s, and is in agent.py:3; this server calls it no more" in caplog.text
+    assert "match() has not returned within 1 s, and is in agent.py:3; this server calls it no more" in caplog.text
 
 
 @pytest.mark.parametrize(
