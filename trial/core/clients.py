@@ -16,7 +16,8 @@ from trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
 
-_LOOK_AGAIN = 0.1  # seconds from the first look that finds a client stalled to the one that counts
+LOOK_AGAIN = 0.1
+"""Seconds from the first look that finds a client stalled to the one that counts."""
 
 
 @dataclass(slots=True)
@@ -28,20 +29,22 @@ class Client:
     player: str
     sent: tuple[object, ...] = ()
     """The values (`Clients.state_of`) that the client was sent last."""
-    stalled_since: float | None = None
-    """When a look at this client found it stalled first; None if the last look did not."""
+    found_stalled: tuple[float, int] | None = None
+    """When a look found the client stalled first, and how many acknowledgements had come; None if it is not stalled."""
 
-    def stalled(self, now: float) -> bool:
-        """Return whether the client has stopped acknowledging frames, and had when it was looked at before.
+    def stalled(self, now: float) -> bool | None:
+        """Return whether the client has stopped acknowledging frames; None if that is to be looked at again.
 
         One look is not enough: if this process could not run for some seconds, the acknowledgements of that time have
         come, and are read only afterwards.
         """
         if not self.window.stalled(now):
-            self.stalled_since = None
-        elif self.stalled_since is None:
-            self.stalled_since = now
-        return self.stalled_since is not None and now - self.stalled_since >= _LOOK_AGAIN
+            self.found_stalled = None
+            return False
+        acknowledgements = self.window.acknowledgements
+        if self.found_stalled is None or self.found_stalled[1] != acknowledgements:
+            self.found_stalled = now, acknowledgements
+        return now - self.found_stalled[0] >= LOOK_AGAIN or None
 
 
 class Clients:
@@ -90,9 +93,12 @@ class Clients:
         """Return the client with this connection; None if another has replaced it."""
         return next((each for each in self.by_human.values() if each.connection == connection), None)
 
-    def stalled(self, now: float) -> list[Client]:
-        """Return the clients that have stopped acknowledging frames."""
-        return [client for client in self.by_human.values() if client.stalled(now)]
+    def stalled(self, now: float) -> list[Client] | None:
+        """Return the clients that have stopped acknowledging frames; None if that is to be looked at again."""
+        found = [(client, client.stalled(now)) for client in self.by_human.values()]
+        if any(stalled is None for _, stalled in found):
+            return None
+        return [client for client, stalled in found if stalled]
 
     def send(self, client: Client, text: str) -> None:
         """Send a message to one client."""

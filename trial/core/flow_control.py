@@ -25,6 +25,8 @@ class Window:
         self._sent_at = -math.inf
         self.newest = -1
         """The id of the last frame sent; -1 before the first."""
+        self.acknowledgements = 0
+        """How many acknowledgements have come for frames that were under way."""
 
     @property
     def acknowledging(self) -> bool:
@@ -48,6 +50,7 @@ class Window:
             if sent_id == frame_id and first:  # rows of one frame share its id, so they tell no round trip
                 self._round_trip = min(self._round_trip, now - at)
         if frames:
+            self.acknowledgements += 1
             self._together = frames > 1
 
     def wait(self, now: float, rate: int) -> float:

@@ -47,7 +47,7 @@ from typing import Any, Literal
 from trial.core import messages, records
 from trial.core.agent_call import AgentCall
 from trial.core.beginning import Beginning
-from trial.core.clients import Client, Clients
+from trial.core.clients import LOOK_AGAIN, Client, Clients
 from trial.core.commands import Commands
 from trial.core.effects import (
     AgentTimeout,
@@ -445,7 +445,11 @@ class Trial:
             return True
         due = self._timing.next(progress, self._now)
         if due is Due.STEP:
-            if self._paused_by_stalled():
+            stalled = self._clients.stalled(self._now)
+            if stalled is None:
+                self.wake_at = self._now + LOOK_AGAIN
+                return False
+            if self._paused_by(stalled):
                 return True
             self._agent.make(self._steps.take(progress, self._now))
             return False
@@ -465,15 +469,13 @@ class Trial:
         self._emit(WriteLog(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
         self._messages.repeat(unfinished.unheard, self._ns())
 
-    def _paused_by_stalled(self) -> bool:
-        """Hold the game if a page has stopped answering; return whether one has."""
-        stalled = [
-            each for each in self._clients.stalled(self._now) if self._participants.stalls(each.player, self._now)
-        ]
-        for client in stalled:
+    def _paused_by(self, stalled: Sequence[Client]) -> bool:
+        """Hold the game for the pages that have stopped answering; return whether one of them was here before."""
+        newly = [each for each in stalled if self._participants.stalls(each.player, self._now)]
+        for client in newly:
             self._emit(WriteLog(logging.INFO, "the player's page has stopped answering: paused"))
             self._note("stopped answering", client)
-        return bool(stalled)
+        return bool(newly)
 
     def _write_end(self) -> bool:
         """Record the end of an episode or a break, after a last call that gives the agent the feedback before it."""

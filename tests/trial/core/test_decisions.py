@@ -243,10 +243,11 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
     driver.step()
+    assert driver.wait(0.11) == [], "the step that is due is not taken"
     assert driver.trial.progress.state is PlayState.PLAYING, "its acknowledgement may have come, and be read next"
-    driver.wait(0.05)
-    driver.wait(0.15)
-    assert [type(effect) for effect in driver.step()] == [WriteLine, SendPicture, WriteLog, SendState]
+    assert driver.trial.wake_at == pytest.approx(driver.now + 0.1)
+    assert driver.wait(0.05) == []
+    assert [type(effect) for effect in driver.wait(0.06)] == [WriteLog, SendState]
     assert driver.trial.progress.state is PlayState.PAUSED
     assert driver.trial.wake_at is None
 
@@ -261,16 +262,33 @@ def test_a_client_whose_acknowledgement_is_read_late_does_not_hold_the_game():
     window.acknowledged(1, driver.now + 0.01)
     driver.step()
     window.sent(2, driver.now)
-    driver.now += 10 * STALLED_SECONDS  # this process could not run
+    for frame in (2, 3, 4):
+        driver.wait(10 * STALLED_SECONDS)  # this process could not run
+        assert driver.trial.progress.state is PlayState.PLAYING
+        assert driver.of(Call) == [], "no step is taken yet"
+        window.acknowledged(frame, driver.now)
+        assert isinstance(driver.say(ack=frame)[-1], StepCall)
+        window.sent(frame + 1, driver.now)
+        driver.step()
+
+
+def test_an_acknowledgement_between_two_looks_begins_anew():
+    window = Window()
+    driver = Driver().begin()
+    driver.reset()
+    driver.connect(window=window)
+    driver.say(command="start")
+    window.sent(1, driver.now)
+    window.acknowledged(1, driver.now + 0.01)
     driver.step()
-    window.acknowledged(2, driver.now)
+    window.sent(2, driver.now)
     window.sent(3, driver.now)
-    driver.step()
-    driver.step()
+    driver.wait(STALLED_SECONDS + 0.2)
+    window.acknowledged(2, driver.now)
+    driver.wait(0.15)
     assert driver.trial.progress.state is PlayState.PLAYING
-    driver.now += 10 * STALLED_SECONDS
-    driver.step()
-    assert driver.trial.progress.state is PlayState.PLAYING, "each time anew"
+    driver.wait(0.15)
+    assert driver.trial.progress.state is PlayState.PAUSED
 
 
 def test_a_refused_message_gets_a_sentence():
