@@ -11,7 +11,7 @@ from types import FrameType
 
 @contextlib.contextmanager
 def interruption() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C raise KeyboardInterrupt, within the block, only in the function that this yields.
+    """Let Ctrl-C raise KeyboardInterrupt, within the block, only in the function that this yields, and at its end.
 
     Elsewhere it would be raised at any line, and in the middle of a lock of the standard library it breaks the lock
     for other threads, which then print a traceback or wait for ever. A second Ctrl-C raises it at once. Nothing changes
@@ -37,3 +37,4 @@ def interruption() -> Iterator[Callable[[], None]]:
         yield check
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    check()

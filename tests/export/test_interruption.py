@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 from collections.abc import Iterator
@@ -18,28 +19,44 @@ def default_handler() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+class Ended(Exception):
+    pass
+
+
 def press() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
 def test_it_ends_the_block_where_the_block_can_be_ended() -> None:
-    with interruption() as check:
+    with contextlib.suppress(Ended), interruption() as check:
         check()
         press()
         with pytest.raises(KeyboardInterrupt):
             check()
+        raise Ended
 
 
 def test_pressed_again_it_ends_the_block_at_once() -> None:
-    with interruption():
+    with contextlib.suppress(Ended), interruption():
         press()
         with pytest.raises(KeyboardInterrupt):
             press()
+        raise Ended
+
+
+def press_in_a_block() -> None:
+    with interruption():
+        press()
+
+
+def test_it_ends_the_program_after_the_block() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        press_in_a_block()
 
 
 def test_after_the_block_it_is_as_before() -> None:
     with interruption():
-        press()
+        pass
     with pytest.raises(KeyboardInterrupt):
         press()
 
