@@ -243,11 +243,10 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
     driver.step()
-    assert driver.wait(0.11) == [], "the step that is due is not taken"
     assert driver.trial.progress.state is PlayState.PLAYING, "its acknowledgement may have come, and be read next"
-    assert driver.trial.wake_at == pytest.approx(driver.now + 0.1)
-    assert driver.wait(0.05) == []
-    assert [type(effect) for effect in driver.wait(0.06)] == [WriteLog, SendState]
+    assert driver.of(Call) == []
+    effects = [*driver.wait(0.15), *driver.wait(0.15)]
+    assert [type(effect) for effect in effects] == [WriteLog, SendState]
     assert driver.trial.progress.state is PlayState.PAUSED
     assert driver.trial.wake_at is None
 
