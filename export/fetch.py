@@ -114,7 +114,6 @@ class Fetcher:
                     committed = time.monotonic()
             while running:
                 collect()
-            check()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, work in running.items():

@@ -229,7 +229,8 @@ def test_the_game_is_held_when_its_client_disconnects():
     assert driver.of(Close) == [], "there is nothing to replace"
 
 
-def test_a_client_that_stops_acknowledging_holds_the_game():
+def second_frame_under_way():
+    """A game whose client has acknowledged the first frame, and not yet the second one; and its window."""
     window = Window()
     driver = Driver().begin()
     driver.reset()
@@ -239,6 +240,11 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
     window.acknowledged(1, driver.now + 0.01)
     driver.step()
     window.sent(2, driver.now)
+    return driver, window
+
+
+def test_a_client_that_stops_acknowledging_holds_the_game():
+    driver, _ = second_frame_under_way()
     driver.wait(STALLED_SECONDS)
     assert isinstance(driver.of(Call)[0], StepCall), "it may still answer"
     driver.now += 0.15
@@ -252,15 +258,7 @@ def test_a_client_that_stops_acknowledging_holds_the_game():
 
 
 def test_a_client_whose_acknowledgement_is_read_late_does_not_hold_the_game():
-    window = Window()
-    driver = Driver().begin()
-    driver.reset()
-    driver.connect(window=window)
-    driver.say(command="start")
-    window.sent(1, driver.now)
-    window.acknowledged(1, driver.now + 0.01)
-    driver.step()
-    window.sent(2, driver.now)
+    driver, window = second_frame_under_way()
     for frame in (2, 3, 4):
         driver.wait(10 * STALLED_SECONDS)  # this process could not run
         assert driver.trial.progress.state is PlayState.PLAYING
@@ -272,15 +270,7 @@ def test_a_client_whose_acknowledgement_is_read_late_does_not_hold_the_game():
 
 
 def test_an_acknowledgement_between_two_looks_begins_anew():
-    window = Window()
-    driver = Driver().begin()
-    driver.reset()
-    driver.connect(window=window)
-    driver.say(command="start")
-    window.sent(1, driver.now)
-    window.acknowledged(1, driver.now + 0.01)
-    driver.step()
-    window.sent(2, driver.now)
+    driver, window = second_frame_under_way()
     window.sent(3, driver.now)
     driver.wait(STALLED_SECONDS + 0.2)
     window.acknowledged(2, driver.now)
