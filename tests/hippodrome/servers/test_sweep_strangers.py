@@ -10,6 +10,7 @@ import itertools
 import json
 import math
 import random
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -54,12 +55,16 @@ class Place(MotoWorld):
         self.leftovers: dict[str, list[str]] = {thing: [] for thing in THINGS}  # what a sweep must remove
         self.asked: list[str] = []  # participants for whose servers the start message is sent again
         self.meanwhile: Callable[[str], None] = lambda operation: None  # what happens after each listing
+        # One call at a time: a sweep makes several at once, and moto's dictionaries must not change while they are listed.
+        self._one = threading.RLock()
         self._numbers = iter(range(10**9))
 
     def __enter__(self) -> Self:
         super().__enter__()
         session = botocore.session.get_session()
-        session.register("after-call", lambda model, **_: model.name.startswith("List") and self.meanwhile(model.name))
+        session.register("before-call", self._begin_call)
+        session.register("after-call", self._end_call)
+        session.register("after-call-error", lambda **_: self._one.release())
         self.platform = AwsPlatform(self.env, session)
         installed.use(self.platform)
         self.put("project_master_list.json", json.dumps({"projects": [msgspec.to_builtins(STUDY)]}).encode())
@@ -68,6 +73,16 @@ class Place(MotoWorld):
     def __exit__(self, *error: object) -> None:
         installed.use(None)
         super().__exit__(*error)
+
+    def _begin_call(self, **_: Any) -> None:
+        self._one.acquire()
+
+    def _end_call(self, model: Any, **_: Any) -> None:
+        try:
+            if model.name.startswith("List"):
+                self.meanwhile(model.name)
+        finally:
+            self._one.release()
 
     def _build(self) -> None:
         super()._build()
