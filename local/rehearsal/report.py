@@ -79,9 +79,10 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
     plays = [each for bot in reports for each in bot.plays]
     rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
     rows += _together(reports)
-    if stopped := sum(each.stopped for each in plays):
+    games = _games(reports)
+    if stopped := sum(any(each.stopped for each in game) for game in games):
         rows.append(
-            ("games stopped early", f"{_of(stopped, len(plays))}: a bot plays {play:g} s (`--play 0`: to the end)")
+            ("games stopped early", f"{_of(stopped, len(games))}: a bot plays {play:g} s (`--play 0`: to the end)")
         )
     if plays:
         rows.append(("wait on the game page", _spread([each.waited for each in plays])))
@@ -96,17 +97,24 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
     return rows
 
 
+def _games(reports: Sequence[BotReport]) -> list[list[PlayedStep]]:
+    """The games that were played; each as the bots who played in it have seen it."""
+    games: dict[tuple[str, str], list[PlayedStep]] = {}
+    for bot in reports:
+        for play in bot.plays:
+            if not play.unmatched and play.addresses:
+                together = play.members > 1
+                games.setdefault((play.step, play.addresses[0] if together else bot.user_id), []).append(play)
+    return [*games.values()]
+
+
 def _together(reports: Sequence[BotReport]) -> Rows:
     """The rows of games that bots played together; none if no bot played or waited with others."""
     plays = [play for bot in reports for play in bot.plays]
     waited = [play.lobby for play in plays if play.lobby is not None]
     if not waited and not any(play.unmatched or play.members > 1 for play in plays):
         return []
-    sessions: dict[str, list[PlayedStep]] = {}
-    for play in plays:
-        if not play.unmatched and play.addresses:
-            sessions.setdefault(f"{play.step} {play.addresses[0]}", []).append(play)
-    sizes = Counter(play.members for members in sessions.values() for play in members[:1])
+    sizes = Counter(game[0].members for game in _games(reports))
     made = " and ".join(
         f"{count} with {size} participant{'' if size == 1 else 's'}"
         for size, count in sorted(sizes.items(), reverse=True)

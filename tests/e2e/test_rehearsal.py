@@ -75,6 +75,7 @@ def test_bots_play_in_pairs_and_one_of_an_odd_number_finds_no_other(tmp_path: Pa
     assert process.returncode == 0, text
     rows = {row[1].strip(): row[2].strip() for row in (line.split("│") for line in text.splitlines()) if len(row) == 4}
     assert rows["games played together"] == "1 with 2 participants"
+    assert rows["games stopped early"].startswith("1 of 1: "), "one of the two stops the game for both"
     assert re.fullmatch(r"1: bot-[0-9a-f]{6}-\d", rows["unmatched"])
     assert re.fullmatch(r"p50 \d+\.\d s, .*max 1[0-9]\.\d s", rows["wait in the lobby"])
     assert [rows[name] for name in ("bots finished", "games found", "completion codes shown")] == ["3 of 3"] * 3
