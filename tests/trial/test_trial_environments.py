@@ -230,6 +230,20 @@ def test_a_process_that_was_killed_is_started_again(launch: Any) -> None:
         env.reset()
 
 
+async def test_a_process_whose_end_is_not_noticed_yet_is_started_again(tmp_path: Path) -> None:
+    made = environments.Environments(tmp_path)
+    (await made._connection()).close()
+    first = made._process
+    assert first is not None
+    first.kill()
+    until(lambda: not linux.runs(first.pid), SECONDS)  # the event loop stands still meanwhile
+    assert first.returncode is None
+    (await made._connection()).close()
+    assert made._process is not None
+    assert made._process.pid != first.pid
+    await made.close()
+
+
 async def test_an_environment_that_hangs_delays_no_step_of_the_game(launch: Any, open_client: Any) -> None:
     server = launch(agent(), SERVES)
 

@@ -154,6 +154,15 @@ class Environments:
         async with self._starting:
             if self._process is None or self._process.returncode is not None:
                 await self._start()
+            try:
+                return self._hand_over()
+            except BrokenPipeError:  # it has ended, and asyncio does not know it yet
+                await self.close()
+                await self._start()
+                return self._hand_over()
+
+    def _hand_over(self) -> socket.socket:
+        """Hand one end of a socket pair to the process, and return the other. Raises OSError."""
         if self._handing is None:
             raise OSError("the process is ending")
         ours, theirs = socket.socketpair()
