@@ -79,7 +79,7 @@ def judged_import(name: str, ours: float, bare: float, detail: Mapping[str, str]
         1000 * ours,
         "ms CPU",
         yardstick=1000 * bare,
-        at_most=WITHIN if name == "next_step" else None,  # participants wait for this one alone
+        at_most=WITHIN if name == "next_step" else None,  # every page waits for it; the others work behind the pages
         detail=detail,
     )
 

@@ -38,6 +38,7 @@ from trial.recordings import recording
 RATE = 30  # frames a second
 SETTLE = 2.0  # seconds of play before the measurement
 SECONDS = 8.0  # the seconds of play that are measured
+LEAST_SHARE = 0.95  # the least share of frames of a yardstick: two servers that fail alike are not well
 MAX_CPU = 1.2  # the goal for a frame of the example: ms of processor time
 TRIALS = 32  # trials that one core has to serve
 MAX_MEMORY = 45.0  # the goal for the memory of each trial: MB
@@ -311,13 +312,14 @@ def one_core() -> Iterator[Row]:
 def judged_core(found: list[ServerLoad]) -> Iterator[Row]:
     """Yield the rows of trials that share a core."""
     yield row(
-        f"frames delivered at {RATE}/s by {len(found)} trials of the example on one core",
-        statistics.mean(one.share for one in found),
+        f"frames at {RATE}/s that reach the client of each of {len(found)} trials of the example on one core, at least",
+        min(one.share for one in found),
         "of those due",
         at_least=0.99,
         bound="ours: one core serves so many",
         detail={
-            "of the trial that got least": min(one.share for one in found),
+            "of all trials": statistics.mean(one.share for one in found),
+            "a client": "a socket, which draws nothing",
             "CPU per frame, ms": statistics.mean(one.cpu for one in found),
             **interpreter(),
         },
@@ -361,12 +363,16 @@ def judged_policy(slow: float, idle: float, late: float) -> Row:
     if late == 0.0:
         raise RuntimeError("the policy was never late")
     return row(
-        f"ticks delivered at {RATE}/s beside a policy that takes 100 ms, against one that idles",
+        f"ticks at {RATE}/s that reach the client beside a policy that takes 100 ms, against one that idles",
         slow,
         "of those due",
-        yardstick=idle,
+        yardstick=max(idle, LEAST_SHARE),
         at_least=0.99,
-        detail={"steps for which it was late": late},
+        detail={
+            "steps for which it was late": late,
+            "beside the one that idles": idle,
+            "the yardstick is at least": LEAST_SHARE,
+        },
     )
 
 

@@ -20,11 +20,14 @@ from typing import IO
 def run(
     module: str, arguments: Sequence[str], *, env: Mapping[str, str], cwd: Path, out: IO[bytes], err: IO[bytes]
 ) -> tuple[int, float]:
-    """Run a module in a process of its own; return its exit status and its peak memory in MB (0 if unknown)."""
+    """Run a module in a process of its own; return its exit status and its peak memory in MB.
+
+    Raises FileNotFoundError if the process could not tell its memory, since something killed it.
+    """
     file = cwd / "memory.txt"
     line = [sys.executable, "-m", "bench.memory", str(file), module, *arguments]
     done = subprocess.run(line, env=env, cwd=cwd, stdin=subprocess.DEVNULL, stdout=out, stderr=err, check=False)
-    return done.returncode, float(file.read_text()) if file.exists() else 0.0
+    return done.returncode, float(file.read_text())
 
 
 def peak() -> float:

@@ -17,18 +17,20 @@ from typing import Any
 import msgspec
 
 from bench.scale import assumed, quantile, spread
-from bench.table import Row, each, row
+from bench.table import Row, each, row, simulated
 from deploy.cost.prices import Prices
 from hippodrome.lobby import decisions
 from hippodrome.model.project import Project
 from hippodrome.model.records import from_json
 from hippodrome.model.server import RECORDS, Server
 from testing.clock import EPOCH
+from testing.exploration import sample_of_each
 from testing.quiet_log import quiet
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.aws_bound import aws_alone_together
 from testing.simulation.conditions import Conditions
 from testing.simulation.members import Habits, SimulatedMember
+from testing.simulation.people import SimulatedVisit
 from testing.simulation.world import PROJECT, SimulatedWorld
 
 CROWD, WITHIN, SEED = 1000, 60.0, 2026
@@ -45,7 +47,7 @@ LEAVE = (Habits(leaves=0.8), Habits(leaves=1.6, beacon=None))  # they close the 
 def rows() -> Iterator[Row]:
     """Measure crowds, then faults; about twenty minutes of one processor."""
     with quiet():
-        yield from each([crowds, faults_of_groups])
+        yield from simulated(each([crowds, faults_of_groups]))
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,12 @@ class Together:
 
     @property
     def waits(self) -> list[float]:
-        """The waits from the lobby to the first picture, of the participants who saw one."""
-        seen = [(one.lobby, one.first_picture) for one in self.came]
-        return [picture - came for came, picture in seen if came is not None and picture is not None]
+        """The waits from the lobby to the first picture; until now, of those who should have seen one and have not."""
+        now, found = self.world.clock.seconds, list[float]()
+        for one in self.came:
+            if one.lobby is not None and (one.first_picture is not None or not served(one.visit)):
+                found.append((now if one.first_picture is None else one.first_picture) - one.lobby)
+        return found
 
     @property
     def matched(self) -> list[float]:
@@ -176,23 +181,32 @@ def one_in_ten_leaves(number: int) -> Habits:
     return USUAL if number % 10 else LEAVE[number // 10 % 2]
 
 
+def served(visit: SimulatedVisit) -> bool:
+    """Return whether the participant has finished, has left by themselves, or was told that no others came.
+
+    A participant whose server failed is told so, and is not served.
+    """
+    return faults.served_or_told(visit) and not visit.reason.startswith(("failed", "ended"))
+
+
 def judged(how: str, found: Together) -> Iterator[Row]:
-    """Yield the rows of a crowd: the share that finishes or is told why not, and the waits.
+    """Yield the rows of a crowd: the share that is `served`, and the waits.
 
     The share is 0 if a session is split or merged, or if anything is left.
     """
     world, came = found.world, found.came
     left = {kind: count for kind, count in world.left().items() if count}
     ended = Counter("played to the end" if one.visit.finished is not None else one.visit.reason for one in came)
-    well = 100 * sum(faults.served_or_told(one.visit) for one in came) / len(came)
+    well = 100 * sum(served(one.visit) for one in came) / len(came)
     sizes = Counter(len(one.members) for one in lobby.formed(world.platform.documents.kept, found.project))
     within = WITHIN if len(came) == CROWD else SMALLER_WITHIN
     name = f"{len(came):,} arrive within {within:.0f} s and play {how}"
     yield row(
-        f"{name}: share that plays to the end or is told; 0 if groups are split or merged, or anything is left",
+        f"{name}: share that plays to the end, leaves, or finds no others; "
+        "0 if groups are split or merged, or anything is left",
         0.0 if left or found.wrong else well,
         "%",
-        bound="all participants; no group is split or merged, and no participant is matched who has gone",
+        bound="ours: no server fails for good, no group is split or merged, and nobody is matched who has gone",
         at_least=100,
         detail={
             "how it ended for them": dict(ended),
@@ -253,7 +267,7 @@ def faults_of_groups() -> Iterator[Row]:
     tried, bad, detail = 0, 0, dict[str, Any]()
     for journey in faults.JOURNEYS_OF_GROUPS:
         points = faults.points(journey, SEED)
-        tries = points[:: max(1, len(points) // POINTS)]
+        tries = sample_of_each(points, max(1, len(points) // POINTS), lambda point: point.fault)
         outcomes = [faults.run(journey, SEED, point)[1] for point in tries]
         failed = sum(not outcome.well for outcome in outcomes)
         detail[journey.name] = f"{len(outcomes)} of {len(points)} faults, {failed} bad"
@@ -265,9 +279,9 @@ def faults_of_groups() -> Iterator[Row]:
 def judged_faults(bad: int) -> Row:
     """Return the row of the faults that did harm."""
     return row(
-        "fault points of groups that strand a participant, leave something behind, or split or merge a group",
+        "of those, with a participant stranded, something left behind, or a group split or merged",
         bad,
         "",
-        bound="ours: no fault strands a participant, leaves anything behind, or splits or merges a group",
+        bound="ours: no fault does so; `make hunt` tries all of them",
         at_most=0,
     )

@@ -83,6 +83,12 @@ def each(measures: Iterable[Measure]) -> Iterator[Row]:
             yield unmeasured(measure.__name__.replace("_", " "), error)
 
 
+def simulated(rows: Iterable[Row]) -> Iterator[Row]:
+    """Yield the rows with names that say that their figures are those of the simulation, not of AWS."""
+    for found in rows:
+        yield {**found, "name": f"simulated: {found['name']}"}
+
+
 def measured(found: Mapping[str, Any]) -> bool:
     """Return whether a row holds a figure."""
     return found.get("value") is not None

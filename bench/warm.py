@@ -20,6 +20,7 @@ import msgspec
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
+from bench import table
 from bench.bill import server_seconds
 from bench.pages import KeptConnection, serving
 from bench.scale import SEED, assumed, quantile, seconds_of
@@ -47,8 +48,8 @@ PATIENCE = 60.0  # seconds to wait for any condition in local mode
 def rows() -> Iterator[Row]:
     """Measure a simulated hour, a simulated crowd, and a few participants in local mode; about a minute."""
     with quiet():
-        yield from each([an_hour, a_burst, what_they_cost])
-    yield from each([for_real])
+        yield from table.simulated(each([an_hour, a_burst]))
+    yield from each([what_they_cost, for_real])
 
 
 # Simulated
@@ -176,7 +177,7 @@ def what_they_cost() -> Iterator[Row]:
     prices = Prices()
     warm = estimate.warm(PROJECT.id, WARM, PROJECT.size.cpu, PROJECT.size.memory, prices)
     yield row(
-        f"{WARM} warm servers of {warm.cpu:g} vCPU and {warm.memory:g} GB, an hour of waiting on Spot",
+        f"computed: {WARM} warm servers of {warm.cpu:g} vCPU and {warm.memory:g} GB, an hour of waiting on Spot",
         warm.spot.likely,
         "$",
         yardstick=warm.on_demand.likely,

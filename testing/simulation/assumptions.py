@@ -51,6 +51,8 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         f"highest count of its messages; allowed to {' and '.join(sorted(LOOPS)) or 'none'} (Lambda Developer Guide, "
         "recursive loop detection)",
         "cold start": f"{_span(functions.COLD)} ({OURS})",
+        "processor time of functions": "0 s: calls and cold starts alone take time (rows of `functions` and `control` "
+        "measure it)",
         "functions end after": ", ".join(f"{name} {seconds} s" for name, seconds in TIMEOUTS.items()),
         "functions at once": f"{CONCURRENCY:,} in the account (Lambda quotas; a new account may have 10)",
         "waiting page asks": f"every {POLLS['first']:g} s at first, every {POLLS['longest']:g} s later, every "

@@ -1,9 +1,10 @@
-"""Computes how long AWS alone would take to serve a crowd, without our code: a lower bound for every control plane.
+"""Computes how long AWS alone would take to serve a crowd, without our code.
 
-An ideal control plane has no latency. It calls RunTask as early as the account's token buckets admit after the
-participant's request. It changes the zone as soon as EC2 shows the address of the running task; while another change
-keeps the zone busy, it collects the tasks of the next change. It shows `ready` as soon as the change is INSYNC. Only
-AWS's quotas, start times, late addresses, DNS times with their slow spans, and the busy zone remain.
+The lower bound is for control planes that name a server when its task runs, as ours does. An ideal one of these has no
+latency. It calls RunTask as early as the account's token buckets admit after the participant's request. It changes the
+zone as soon as EC2 shows the address of the running task; while another change keeps the zone busy, it collects the
+tasks of the next change. It shows `ready` as soon as the change is INSYNC. Only AWS's quotas, start times, late
+addresses, DNS times with their slow spans, and the busy zone remain.
 """
 
 from __future__ import annotations
@@ -15,15 +16,21 @@ from testing.simulation.cloud import QUOTAS
 from testing.simulation.conditions import Conditions, address_lag, draws, propagation, start_time
 from testing.simulation.ports import MAX_CHANGES
 
+ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
 
-def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:
+
+def aws_alone(
+    asked: Sequence[float], seed: int, conditions: Conditions | None = None, *, early: bool = False
+) -> list[float]:
     """Return the seconds that each participant waits; `asked` are the seconds at which they request a server.
 
     The seed is that of the simulated run, whose start times and DNS times are drawn in the same order. The same
     arguments give the same result. Interruptions are left out, since they only make waits longer. Spot that is sold out
     changes nothing, since Fargate on demand has the same quotas and start times.
+
+    With `early`, a task's name is made as soon as its network interface has an address, while the task still starts.
     """
-    return [ready - came for came, ready in _served(asked, seed, conditions)]
+    return [ready - came for came, ready in _served(asked, seed, conditions, early=early)]
 
 
 def aws_alone_together(
@@ -44,15 +51,22 @@ def aws_alone_together(
     return [max(members[-1], server) - one for members, server in pairs for one in members]
 
 
-def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> Iterator[tuple[float, float]]:
-    """Yield, for each server that is requested at these seconds, this second and the second at which it is ready."""
+def _served(
+    asked: Sequence[float], seed: int, conditions: Conditions | None = None, *, early: bool = False
+) -> Iterator[tuple[float, float]]:
+    """Yield, for each server that is requested at these seconds, this second and the second at which it is ready.
+
+    `early` is that of `aws_alone`.
+    """
     conditions, starts, spreads = conditions or Conditions(), draws(seed, "starts"), draws(seed, "propagation")
-    chance, lags = random.Random(seed), draws(seed, "addresses")
+    chance, lags, interfaces = random.Random(seed), draws(seed, "addresses"), draws(seed, "interfaces")
     arrivals = sorted(asked)
-    runs = sorted(
-        (launched + start_time(starts, conditions.starts) + address_lag(lags, conditions), came)
-        for launched, came in zip(_admitted(arrivals), arrivals, strict=True)
-    )
+    runs = []  # for each task: when its address is known, when the task runs, and when the participant came
+    for launched, came in zip(_admitted(arrivals), arrivals, strict=True):
+        task_runs = launched + start_time(starts, conditions.starts)
+        known = launched + interfaces.uniform(*ATTACHED) if early else task_runs + address_lag(lags, conditions)
+        runs.append((known, task_runs, came))
+    runs.sort()
     free, change = 0.0, QUOTAS["route53"]
     most, gap = MAX_CHANGES // 2, 1 / change[0]
     while runs:
@@ -61,7 +75,7 @@ def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = N
         runs = runs[len(batch) :]
         free = begins + max(gap, chance.uniform(*conditions.busy_zone))
         in_sync = begins + propagation(spreads, conditions, seed, begins)
-        yield from ((came, in_sync) for _, came in batch)
+        yield from ((came, max(in_sync, task_runs)) for _, task_runs, came in batch)
 
 
 def _admitted(arrivals: Sequence[float]) -> list[float]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hippodrome.ports import DnsRecord, NoCapacity, TaskRequest
+from testing.simulation.aws_bound import ATTACHED
 from testing.simulation.cloud import Throttled
 from testing.simulation.tasks import TimedTask
 from testing.simulation.world import SimulatedWorld
@@ -30,7 +31,6 @@ from testing.tasks import Life
 TRIES, PAUSE = 3, 20.0  # tries of RunTask, and looks for the address; seconds between them
 ATTEMPTS = 5  # attempts of botocore's legacy mode
 AGAIN = (60.0, 120.0)  # seconds until Lambda invokes a function that has raised an exception again
-ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
 RULES = 300  # rules of an event bus: EventBridge quotas
 ASSUMED = (
     f"the interface has its address {ATTACHED[0]:g} to {ATTACHED[1]:g} s after RunTask (our assumption); functions have "

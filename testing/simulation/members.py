@@ -141,6 +141,7 @@ class SimulatedMember(SimulatedParticipant):
             return "unreachable"
         if self.first_picture is None:
             self.first_picture = self.clock.seconds
+        self._connected()
         try:
             outcome = self._stay(trial, str(state["step"]))
         finally:
