@@ -1,4 +1,4 @@
-"""The stages that `stop`, `erase` and `destroy` share, and the one executor that runs them; `apply` uses it to try again.
+"""The stages that `stop`, `erase` and `destroy` share, and the one executor that runs them, which `apply` uses, too.
 
 look      what exists; changes nothing
 plan      what was found → a list of steps: plain data, in the order in which they are to be done; may be empty
