@@ -416,8 +416,9 @@ async def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_cli
     async with open_client(server.address) as later:
         await later.hello()
         await later.until(lambda: later.frames and np.array_equal(later.frame, textured(later.frame)))
-        assert later.kinds[0] == JPEG
-        assert set(later.kinds[1:]) == {ROWS}
+        # A step that was under way when the game was paused may still bring a picture.
+        assert set(later.kinds) == {JPEG, ROWS}
+        assert (later.kinds[0], later.kinds[-1]) == (JPEG, ROWS)
 
 
 async def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> None:
