@@ -367,7 +367,11 @@ def _anonymous(pid: int) -> int:
 
 def rows() -> Iterator[Row]:
     """Measure everything, one row after another; about a minute."""
-    yield from each((single_steps, batched_steps, idle))
+    before = os.sched_getaffinity(0)
+    try:
+        yield from each((single_steps, batched_steps, idle))
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 if __name__ == "__main__":

@@ -162,8 +162,8 @@ async def played(servers: Sequence[tuple[str, int]], players: int) -> list[Toget
 def _played(pid: int, found: load.Delivered) -> TogetherLoad:
     ticks = [client.pictures for client in found.clients]
     size = sum(client.bytes for client in found.clients)
-    cpu = 1000 * found.cpu / max(ticks)
-    return TogetherLoad([one / found.due for one in ticks], size / sum(ticks), cpu, load.memory(pid)[0])
+    cpu = 1000 * found.cpu / max(1, *ticks)
+    return TogetherLoad([one / found.due for one in ticks], size / max(1, sum(ticks)), cpu, load.memory(pid)[0])
 
 
 # On sockets

@@ -8,22 +8,31 @@ from pathlib import Path
 from typing import Any
 
 from local.rehearsal.study_process import ROOT, Process, StudyProcess, logs_of
+from protocol import environment
 from testing import preloaded
 from trial.recordings.recording import read
+from trial.settings import STALLED_SECONDS
 
 
 class HeldStudy(StudyProcess):
     """A `StudyProcess` whose imports are done when it starts, and those of its servers, too (`forked_servers.py`).
 
-    With `port`, it can be started again at the same port.
+    With `port`, it can be started again at the same port. `stalled`: for how many seconds a page may leave a frame without
+    acknowledgement; a page on a busy machine may need more than the 3 s that a server gives it otherwise.
     """
 
-    def __init__(self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None) -> None:
+    def __init__(
+        self, folder: Path, data: Path, *, port: int = 0, log: Path | None = None, stalled: float = STALLED_SECONDS
+    ) -> None:
         super().__init__(folder, data, log=log)
-        self._port = port
+        self._port, self._stalled = port, stalled
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
-        options["env"] = {**options["env"], "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT)}
+        options["env"] = {
+            **options["env"],
+            "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT),
+            environment.STALLED_SECONDS: str(self._stalled),
+        }
         arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
         return preloaded.start("testing.forked_servers", arguments, starts=True, **options)
 

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import ssl
 import subprocess
 import sys
@@ -27,7 +26,7 @@ import boto3
 import httpx
 from botocore.config import Config
 
-from testing import aws_events, preloaded, template
+from testing import aws_events, ports, preloaded, template
 from testing.certificates import authority
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,9 +107,7 @@ class MinistackWorld:
     # -- opening and closing
 
     def __enter__(self) -> MinistackWorld:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = ports.free()
         self.endpoint = f"https://127.0.0.1:{self.port}"
         self.ca, certificate, key = _certificates(self.home)
         self.tls = ssl.create_default_context(cafile=str(self.ca))

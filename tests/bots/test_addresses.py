@@ -223,7 +223,7 @@ def test_a_server_elsewhere_gets_no_token(site: Site, url: str) -> None:
 def test_a_server_that_redirects_is_not_followed(site: Site) -> None:
     site.answer("GET", game(state=ready(f"wss://{SERVER}.servers.example.org/")))
     site.answer("SOCKET", "", "307 Temporary Redirect", Location=f"wss://{EVIL}/")
-    errors = site.walk()
+    errors = site.walk(patience=60)
     assert any("HTTP 307" in error for error in errors), errors
     assert set(site.dialled) == {f"{SITE}:443", f"{SERVER}.servers.example.org:443"}
 

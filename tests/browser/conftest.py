@@ -213,7 +213,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StudyProcess]:
     folder = tmp_path_factory.mktemp("example")
     copy_of(ROOT, folder / "project")
     replace_lines(folder / "project", {"  startingFrameRate: 30\n": "  startingFrameRate: 10\n"})
-    held = HeldStudy(folder / "project", folder / "data")
+    held = HeldStudy(folder / "project", folder / "data", stalled=60)
     try:
         held.start()
         yield held
@@ -285,17 +285,17 @@ class GamesToEnd:
 def hold(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hold]:
     """An example, held once for all tests of the file, in a copy whose game can be ended with a button.
 
-    Call it as `hold("gridworld")`. `changes` has lines of config.yml and their replacements.
+    Call it as `hold("gridworld")`. `changes` has lines of config.yml and their replacements; `stalled` is HeldStudy's.
     """
     studies: dict[tuple[str, ...], HeldStudy] = {}
 
-    def start(name: str, changes: Mapping[str, str] | None = None) -> StudyProcess:
+    def start(name: str, changes: Mapping[str, str] | None = None, stalled: float = 60) -> StudyProcess:
         key = (name, *(changes or {}).values())
         if key not in studies:
             folder = tmp_path_factory.mktemp(name)
             copy_of(ROOT / "examples" / name, folder / "project")
             replace_lines(folder / "project", changes or {})
-            studies[key] = HeldStudy(folder / "project", folder / "data")
+            studies[key] = HeldStudy(folder / "project", folder / "data", stalled=stalled)
             studies[key].start()
         return studies[key]
 

@@ -15,6 +15,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may take longer than the bench waits for a page: here, that is no failure."""
     monkeypatch.setattr(seen, "PATIENCE", 60_000)
+    monkeypatch.setenv("STALLED_SECONDS", "60")
 
 
 def test_the_bench_has_agents_for_every_kind_of_picture() -> None:

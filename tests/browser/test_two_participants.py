@@ -15,6 +15,7 @@ from tests.browser.conftest import Hold
 from tests.browser.test_together_browser import asleep, players_shown, wait_for_text
 from tests.browser.world import FLAWS, shot
 from trial.recordings.recording import read
+from trial.settings import STALLED_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
 CHANGES = {
@@ -27,7 +28,7 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def study(hold: Hold) -> StudyProcess:
-    return hold("two-players", CHANGES)
+    return hold("two-players", CHANGES, stalled=STALLED_SECONDS)
 
 
 NOTE_TITLES = """() => {

@@ -31,8 +31,8 @@ def main() -> int:
         return status
     server = HTTPServer((os.environ["HOST"], int(os.environ["PORT"])), Health)
     threading.Thread(target=server.serve_forever, daemon=True).start()
-    print(json.dumps({"port": server.server_port}), flush=True)
-    print(json.dumps({key: os.environ[key] for key in ("STORE", "SPOOL", "TLS", "AGENT_DIR", "TOKEN")}), flush=True)
+    told = {key: os.environ[key] for key in ("STORE", "SPOOL", "TLS", "AGENT_DIR", "TOKEN")}
+    print(f"{json.dumps({'port': server.server_port})}\n{json.dumps(told)}", flush=True)
     time.sleep(seconds)
     return status
 

@@ -376,7 +376,8 @@ def test_deleted_data_are_reported_and_the_study_goes_on(local: Make, what: str)
     kept = {name: (here.data / name).read_text() for name in ("_secret.json", "project_master_list.json")}
     time.sleep(1.2)  # it looks twice a second
     path = here.data if what == "data" else here.data / what
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    gone = path.rename(here.data.parent / "gone")  # all of it at once
+    shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
     here.wait_for_text("WAS DELETED")
     here.wait_for_text("published again")
     time.sleep(1.5)

@@ -250,7 +250,8 @@ def test_an_answer_needs_the_participants_own_ticket(installed: MinistackInstall
 
 def test_start_runs_one_task_with_its_shutdown_timer(installed: MinistackInstallation, people: People) -> None:
     tasks = installed.tasks()
-    assert set(tasks) == {server_of("R_alice"), server_of("R_bob")}
+    assert server_of("R_alice") in tasks
+    assert set(tasks) <= {server_of("R_alice"), server_of("R_bob")}  # Bob's timer may have fired
     task = tasks[server_of("R_alice")]
     assert task["capacityProviderName"] == "FARGATE_SPOT"
     assert (task["overrides"]["cpu"], task["overrides"]["memory"]) == ("512", "1024")
@@ -270,7 +271,8 @@ def test_the_same_start_message_again_starts_nothing(installed: MinistackInstall
     world = installed.world
     world.client("sns").publish(TopicArn=installed.outputs["StartServerTopic"], Message=json.dumps(message))
     until(lambda: installed.waiting(installed.queue("start_server")) == 0, "the message is dealt with")
-    assert len(installed.tasks()) == 2
+    assert server_of("R_alice") in installed.tasks()
+    assert set(installed.tasks()) <= {server_of("R_alice"), server_of("R_bob")}  # Bob's timer may have fired
 
 
 # -- queues, alarms ---------------------------------------------------------------------------------------------------

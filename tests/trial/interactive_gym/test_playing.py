@@ -42,7 +42,8 @@ def make_project(folder: Path, source: str) -> Path:
 
 async def play_project(launch: Any, open_client: Any, made: Path, trial: dict[str, Any]) -> Any:
     """Play the project's game to its end on a server; return the server."""
-    server = launch(None, {"startingFrameRate": 60, "maxFrameRate": 60, **trial}, AGENT_DIR=str(made))
+    section = {"startingFrameRate": 60, "maxFrameRate": 60, "callbackSeconds": 10, **trial}
+    server = launch(None, section, AGENT_DIR=str(made))
 
     await play_to_the_end(server, open_client)
     assert server.wait() == 0, server.log_text()
@@ -93,7 +94,8 @@ async def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open
 
 async def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
     made = make_project(tmp_path / "mine", PEOPLE)
-    told = yaml.safe_load((made / "config.yml").read_text())["trial"] | {"instructions": None, "countdown": 0}
+    told = yaml.safe_load((made / "config.yml").read_text())["trial"]
+    told |= {"instructions": None, "countdown": 0, "callbackSeconds": 10}
     members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60"}
     server = launch(
         None, {key: value for key, value in told.items() if value is not None}, AGENT_DIR=str(made), **members
