@@ -31,6 +31,7 @@ from hippodrome.config import read_project
 from hippodrome.model import server
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.servers import dns
+from hippodrome.storage import secret
 from testing.certificates import authority
 from testing.simulation import hippo
 from testing.strict_s3 import BUCKET, StrictS3
@@ -196,6 +197,7 @@ wall, cpu = time.perf_counter(), time.process_time()
 import botocore.session
 s3, bucket = botocore.session.get_session().create_client("s3"), os.environ["BUCKET"]
 s3.get_object(Bucket=bucket, Key="{MASTER_LIST}")["Body"].read()
+s3.get_object(Bucket=bucket, Key="{secret.KEY}")["Body"].read()
 s3.list_objects_v2(Bucket=bucket, Prefix=project + "/users/" + user + "/")
 s3.put_object(Bucket=bucket, Key=project + "/users/" + user + "/participant.json", Body=b"{{}}", IfNoneMatch="*")
 s3.get_object(Bucket=bucket, Key=page)["Body"].read()
