@@ -50,7 +50,8 @@ def internet(monkeypatch):
         context = answering(records)
         stack.append(context)
         ask_only(monkeypatch, context.__enter__())
-        monkeypatch.setattr("deploy.aws.hosted_zone.DNS_TIMEOUT", 60.0)  # somebody answers
+        # This server answers each question, but on a busy machine it may need more than the 0.2 s of the deaf one below.
+        monkeypatch.setattr("deploy.aws.hosted_zone.DNS_TIMEOUT", 60.0)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
