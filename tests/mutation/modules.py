@@ -12,12 +12,22 @@ SERVICES = (
     "hippodrome/participants/test_relays",
     "hippodrome/servers/test_causes",
     "hippodrome/test_metrics",
+    "hippodrome/servers/test_sessions",
+    "hippodrome/servers/test_stops",
+    "hippodrome/lobby/test_lobby_servers",
 )
 SESSIONS = (
     "trial/core/test_session",
     "trial/core/test_session_hidden",
     "trial/core/test_session_flapping",
     "trial/core/test_presence",
+)
+TRIALS = (
+    "trial/core/test_decisions",
+    "trial/core/test_turns",
+    "trial/core/test_keys",
+    "trial/core/test_flow_control",
+    *SESSIONS,
 )
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
@@ -74,7 +84,11 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/model/messages.py": ("hippodrome/model/test_messages", "hippodrome/participants/test_relays"),
     "hippodrome/servers/dns.py": ("hippodrome/servers/test_dns", *SERVICES),
     "hippodrome/participants/frame.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_scripts"),
-    "hippodrome/participants/pages.py": ("hippodrome/participants/test_pages", "hippodrome/participants/test_journey"),
+    "hippodrome/participants/pages.py": (
+        "hippodrome/participants/test_pages",
+        "hippodrome/participants/test_journey",
+        "hippodrome/participants/test_lobby_pages",
+    ),
     "hippodrome/model/participant.py": (
         "hippodrome/model/test_participant",
         "hippodrome/participants/test_repeated_forms",
@@ -114,6 +128,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/sweep.py": (
         "hippodrome/servers/test_sweep",
         "hippodrome/servers/test_sweep_garbage",
+        "hippodrome/servers/test_sweep_strangers",
         *SERVICES,
     ),
     "hippodrome/participants/waiting.py": (
@@ -124,7 +139,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/model/memberships.py": ("hippodrome/model/test_memberships", "hippodrome/lobby/test_lobby"),
     "hippodrome/model/sessions.py": ("hippodrome/servers/test_sessions",),
     "protocol/session.py": ("protocol/test_session", "hippodrome/servers/test_sessions"),
-    "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo",),
+    "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo", "hippodrome/config/test_hippo_pages"),
     "protocol/trial.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
@@ -144,33 +159,30 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/config/test_config_keys",
         "hippodrome/config/test_registration",
     ),
-    "trial/core/controls.py": ("trial/core/test_wire_messages", "trial/core/test_controls"),
+    "trial/core/controls.py": ("trial/core/test_wire_messages", "trial/core/test_controls", "trial/core/test_keys"),
     "trial/pictures/frames.py": ("trial/core/test_wire_messages", "trial/pictures/test_frames"),
-    "trial/core/clients.py": ("trial/core/test_decisions",),
-    "trial/core/trial.py": ("trial/core/test_decisions",),
-    "trial/core/records.py": ("trial/core/test_decisions",),
-    "trial/core/recording.py": ("trial/core/test_decisions",),
-    "trial/core/participants.py": ("trial/core/test_decisions",),
-    "trial/core/beginning.py": ("trial/core/test_decisions",),
-    "trial/core/steps.py": ("trial/core/test_decisions",),
-    "trial/core/ending.py": ("trial/core/test_decisions",),
-    "trial/core/commands.py": ("trial/core/test_wire_messages", "trial/core/test_decisions"),
-    "trial/core/agent_call.py": ("trial/core/test_decisions",),
+    "trial/core/clients.py": TRIALS,
+    "trial/core/trial.py": TRIALS,
+    "trial/core/records.py": TRIALS,
+    "trial/core/recording.py": TRIALS,
+    "trial/core/participants.py": TRIALS,
+    "trial/core/beginning.py": TRIALS,
+    "trial/core/steps.py": TRIALS,
+    "trial/core/ending.py": TRIALS,
+    "trial/core/commands.py": ("trial/core/test_wire_messages", *TRIALS),
+    "trial/core/agent_call.py": TRIALS,
     "trial/core/choices.py": (
         "trial/core/test_turns",
         "trial/core/test_progress",
         "trial/core/test_controls",
         "trial/core/test_progress_any_order",
+        "trial/core/test_keys",
     ),
     "trial/core/presence.py": SESSIONS,
     "trial/core/session.py": SESSIONS,
-    "trial/core/message_log.py": ("trial/core/test_decisions",),
-    "trial/core/timing.py": (
-        "trial/core/test_decisions",
-        "trial/core/test_progress",
-        "trial/core/test_progress_any_order",
-    ),
-    "trial/core/progress.py": ("trial/core/test_progress", "trial/core/test_progress_any_order"),
+    "trial/core/message_log.py": TRIALS,
+    "trial/core/timing.py": (*TRIALS, "trial/core/test_progress", "trial/core/test_progress_any_order"),
+    "trial/core/progress.py": ("trial/core/test_progress", "trial/core/test_progress_any_order", *TRIALS),
     "trial/core/messages.py": ("trial/core/test_wire_messages", "trial/core/test_messages"),
     "trial/recordings/resume.py": ("trial/recordings/test_recorded",),
     "trial/recordings/recording.py": (
