@@ -357,6 +357,29 @@ def test_the_slots_of_many_servers_are_given_back_with_one_write() -> None:
     assert server_slots(platform).slots == {}
 
 
+ENDED = server.close(claimed(study(), "alice"), Reason.LOST, FakePlatform().clock + timedelta(seconds=200))
+
+
+@pytest.mark.parametrize(
+    ("known", "counted"),
+    [
+        (ENDED, 200),
+        (msgspec.structs.replace(ENDED, attempt=2), 30 * 60),
+        (msgspec.structs.replace(ENDED, reason=None), 30 * 60),
+        (claimed(study(), "alice"), 30 * 60),
+        (None, 30 * 60),
+    ],
+)
+def test_a_forgotten_slot_counts_the_time_of_its_attempt_or_all_that_it_reserved_if_that_is_unknown(
+    known: Server | None, counted: int
+) -> None:
+    project = study(max_server_hours=10, max_runtime=30)
+    platform = installed(project)
+    assert Slots(platform).acquire(project, claimed(project, "alice"))
+    Slots(platform).release_forgotten("maze", {ENDED.name: known, "the-name-of-no-server": None})
+    assert server_slots(platform) == ServerSlots(used=counted)
+
+
 def test_without_limits_no_document_of_slots_is_read_or_written() -> None:
     platform = installed()
     touched: list[str] = []

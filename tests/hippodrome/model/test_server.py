@@ -56,6 +56,16 @@ def test_a_new_record_holds_all_that_is_known_before_anything_starts() -> None:
 
 
 @pytest.mark.parametrize(
+    ("players", "matching", "may_match"), [(3, "match", True), (3, "arrival", False), (1, "match", False)]
+)
+def test_only_a_sessions_server_has_players_and_may_call_match(players: int, matching: str, may_match: bool) -> None:
+    of_session = new_record(ids.new_session_id(), players=players, matching=matching)
+    assert (of_session.players, of_session.may_match) == (players, may_match)
+    assert (own := new_record(players=players, matching=matching)).players == 0
+    assert not own.may_match
+
+
+@pytest.mark.parametrize(
     ("user", "first"),
     [
         ("alice", "alice"),
@@ -199,6 +209,34 @@ def test_an_attempt_that_found_no_slot_is_repeated_and_is_no_earlier_attempt() -
     assert server.repeating(full, new_record(attempt=2)).earlier == second.earlier
 
 
+@pytest.mark.parametrize(
+    ("attempt", "reason", "automatic", "on_request"),
+    [
+        (1, Reason.LOST, 2, None),
+        (2, Reason.LOST, 3, None),
+        (3, Reason.LOST, None, 4),
+        (7, Reason.LOST, None, 8),
+        (8, Reason.LOST, None, None),
+        (1, Reason.ENDED, None, 2),
+        (1, Reason.STOPPED, None, 2),
+        (2, Reason.FULL, None, 2),
+        (8, Reason.FULL, None, 8),
+    ],
+)
+def test_a_lost_server_is_replaced_twice_by_itself_and_then_on_request(
+    attempt: int, reason: Reason, automatic: int | None, on_request: int | None
+) -> None:
+    closed = server.close(new_record(attempt=attempt), reason, LATER)
+    assert (server.next_attempt(closed), server.requestable_attempt(closed)) == (automatic, on_request)
+    assert server.plays_on(closed) is (automatic is not None)
+
+
+def test_an_open_server_plays_on_and_has_no_next_attempt() -> None:
+    assert server.plays_on(new_record())
+    assert server.next_attempt(new_record()) is None
+    assert server.requestable_attempt(new_record()) is None
+
+
 # Warm servers
 
 
@@ -237,6 +275,7 @@ def test_a_warm_server_is_assigned_or_drained() -> None:
     }
     assert changes(waiting, server.draining(waiting)) == {"state": ServerState.DRAINING}
     assert waiting.is_warm_server
+    assert server.next_attempt(server.close(waiting, Reason.LOST, LATER)) is None, "its pool starts another"
 
 
 # After the end

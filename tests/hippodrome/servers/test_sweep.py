@@ -398,6 +398,20 @@ def test_only_a_few_sweeps_read_each_record(platform: FakePlatform) -> None:
     assert sum(count - quiet for count in reads) <= 8
 
 
+@pytest.mark.parametrize(("minutes", "seconds", "read"), [(3, 0, False), (3, 1, True), (18, 0, True), (18, 1, False)])
+def test_a_record_without_resources_is_read_from_its_third_minute_for_a_quarter_of_an_hour(
+    platform: FakePlatform, minutes: int, seconds: int, read: bool
+) -> None:
+    ready(platform)
+    Servers(platform).stop([StopServer("maze", "alice")])
+    platform.wait(minutes=minutes, seconds=seconds)
+    read_keys: list[str] = []
+    get = platform.documents.get
+    platform.documents.get = lambda key, *kept: read_keys.append(key) or get(key, *kept)  # type: ignore
+    sweep.handler({}, None)
+    assert (server.key(LABEL) in read_keys) is read
+
+
 def test_a_record_that_cannot_be_read_does_not_keep_the_sweep_from_other_records(platform: FakePlatform) -> None:
     running_is_not_told(platform)
     Servers(platform).start(StartServer("maze", "bob"))
