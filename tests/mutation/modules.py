@@ -115,6 +115,10 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/servers/warm/test_warm_servers",
         "hippodrome/limits/test_limits",
         "hippodrome/participants/test_pages",
+        "hippodrome/test_one_bad_entry",
+        "hippodrome/model/test_hippo_entry",
+        "hippodrome/model/test_server",
+        "hippodrome/lobby/test_match",
     ),
     "hippodrome/model/server.py": ("hippodrome/model/test_server", *SERVICES),
     "hippodrome/model/warm_pool.py": (
@@ -129,6 +133,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/servers/test_sweep",
         "hippodrome/servers/test_sweep_garbage",
         "hippodrome/servers/test_sweep_strangers",
+        "hippodrome/test_one_bad_entry",
         *SERVICES,
     ),
     "hippodrome/participants/waiting.py": (

@@ -166,12 +166,13 @@ def test_a_function_remembers_for_ten_seconds_that_a_study_is_full() -> None:
     assert slots.admit(project, "alice")
     assert not slots.admit(project, "bob")
     platform.documents.calls.clear()
+    platform.wait(seconds=9)
     assert not slots.admit(project, "carol")
     assert platform.documents.calls == []
     assert len(slots.documents_naming("maze", "alice")) == 1
     slots.release_participant("maze", "alice")
     assert slots.documents_naming("maze", "alice") == []
-    platform.wait(seconds=11)
+    platform.wait(seconds=1)
     assert slots.admit(project, "carol")
 
 
@@ -340,6 +341,20 @@ def test_a_slot_is_given_back_once_and_before_the_record_is_closed(monkeypatch: 
     monkeypatch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
     with pytest.raises(RetryLater):
         Slots(platform).acquire(study(max_servers=1), claimed(study(max_servers=1), "bob"))
+
+
+def test_a_lost_server_whose_slot_is_not_freed_stays_open_until_the_next_sweep_frees_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    platform = installed(study(max_servers=1))
+    platform.tasks.running.pop(start_and_run(platform, "alice"))
+    platform.wait(minutes=11)
+    with monkeypatch.context() as patch:
+        patch.setattr("hippodrome.storage.compare_and_swap.TRIES", 0)
+        Sweep(platform).run()
+    assert not record(platform).is_closed
+    Sweep(platform).run()
+    assert record(platform).is_closed
 
 
 def test_the_slots_of_many_servers_are_given_back_with_one_write() -> None:

@@ -122,6 +122,30 @@ def test_a_refusal_of_run_task_gives_the_cause(error: NoCapacity | Refused, caus
     assert causes.cause_of_refusal(error) is cause
 
 
+def test_the_values_of_causes_stay_as_they_are_in_stored_records() -> None:
+    assert [cause.value for cause in Cause] == [
+        "image",
+        "initialisation",
+        "cannot begin",
+        "ended at once",
+        "never ready",
+        "no port",
+        "crashed",
+        "out of memory",
+        "killed",
+        "no task definition",
+        "no permission",
+        "impossible size",
+        "quota",
+        "refused",
+        "no capacity",
+        "spot",
+        "machine",
+        "vanished",
+        "unknown",
+    ]
+
+
 def test_a_cause_of_a_later_version_is_unknown() -> None:
     assert causes.parse_cause("image") is Cause.IMAGE
     assert causes.parse_cause("") is causes.parse_cause("of a later version") is None

@@ -19,7 +19,10 @@ from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.sweep import Sweep
+from hippodrome.servers.warm.pools import Pools
 from hippodrome.storage.errors import RetryLater
+from hippodrome.storage.project_cache import ProjectCache
+from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 from protocol import handover
 from protocol.handover import Handover
@@ -447,6 +450,15 @@ def test_the_sweep_fills_the_pool_when_every_message_was_lost() -> None:
     platform = installed(warm(2))
     sweep(platform)
     assert len(platform.tasks.running) == 2
+
+
+def test_the_sweep_knows_the_warm_servers_of_a_study_that_was_registered_a_moment_ago() -> None:
+    platform = installed(study(id="another"))
+    cache = ProjectCache(platform)
+    cache.projects()
+    platform.documents.put(MASTER_LIST, to_json(MasterList([warm(1)])))
+    Servers(platform).start(KEEP)
+    assert Pools(platform, cache).repair(Repository(platform.documents)) == {ids.warm_id("maze", platform.now(), 0)}
 
 
 def test_the_sweep_asks_again_for_a_warm_server_whose_start_was_lost() -> None:
