@@ -33,6 +33,7 @@ import moto.backends
 import moto.cloudformation.models
 import moto.core.base_backend
 import moto.core.botocore_stubber
+import moto.core.errors
 import moto.core.models
 import moto.core.responses
 import moto.core.serialize
@@ -98,6 +99,8 @@ def _keep_calls() -> None:
 def _keep_moto() -> None:
     """Keep what moto computes for every call and every world."""
     _keep(moto.core.responses, "method_names_from_class", lambda kind: kind)
+    errors = moto.core.errors.ErrorLookupFactory()  # it keeps the errors of each service, but moto makes one per error
+    setattr(moto.core.errors, "ErrorLookupFactory", lambda: errors)  # noqa: B010
     # S3 loads its module of URLs anew twice per call, since an environment variable may change them; here none does.
     backend = moto.core.base_backend.BaseBackend
     setattr(moto.s3.models.S3Backend, "_url_module", vars(backend)["_url_module"])  # noqa: B010 - a property for mypy

@@ -65,7 +65,10 @@ def test_each_mutant_is_one_small_change_of_what_runs() -> None:
     ]
 
 
-@pytest.mark.parametrize("line", ['Size = Literal["small", "large"]', 'self._emit(WriteLog(20, "small"))', 'failure("too small", error, size=2)'])
+@pytest.mark.parametrize(
+    "line",
+    ['Size = Literal["small", "large"]', 'self._emit(WriteLog(20, "small"))', 'failure("too small", error, size=2)'],
+)
 def test_types_and_log_calls_are_not_mutated(line: str) -> None:
     assert len(Mutants("core.py", line)) == 0
 

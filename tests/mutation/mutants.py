@@ -127,7 +127,9 @@ def _is_wording(node: ast.AST) -> bool:
     if not isinstance(node, ast.Expr):
         return isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom)
     call = node.value
-    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(("logger.", "log(", "failure(", "self._emit(WriteLog("))
+    logs = isinstance(call, ast.Call) and ast.unparse(call).startswith(
+        ("logger.", "log(", "failure(", "self._emit(WriteLog(")
+    )
     return logs or isinstance(call, ast.Constant)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.model import ids, messages
-from hippodrome.model.messages import StartServer, StopServer, to_message
+from hippodrome.model.messages import StartServer, StopServer, StopUser, to_message
 from protocol.keys import NAME
 
 json_values = st.recursive(
@@ -59,6 +59,12 @@ def test_hippos_messages_without_an_attempt_are_understood() -> None:
     assert messages.parse_stop_server(body) == StopServer("maze", "alice", None)
 
 
+def test_a_stop_without_a_project_stops_the_participants_servers_of_all_projects() -> None:
+    assert messages.parse_stop_server({"userId": "alice"}) == StopUser("alice")
+    assert messages.parse_stop_server({"projectId": None, "userId": "alice"}) == StopUser("alice")
+    assert messages.parse_stop_server({"userId": "../x"}) is None
+
+
 @pytest.mark.parametrize("user", ["../x", "", "a\0", 7, None])
 def test_messages_with_malformed_ids_are_not_parsed(user: object) -> None:
     assert messages.parse_start_server({"projectId": "maze", "userId": user}) is None
@@ -72,6 +78,7 @@ def test_messages_are_parsed_with_and_without_the_envelope_of_sns(project: str, 
     wrapped = json.dumps({"Type": "Notification", "Message": raw})
     assert messages.parse_start_server(messages.body_of({"body": raw})) == sent
     assert messages.parse_start_server(messages.body_of({"body": wrapped})) == sent
+    assert messages.parse_start_server(messages.body_of({"Sns": {"Message": raw}})) == sent
 
 
 def test_events_of_other_tasks_are_not_parsed() -> None:

@@ -115,6 +115,14 @@ def test_an_attempt_is_open_until_it_is_closed_and_owns_resources_of_its_name() 
     assert (closed.is_closed, closed.is_open(2), closed.owns(f"{LABEL}-2")) == (True, False, False)
 
 
+def test_only_a_participants_own_server_lacks_a_step_that_was_registered_after_it_started() -> None:
+    own, of_session = new_record(), new_record(ids.new_session_id(), players=2)
+    assert [own.lacks(step) for step in ("3", "4")] == [False, True]
+    assert [of_session.lacks(step) for step in ("3", "4")] == [False, False], "others play on it"
+    of_an_earlier_version = msgspec.structs.replace(own, game_steps=())
+    assert not of_an_earlier_version.lacks("4")
+
+
 def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
     assert new_record().dns_record is None
     named = server.naming(new_record(), "task", Address("192.0.2.1", 5000), LATER)

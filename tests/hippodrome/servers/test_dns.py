@@ -65,6 +65,21 @@ def test_a_server_is_ready_when_its_change_is_in_sync_and_other_changes_are_chec
     assert [message.servers for message in follow_ups(platform)] == [second.servers]
 
 
+def test_a_server_that_becomes_ready_in_the_process_that_named_it_is_read_once() -> None:
+    platform = FakePlatform()
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    servers = Servers(platform)
+    servers.start(StartServer("maze", "alice"))
+    (task,) = platform.tasks.running
+    platform.documents.calls.clear()
+    assert (
+        servers.tasks_changed([TaskChanged(task, "hippodrome", name("alice"), "RUNNING", "eni", None, "", None)]) == []
+    )
+    assert from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server).ready
+    assert platform.documents.calls == ["get", "put", "put"]
+
+
 def test_all_changes_are_checked_at_the_same_time(platform: FakePlatform) -> None:
     batches: list[int] = []
     together = platform.run_all
