@@ -89,7 +89,7 @@ def calls_of_a_participant() -> Iterator[Row]:
     limited = read_project(ROOT).registration() | limits
     for name, pause, registration, most in (
         ("in a running study", timedelta(), None, 30),
-        ("alone, at a minute a page: caches stale", MINUTE, None, 30),
+        ("alone, at a minute a page: caches stale", MINUTE, None, 39),
         ("in a running study with limits", timedelta(), limited, 36),
     ):
         with on_moto(registration) as study:

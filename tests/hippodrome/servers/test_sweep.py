@@ -189,7 +189,7 @@ def test_a_resource_that_cannot_be_removed_does_not_prevent_the_others(platform:
     leftovers(platform)
     platform.tasks.stop = None  # type: ignore[assignment,method-assign]
     swept = sweep.handler({}, None)
-    assert (swept["failed"], swept["names"], swept["timers"]) == (1, 1, 2)
+    assert (swept["failed"], swept["tasks"], swept["names"], swept["timers"]) == (1, 0, 1, 2)
 
 
 def test_a_server_may_take_five_minutes_to_end_after_its_deadline(platform: FakePlatform) -> None:
