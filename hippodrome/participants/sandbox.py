@@ -206,8 +206,7 @@ def environment() -> ImmutableSandboxedEnvironment:
 
         def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:  # noqa: N802 - Jinja's name
             self.generic_visit(node)
-            at = {"lineno": node.lineno, "environment": node.environment}
-            return nodes.Filter(nodes.List(node.nodes, **at), "join", [], [], None, None, **at)
+            return nodes.Filter(nodes.List(node.nodes), "join", [], [], None, None, lineno=node.lineno)
 
     class Environment(ImmutableSandboxedEnvironment):
         """The sandbox, which also refuses to multiply a small text into a huge one."""

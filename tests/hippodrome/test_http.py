@@ -86,6 +86,7 @@ def test_several_values_of_a_header_are_joined_as_in_payload_format_2() -> None:
         ({"resource": "/next", "path": "/next"}, "/next"),
         ({"resource": "/next", "path": "/hippo/next"}, "/next"),  # of a custom domain with a base path
         ({"resource": "/next", "path": "/hippo/next/"}, "/next"),
+        ({"resource": "/a/X", "path": "/hippo/a/X"}, "/a/X"),
         ({"resource": "/", "path": "/live"}, "/"),  # as HIPPO's API is set up
         ({"resource": "/", "path": "/"}, "/"),
         ({"resource": "/steps/{projectId}/{file}", "path": "/a/b/steps/maze/x.png"}, "/steps/maze/x.png"),

@@ -29,6 +29,7 @@ TRIALS = (
     "trial/core/test_flow_control",
     *SESSIONS,
 )
+SECTION = ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys", "protocol/test_keyboard")
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
         "hippodrome/servers/test_causes",
@@ -148,9 +149,9 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/config/test_config_keys",
         "hippodrome/config/test_registration",
     ),
-    "protocol/trial_check.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
-    "protocol/trial_rules.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
-    "protocol/key_maps.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
+    "protocol/trial_check.py": (*SECTION, "trial/test_settings"),
+    "protocol/trial_rules.py": SECTION,
+    "protocol/key_maps.py": ("protocol/test_keyboard", "hippodrome/config/test_trial_section"),
     "protocol/values.py": (
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",

@@ -335,6 +335,15 @@ def test_a_likely_typing_error_stays_a_mistake(folder: Path, slip: str) -> None:
     assert f"trial.{slip}: unknown key; did you mean " in expected
 
 
+def test_keys_after_a_typing_error_are_adapted_all_the_same() -> None:
+    trial = {"maxEpisods": 5, "rows": 6, "ui": {"undo": "yes", "lft": "yes", "height": 6}}
+    assert adapt({"trial": trial}).values["trial"] == {
+        "maxEpisods": 5,
+        "ui": {"undo": "yes", "lft": "yes"},
+        "options": {"rows": 6},
+    }
+
+
 def test_a_key_similar_to_one_that_is_given_is_an_option(folder: Path) -> None:
     found = read(folder, game(trial="maxEpisodes: 3\nmaxEpisode: 4\n"))
     assert (found.trial.max_episodes, found.trial.options) == (3, {"maxEpisode": 4})

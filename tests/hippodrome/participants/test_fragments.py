@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from html.parser import HTMLParser
 from typing import Any
@@ -249,8 +250,9 @@ def test_an_unknown_value_is_shown_as_nothing() -> None:
 
 
 def test_comparisons_and_texts_in_expressions_are_no_tags() -> None:
-    source = "{% if a <b and b> a %}<i>{{ '<form>'|length }}</i>{% endif %}"
+    source = "{% if a <b and b> a and '<form>' %}<i>{{ '<form>'|length }}{# <form> #}</i>{% endif %}"
     assert prepare(source).render({"a": 1, "b": 2}) == "<i>6</i>"
+    assert prepare(source).text == source
 
 
 def test_expressions_in_attributes() -> None:
@@ -268,6 +270,8 @@ def test_characters_of_private_use_stay_unchanged() -> None:
         ("<form\n>\n{{ 1 + }}", 3),
         ("a\n{% if x %}", 2),
         ("a\nb\n{{ 1 / 0 }}", 3),
+        ("a\nb\n{{ 'x' ~ 1 / 0 }}", 3),
+        ("{{ joiner()|tojson }}", 1),
         ("\n{{ x|nosuchfilter }}", 2),
         ("\n\n{{ 'x' * 10000000 * 1000 }}", 3),
         ("{{ name }", 1),
@@ -412,12 +416,17 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("65 ** 2", False),
         ("100 ** 0.5", False),
         ("[['x' * 20]] * 1000000", True),
+        ("[{'x': 'y' * 1000000}] * 20", True),
+        ("[{'y' * 1000000: 1}] * 20", True),
         ("'x' + 'y'", False),
+        ("('x' * 1000000) + ('y' * 1000000)", False),
         ("('x' * 1000000) + ('y' * 1000001)", True),
         ("('x' * 1000000).encode() + ('y' * 1000001).encode()", True),
         ("'%999d' % 1", False),
         ("'%1000000000d' % 1", True),
         ("'%.1000000000f' % 1", True),
+        ("'%9d'.encode() % 1", False),
+        ("'%1000000000d'.encode() % 1", True),
         ("'%*d' % (9, 1)", True),
         ("'%.*f' % (9, 1)", True),
         ("'%(x)999d' % {'x': 1}", False),
@@ -434,6 +443,7 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("'x'|center(width=10 ** 9)", True),
         ("['x']|map('center', 10 ** 9)|list", True),
         ("(['x'] * 2000)|map('center', 1000000)|join", True),
+        ("(['x'] * 11)|map('center', 1000000)|join", False),
         ("'x'.center(80)", False),
         ("'x'.center(10 ** 9)", True),
         ("'x'['ljust'](10 ** 9)", True),
@@ -462,8 +472,15 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("[1]|batch(10 ** 9, 'x')|list", True),
         ("1|round(10 ** 9, 'ceil')", True),
         ("''|default(10 ** 9)", False),
+        ("''|center(2 * 10 ** 7)", False),
+        ("''|center(2 * 10 ** 7 + 1)", True),
+        ("(['y' * 1000000] * 11)|join", False),
+        ("((['y' * 1000000] * 11)|join ~ (['y' * 1000000] * 11)|join)|length ~ ''", True),
         ("lipsum(2)", False),
         ("lipsum(10 ** 6)", True),
+        ("lipsum(10 ** 6, html=false)", True),
+        ("lipsum(1, true, 1, 20000)", False),
+        ("lipsum(1, true, 1, 20001)", True),
     ],
 )
 def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: bool) -> None:
@@ -473,6 +490,58 @@ def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: 
             page.render({})
     else:
         assert page.render({}) == "done"
+
+
+@pytest.mark.parametrize(
+    ("expression", "name"),
+    [
+        ("'x' * 2000001", "*"),
+        ("['x' * 1000000] * 21", "*"),
+        ("'%1000000000d' % 1", "%"),
+        ("9 ** 99", "**"),
+        ("'{:1000000000}'.format(1)", "format"),
+        ("'x'.center(10 ** 9)", "center"),
+        ("'x'|indent(10 ** 9)", "indent"),
+        ("lipsum(10 ** 6)", "lipsum"),
+    ],
+)
+def test_what_would_make_a_huge_text_is_named(expression: str, name: str) -> None:
+    with pytest.raises(FragmentError, match=re.escape(f"the result of {name} would be too large")):
+        prepare(f"{{{{ {expression} }}}}").render({})
+
+
+def test_a_filter_takes_no_more_of_a_long_sequence_than_it_may() -> None:
+    lines = iter(["x" * 1_000_000] * 40)
+    with pytest.raises(FragmentError, match="SecurityError"):
+        prepare("{{ lines|join }}").render({"lines": lines})
+    assert len(list(lines)) == 19
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "{{ 'a'|center(width=5) }}.",
+        "{{ ['a', '<b>']|join(d=', ') }}",
+        "{{ ['a', 'b']|map('upper')|join('-') }}",
+        "{{ '%(n)05d <'|format(n=7) }}",
+        "{{ '{:>5} {x}'.format(1, x='<') }}",
+        "{{ dict(a=1)['a'] }}",
+        "{{ [1, 2, 3]|batch(2, 'z')|list }}{{ [1, 2, 3]|slice(2)|list }}",
+        "{{ 'a b c'|wordwrap(1) }}{{ 'abcdefgh'|truncate(4, leeway=0) }}{{ 2.345|round(2) }}",
+        "{{ {'b': 1, 'a': [2]}|tojson(indent=1) }}",
+        "{{ 7 % 4 }} {{ 2 ** 3 }} {{ 2 + 3 }} {{ 'a' * 3 }} {{ '%s' % '<' }} {{ ['a'] + ['b'] }}",
+        "{% set text %}a{{ 1 }}{{ '<' }}{% endset %}{{ text }}\n",
+        "{% macro m(x) %}<i>{{ x }}</i>{% endmacro %}{{ m('<') ~ m(2) }}\n",
+    ],
+)
+def test_what_is_limited_does_otherwise_what_jinja_does(source: str) -> None:
+    jinja = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
+    assert prepare(source).render({}) == jinja.from_string(source).render()
+
+
+def test_a_part_of_a_page_may_have_more_characters_than_the_page() -> None:
+    source = "{% set text %}{% for a in range(11) %}{{ x }}{% endfor %}{% endset %}{{ text|length }}"
+    assert prepare(source).render({"x": "x" * 1_000_000}) == "11000000"
 
 
 @pytest.mark.parametrize(

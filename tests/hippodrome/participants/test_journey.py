@@ -80,6 +80,14 @@ def test_a_participant_goes_from_the_link_to_the_completion_code(platform: FakeP
     assert stored(platform, "answers/4.json")["answers"] == {"words": "It was\nfun ☃"}
 
 
+def test_a_participants_documents_have_a_line_for_each_field(platform: FakePlatform, alice: Browser) -> None:
+    alice.answer(alice.get(), consent="yes")
+    for name in ("participant.json", "answers/1.json"):
+        lines = platform.documents.kept[f"maze/users/alice/{name}"][0].decode().splitlines()
+        named = [re.match(r'( +)"(\w+)": ', line) for line in lines]
+        assert [found[2] for found in named if found and found[1] == " "] == list(stored(platform, name))
+
+
 def test_a_get_never_moves_a_participant_on(platform: FakePlatform, alice: Browser) -> None:
     first = alice.get()
     before = dict(platform.documents.kept)
