@@ -79,12 +79,12 @@ def _answers(parsed: Any) -> set[str]:
 def render(text: str, values: Mapping[str, Any]) -> str:
     """Return the page with these values. Raises FragmentError."""
     parts: list[str] = []
-    size = 0
+    length = 0
     try:
         for part in _compile(text).generate(values):
             parts.append(part)
-            size += len(part)
-            if size > LIMIT:
+            length += len(part)
+            if length > LIMIT:
                 raise FragmentError(
                     "the page is larger than 2 MB with its values filled in; look for a loop that repeats too much"
                 )

@@ -117,7 +117,13 @@ def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
 
 @pytest.mark.parametrize(
     ("source", "ends"),
-    [("<textarea>x", "</textarea>"), ("<script>x", "</script>"), ("<!-- x", "-->"), ("x <b", "&lt;b")],
+    [
+        ("<textarea>x", "</textarea>"),
+        ("<script>x", "</script>"),
+        ("<!-- x", "<!-- x-->"),
+        ("x <b", "x &lt;b"),
+        ("x </b", "x &lt;/b"),
+    ],
 )
 def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, ends: str) -> None:
     assert prepare(source).render({}).endswith(ends)
@@ -131,12 +137,15 @@ def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, e
     [
         ("<p>Hello</p>", False, False),
         ("<input>", False, False),
+        ("<input name>", False, False),
+        ("<input name='  '>", False, False),
         ("<input name=a>", True, False),
         ("<select name=a>", True, False),
         ("<textarea name=a></textarea>", True, False),
         ("<button>Go</button>", False, True),
         ('<button type="submit" name=a>Go</button>', True, True),
         ("<button type=button>No</button>", False, False),
+        ("<button type=' Reset '>No</button>", False, False),
         ("<INPUT TYPE=SUBMIT>", False, True),
         ("<input type='image' src=a.png>", False, True),
         ("<input type=reset>", False, False),
@@ -157,6 +166,7 @@ def test_fields_and_buttons_are_noted(source: str, fields: bool, submit: bool) -
     [
         ('<img src="cat.png">', '<img src="/steps/demo/cat.png">'),
         ("<img alt=x src=./cat.png>", "<img alt=x src=/steps/demo/cat.png>"),
+        ("<img src=X.png>", "<img src=/steps/demo/X.png>"),
         ("<img src='https://a.example/cat.png'>", "<img src='https://a.example/cat.png'>"),
         ('<img src="//a.example/cat.png">', '<img src="//a.example/cat.png">'),
         ('<img src="/x.png">', '<img src="/x.png">'),
@@ -200,11 +210,22 @@ def test_scripts_of_other_hosts_get_the_nonce_only_if_the_project_allows_the_hos
 
 @pytest.mark.parametrize(
     "address",
-    ["/\t/bad.example/a.js", "\n//bad.example/a.js", "https:///bad.example/a.js", "HTTPS:\\\\bad.example/a.js"],
+    [
+        "/\t/bad.example/a.js",
+        "\n//bad.example/a.js",
+        "\\\\bad.example/a.js",
+        "https:///bad.example/a.js",
+        "HTTPS:\\\\bad.example/a.js",
+    ],
 )
 def test_an_address_that_browsers_read_as_another_host_gets_no_nonce(address: str) -> None:
     (script,) = Tags(prepare(f'<script src="{address}"></script>', BASE).render({}, "N")).named("script")
     assert "nonce" not in script
+
+
+def test_a_script_whose_address_is_a_value_gets_no_nonce() -> None:
+    page = prepare('<script src="{{ x }}"></script>', BASE)
+    assert page.render({"x": "//bad.example/a.js"}, "N") == '<script src="//bad.example/a.js"></script>'
 
 
 def test_an_authors_nonce_has_no_effect() -> None:
@@ -253,6 +274,7 @@ def test_comparisons_and_texts_in_expressions_are_no_tags() -> None:
     source = "{% if a <b and b> a and '<form>' %}<i>{{ '<form>'|length }}{# <form> #}</i>{% endif %}"
     assert prepare(source).render({"a": 1, "b": 2}) == "<i>6</i>"
     assert prepare(source).text == source
+    assert prepare("{% if a <b%}c{% endif %}").render({"a": 1, "b": 2}) == "c"
 
 
 def test_expressions_in_attributes() -> None:
@@ -390,9 +412,13 @@ def test_the_language_of_the_page_is_one_that_a_page_can_have(lang: str, kept: s
     assert prepare(f'<html lang="en"><html lang="{lang}">').lang == "en"
 
 
-@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b"])
+@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b", "{# {% {{ '<form>' }}"])
 def test_an_expression_that_never_ends_is_text_and_so_are_tags_in_it(source: str) -> None:
     assert prepare(f"{source}<form>").text == source
+
+
+def test_a_zero_byte_is_shown_as_browsers_show_it() -> None:
+    assert prepare("a\0b").text == "a\ufffdb"
 
 
 def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:

@@ -45,6 +45,7 @@ AHEAD = (
     {"sec_purpose": "prefetch;anonymous-client-ip"},
     {"purpose": "prefetch"},
     {"purpose": "Preview"},
+    {"purpose": " prerender"},
     {"x_purpose": "preview"},
     {"x_moz": "prefetch"},
 )
@@ -85,6 +86,15 @@ def test_a_prefetch_of_a_browser_is_refused_and_not_cached(platform: FakePlatfor
     assert untouched(platform)
     Browser(platform, LINK).get()
     assert not untouched(platform)
+
+
+@pytest.mark.parametrize("headers", [{"user_agent": PROGRAMS[0]}, *AHEAD])
+def test_a_form_that_is_sent_is_no_preview(platform: FakePlatform, headers: dict[str, str]) -> None:
+    alice = Browser(platform, LINK)
+    alice.get()
+    form = f"hippodrome-step=1&hippodrome-ticket={ids.ticket('secret', 'alice', '1')}&consent=yes"
+    alice.send("POST", form, content_type="application/x-www-form-urlencoded", **headers)
+    assert "maze/users/alice/answers/1.json" in platform.documents.kept
 
 
 @pytest.mark.parametrize("query", [LINK, "projectId=maze", "projectId=maze&workerId=W1"])
