@@ -187,7 +187,10 @@ def test_gzip_is_accepted_if_the_header_says_so(header: str, accepted: bool) -> 
 @pytest.mark.parametrize(
     ("event", "decoded"),
     [
-        ({"httpMethod": "GET", "path": "/next"}, False),  # of a REST API, which decodes no response unless it is told to
+        (
+            {"httpMethod": "GET", "path": "/next"},
+            False,
+        ),  # of a REST API, which decodes no response unless it is told to
         ({"version": "1.0", "httpMethod": "GET", "path": "/next"}, True),
         ({"version": "2.0", "rawPath": "/next"}, True),
     ],

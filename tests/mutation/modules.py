@@ -64,6 +64,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     ),
     "hippodrome/participants/answers.py": (
         "hippodrome/participants/test_journey",
+        "protocol/test_both_ends",
         "hippodrome/participants/test_repeated_forms",
     ),
     "hippodrome/participants/journey.py": (
@@ -72,6 +73,8 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_repeated_forms",
         "hippodrome/participants/test_previews",
         "hippodrome/limits/test_limits",
+        "hippodrome/participants/test_lobby_pages",
+        "hippodrome/test_one_bad_entry",
     ),
     "hippodrome/limits/rules.py": (
         "hippodrome/limits/test_rules",
@@ -153,6 +156,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "protocol/trial_rules.py": SECTION,
     "protocol/key_maps.py": ("protocol/test_keyboard", "hippodrome/config/test_trial_section"),
     "protocol/values.py": (
+        "protocol/test_values",
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
         "hippodrome/config/test_step_files",
