@@ -29,7 +29,12 @@ TRIALS = (
     "trial/core/test_flow_control",
     *SESSIONS,
 )
-SECTION = ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys", "protocol/test_keyboard")
+SECTION = (
+    "protocol/test_trial",
+    "protocol/test_keyboard",
+    "hippodrome/config/test_config_keys",
+    "hippodrome/config/test_trial_section",
+)
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
         "hippodrome/servers/test_causes",
@@ -145,6 +150,8 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "protocol/session.py": ("protocol/test_session", "hippodrome/servers/test_sessions"),
     "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo", "hippodrome/config/test_hippo_pages"),
     "protocol/trial.py": (
+        "protocol/test_trial",
+        "protocol/test_keyboard",
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
         "hippodrome/config/test_step_files",
