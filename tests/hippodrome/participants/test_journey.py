@@ -505,6 +505,12 @@ def test_the_fields_of_a_recruiters_link_are_kept_up_to_a_length(platform: FakeP
     assert stored(platform, "participant.json")["link"] == {long: "1", "a": "v" * 256}
 
 
+def test_the_fields_of_a_link_that_are_not_the_recruiters_are_not_kept(platform: FakePlatform) -> None:
+    browser = Browser(platform, "projectId=maze&userId=alice&poll=3&signature=x&a=1")
+    browser.send("POST", "b=1", accept="application/json", content_type=FORM)
+    assert stored(platform, "participant.json")["link"] == {"a": "1"}
+
+
 @pytest.mark.parametrize(
     ("query", "title", "text"),
     [
