@@ -499,6 +499,21 @@ def test_a_program_without_an_id_is_told_so_and_gets_none(platform: FakePlatform
     assert json.loads(answer["body"])["message"]
 
 
+def test_a_form_without_an_id_is_refused(platform: FakePlatform) -> None:
+    answer = Browser(platform, "projectId=maze").post(consent="yes")
+    assert (answer["statusCode"], "Location" in answer["headers"]) == (400, False)
+
+
+def test_an_arrival_is_logged_once(platform: FakePlatform, alice: Browser, log: io.StringIO) -> None:
+    for _ in range(2):
+        alice.get()
+    assert log.getvalue().count('"arrived"') == 1
+
+
+def test_a_link_whose_project_no_study_can_have_costs_no_call(platform: FakePlatform, alice: Browser) -> None:
+    assert calls(platform, lambda: Browser(platform, "projectId=../maze&userId=alice").send()) == []
+
+
 def test_the_fields_of_a_recruiters_link_are_kept_up_to_a_length(platform: FakePlatform) -> None:
     long, longer = "k" * 64, "k" * 65
     Browser(platform, f"projectId=maze&userId=alice&{long}=1&{longer}=2&a={'v' * 257}").get()
