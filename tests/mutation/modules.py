@@ -150,6 +150,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "protocol/session.py": ("protocol/test_session", "hippodrome/servers/test_sessions"),
     "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo", "hippodrome/config/test_hippo_pages"),
     "protocol/trial.py": (
+        "hippodrome/config/test_registration",  # compares the schema
         "protocol/test_trial",
         "protocol/test_keyboard",
         "hippodrome/config/test_trial_section",
@@ -157,7 +158,6 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/config/test_step_files",
         "hippodrome/config/test_config_file",
         "hippodrome/config/test_config_keys",
-        "hippodrome/config/test_registration",
     ),
     "protocol/trial_check.py": (*SECTION, "trial/test_settings"),
     "protocol/trial_rules.py": SECTION,

@@ -120,6 +120,7 @@ def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
     [
         ("<textarea>x", "</textarea>"),
         ("<script>x", "</script>"),
+        ("<script>x</script y", "<script>x</script y</script>"),
         ("<!-- x", "<!-- x-->"),
         ("x <b", "x &lt;b"),
         ("x </b", "x &lt;/b"),
@@ -368,6 +369,7 @@ def test_the_content_of_a_raw_element_is_text_up_to_its_own_end_tag(name: str) -
 @pytest.mark.parametrize("name", ["html", "head", "body", "form", "meta", "base", "FORM"])
 def test_tags_of_a_whole_document_leave_their_line_ends(name: str) -> None:
     assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "a\nb\nc"
+    assert prepare("a<!DOCTYPE\nhtml>b<?xml\n?>c").render({}) == "a\nb\nc"
 
 
 @pytest.mark.parametrize(
