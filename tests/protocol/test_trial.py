@@ -137,6 +137,9 @@ def test_a_mistake_in_a_section_or_a_list_has_its_place() -> None:
         "scene.width: must be a whole number from 1 to 4096, not 0",
     ]
     assert accepted(actionSpace=["up", 3]).action_space == ("up", "3")
+    many = [f"a{number}" for number in range(1001)]
+    assert accepted(actionSpace=many[:1000]).action_space == tuple(many[:1000])
+    assert problems_of(actionSpace=many) == ["actionSpace: must have at most 1000 items, not 1001"]
     scene = accepted(scene={"height": 5}).scene
     assert scene is not None
     assert (scene.width, scene.height) == (600, 5)
