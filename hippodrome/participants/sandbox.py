@@ -126,8 +126,6 @@ def _size(value: object) -> int:
             if isinstance(one, list | tuple | set | frozenset):
                 rest.append(iter(one))
                 break
-            if size > MAX_MADE:
-                break
         else:
             rest.pop()
     return size
