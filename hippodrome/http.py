@@ -156,7 +156,8 @@ def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | Non
     }
     query = tuple((str(key), str(value)) for key, values in several.items() for value in values or ())
     try:
-        "".join(map("".join, query)).encode()
+        for key, value in query:
+            f"{key}{value}".encode()
     except ValueError:
         return None
     return query if len(query) <= MAX_QUERY_FIELDS else None

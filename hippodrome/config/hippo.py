@@ -344,7 +344,7 @@ def _frame_rates(adapted: Adapted) -> None:
 
 def _unknown(adapted: Adapted) -> None:
     """Removes unknown keys, or gives them to the agent. Typing errors and misplaced keys stay, for the check."""
-    for section, known in sorted(NAMES.items(), key=lambda one: one[0] != ("trial",)):
+    for section, known in NAMES.items():
         for key in [key for key in adapted.section(section) if key not in known]:
             path = (*section, key)
             if path == ("trial", RATE_CHANGE_MISSPELT) or _is_mistake(adapted, path):

@@ -81,8 +81,8 @@ def _urlencoded(body: bytes) -> dict[str, Any]:
 
 def _json(body: bytes) -> dict[str, Any]:
     try:
-        data = json.loads(body.decode("utf-8"), object_pairs_hook=_gather, parse_constant=_no_constant)
-        # Lone surrogates cannot be stored, and 1e999 would be stored as nothing.
+        data = json.loads(body.decode("utf-8"), object_pairs_hook=_gather)
+        # Lone surrogates cannot be stored; NaN, which is no JSON, and 1e999 would be stored as nothing.
         json.dumps(data, ensure_ascii=False, allow_nan=False).encode("utf-8")
     except (ValueError, RecursionError):
         raise BadForm(400, "What was sent is not JSON in UTF-8.") from None
@@ -112,10 +112,6 @@ def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     for name, value in pairs:
         values_of.setdefault(name, []).append(value)
     return {name: values[0] if len(values) == 1 else values for name, values in values_of.items()}
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is not JSON")
 
 
 def _text(value: Any) -> str | None:

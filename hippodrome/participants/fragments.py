@@ -61,11 +61,11 @@ class Fragment:
     """A prepared step page, and the facts about it that the frame needs."""
 
     text: str
-    has_fields: bool = False  # whether it has inputs with names, whose values are sent
-    has_submit: bool = False  # whether it has a submit button of its own
-    has_heading: bool = False  # whether it has an <h1>
-    title: str = ""
-    lang: str = ""
+    has_fields: bool  # whether it has inputs with names, whose values are sent
+    has_submit: bool  # whether it has a submit button of its own
+    has_heading: bool  # whether it has an <h1>
+    title: str
+    lang: str
 
     def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
         """Return the page with these values, and with the nonce of the response in its scripts.
@@ -130,8 +130,7 @@ class _Preparation:
         while found := _JINJA_START.search(source, at):
             at = found.end()
             if closer := _JINJA_END.get(found[0]):
-                end = -1 if closer in unclosed else source.find(closer, at)
-                if end < 0:
+                if closer in unclosed or (end := source.find(closer, at)) == -1:
                     unclosed.add(closer)
                     continue
                 at = end + 2
@@ -185,8 +184,7 @@ class _Preparation:
         Only the first end tag counts: if no ">" follows it, none follows a later one either.
         """
         end = re.compile(rf"</{name}(?=[\s/>])", re.IGNORECASE).search(self._source, at)
-        close = self._source.find(">", end.end()) if end else -1
-        if end is None or close < 0:
+        if end is None or (close := self._source.find(">", end.end())) == -1:
             return self._source[at:], ""
         return self._source[at : end.start()], self._source[end.start() : close + 1]
 

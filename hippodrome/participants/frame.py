@@ -218,7 +218,7 @@ def style(kind: str | None = None) -> str:
 
     For None, return all of it.
     """
-    text = (WEB / "style.css").read_text(encoding="utf-8")
+    text = _read("style.css")
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
     return _plain("style.css", text)
@@ -235,7 +235,7 @@ def _of_direction(lang: str) -> str:
 
 @cache
 def _sheet(name: str) -> str:
-    return _plain(name, (WEB / name).read_text(encoding="utf-8"))
+    return _plain(name, _read(name))
 
 
 @lru_cache(maxsize=16)
@@ -252,8 +252,13 @@ def _code(name: str, also: tuple[str, ...] = (), texts: Texts = IN_ENGLISH) -> s
 
 @lru_cache(maxsize=256)
 def _template(name: str, texts: Texts) -> Template:
-    template = _PARTS[name] if name in _PARTS else (WEB / name).read_text(encoding="utf-8")
+    template = _PARTS[name] if name in _PARTS else _read(name)
     return Template(in_template(template, texts))
+
+
+def _read(name: str) -> str:
+    """The text of a file of `web/`."""
+    return (WEB / name).read_text(encoding="utf-8")
 
 
 _CODE_OR_TEXT = re.compile(

@@ -102,13 +102,16 @@ class Journey:
             text = f"A study link looks like {LINK} - please use the whole link that you were given."
             status = 404 if request.query else 200
             raise PageError(status, "This is where studies run", text, PROJECT_NOT_FOUND)
+        text = "The link may be misspelled, or the study may be over."
+        not_found = PageError(404, "There is no such study", text, PROJECT_NOT_FOUND)
         project_id = request.query_value("projectId")
-        project = self._project_cache.live_project(project_id) if project_id and ids.is_project_id(project_id) else None
-        if project is None and project_id and self._project_cache.is_unreadable(project_id):
+        if project_id is None or not ids.is_project_id(project_id):
+            raise not_found
+        project = self._project_cache.live_project(project_id)
+        if project is None and self._project_cache.is_unreadable(project_id):
             raise PageError(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
         if project is None:
-            text = "The link may be misspelled, or the study may be over."
-            raise PageError(404, "There is no such study", text, PROJECT_NOT_FOUND)
+            raise not_found
         return project
 
     # Reading

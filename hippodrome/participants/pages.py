@@ -111,7 +111,7 @@ def game_page(view: GameView) -> Page:
     """Return the page of a game step: waiting and playing. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
-    state = str(view.state.get("state", "queued"))
+    state = str(view.state["state"])
     over = is_over(view.state)
     data: dict[str, Any] = {
         "state": dict(view.state),

@@ -79,12 +79,12 @@ def _answers(parsed: Any) -> set[str]:
 def render(text: str, values: Mapping[str, Any]) -> str:
     """Return the page with these values. Raises FragmentError."""
     parts: list[str] = []
-    size = 0
+    length = 0
     try:
         for part in _compile(text).generate(values):
             parts.append(part)
-            size += len(part)
-            if size > LIMIT:
+            length += len(part)
+            if length > LIMIT:
                 raise FragmentError(
                     "the page is larger than 2 MB with its values filled in; look for a loop that repeats too much"
                 )
@@ -125,8 +125,6 @@ def _size(value: object) -> int:
                 break
             if isinstance(one, list | tuple | set | frozenset):
                 rest.append(iter(one))
-                break
-            if size > MAX_MADE:
                 break
         else:
             rest.pop()
@@ -206,8 +204,7 @@ def environment() -> ImmutableSandboxedEnvironment:
 
         def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:  # noqa: N802 - Jinja's name
             self.generic_visit(node)
-            at = {"lineno": node.lineno, "environment": node.environment}
-            return nodes.Filter(nodes.List(node.nodes, **at), "join", [], [], None, None, **at)
+            return nodes.Filter(nodes.List(node.nodes), "join", [], [], None, None, lineno=node.lineno)
 
     class Environment(ImmutableSandboxedEnvironment):
         """The sandbox, which also refuses to multiply a small text into a huge one."""

@@ -29,6 +29,12 @@ TRIALS = (
     "trial/core/test_flow_control",
     *SESSIONS,
 )
+SECTION = (
+    "protocol/test_trial",
+    "protocol/test_keyboard",
+    "hippodrome/config/test_config_keys",
+    "hippodrome/config/test_trial_section",
+)
 TESTED_BY: dict[str, tuple[str, ...]] = {
     "hippodrome/servers/causes.py": (
         "hippodrome/servers/test_causes",
@@ -63,6 +69,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     ),
     "hippodrome/participants/answers.py": (
         "hippodrome/participants/test_journey",
+        "protocol/test_both_ends",
         "hippodrome/participants/test_repeated_forms",
     ),
     "hippodrome/participants/journey.py": (
@@ -71,6 +78,8 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "hippodrome/participants/test_repeated_forms",
         "hippodrome/participants/test_previews",
         "hippodrome/limits/test_limits",
+        "hippodrome/participants/test_lobby_pages",
+        "hippodrome/test_one_bad_entry",
     ),
     "hippodrome/limits/rules.py": (
         "hippodrome/limits/test_rules",
@@ -146,17 +155,20 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
     "protocol/session.py": ("protocol/test_session", "hippodrome/servers/test_sessions"),
     "hippodrome/config/hippo.py": ("hippodrome/config/test_hippo", "hippodrome/config/test_hippo_pages"),
     "protocol/trial.py": (
+        "hippodrome/config/test_registration",  # compares the schema
+        "protocol/test_trial",
+        "protocol/test_keyboard",
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
         "hippodrome/config/test_step_files",
         "hippodrome/config/test_config_file",
         "hippodrome/config/test_config_keys",
-        "hippodrome/config/test_registration",
     ),
-    "protocol/trial_check.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
-    "protocol/trial_rules.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
-    "protocol/key_maps.py": ("hippodrome/config/test_trial_section", "hippodrome/config/test_config_keys"),
+    "protocol/trial_check.py": (*SECTION, "trial/test_settings"),
+    "protocol/trial_rules.py": SECTION,
+    "protocol/key_maps.py": ("protocol/test_keyboard", "hippodrome/config/test_trial_section"),
     "protocol/values.py": (
+        "protocol/test_values",
         "hippodrome/config/test_trial_section",
         "hippodrome/config/test_project_folder",
         "hippodrome/config/test_step_files",

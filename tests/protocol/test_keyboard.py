@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import keyboard, trial, trial_check
+from protocol import key_maps, keyboard, trial, trial_check
 
 
 def accepted(**section: Any) -> trial.TrialSection:
@@ -127,9 +127,32 @@ def test_keys_must_be_a_map_to_names_of_actions() -> None:
     assert problems_of(keys={"a": "left", "player_1": {"a": "left"}})[-1] == (
         "keys.player_1: must be the name of an action, not a map"
     )
-    assert problems_of(keys={chr(200 + number): "left" for number in range(101)})[-1] == (
-        "keys: must have at most 100 lines, not 101"
+    many = {chr(0x4E00 + number): "left" for number in range(101)}
+    assert problems_of(keys=many) == ["keys: must have at most 100 lines, not 101"]
+    assert problems_of(keys=dict(list(many.items())[1:])) == []
+
+
+def test_of_keys_and_labels_the_valid_ones_are_kept_and_the_others_reported() -> None:
+    checked, problems = trial_check.check(
+        {
+            "keys": {"red": {"Foo": "left", "a": [], "b": "left"}, "blue": {"Tab": "left"}},
+            "labels": {"left": [], "": "Go", "right": "Go right"},
+            "playerNames": {"red": {}, "blue": "The blue one"},
+        }
     )
+    assert [problem.path for problem in problems] == [
+        ("keys", "red", "Foo"),
+        ("keys", "red", "a"),
+        ("keys", "blue", "Tab"),
+        ("labels", "left"),
+        ("labels", ""),
+        ("playerNames", "red"),
+    ]
+    assert (checked.keys, checked.labels, checked.player_names) == ({}, {}, {})
+    found = [key_maps.actions_of_keys({"Foo": "left", "a": [], "b": "left"}, ())[0]]
+    found += [key_maps.labels({"left": [], "": "Go", "right": "Go right"}, ())[0]]
+    found += [key_maps.player_names({"red": {}, "blue": "The blue one"}, ())[0]]
+    assert found == [{"b": "left"}, {"right": "Go right"}, {"blue": "The blue one"}]
 
 
 def test_a_page_of_the_game_is_a_file_in_the_steps_folder() -> None:

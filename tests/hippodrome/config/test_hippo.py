@@ -335,6 +335,15 @@ def test_a_likely_typing_error_stays_a_mistake(folder: Path, slip: str) -> None:
     assert f"trial.{slip}: unknown key; did you mean " in expected
 
 
+def test_keys_after_a_typing_error_are_adapted_all_the_same() -> None:
+    trial = {"maxEpisods": 5, "rows": 6, "ui": {"undo": "yes", "lft": "yes", "height": 6}}
+    assert adapt({"trial": trial}).values["trial"] == {
+        "maxEpisods": 5,
+        "ui": {"undo": "yes", "lft": "yes"},
+        "options": {"rows": 6},
+    }
+
+
 def test_a_key_similar_to_one_that_is_given_is_an_option(folder: Path) -> None:
     found = read(folder, game(trial="maxEpisodes: 3\nmaxEpisode: 4\n"))
     assert (found.trial.max_episodes, found.trial.options) == (3, {"maxEpisode": 4})
@@ -378,6 +387,200 @@ def test_strict_makes_remarks_mistakes(folder: Path, capsys: pytest.CaptureFixtu
     assert "config.yml:9: remark: trial.rows:" in capsys.readouterr().out
     read(folder, SMALL)
     assert main(["check", "--strict", str(folder)]) == 0
+
+
+# Values, without a file
+
+
+STUDY = {"1": "consent", "2": "game", "3": "thanks"}
+
+
+def steps_of(steps: Any, **project: Any) -> Any:
+    return adapt({"project": {"steps": steps, **project}}).values["project"]["steps"]
+
+
+def project_of(**project: Any) -> Any:
+    return adapt({"project": project}).values["project"]
+
+
+def trial_of(**trial: Any) -> Any:
+    return adapt({"trial": trial}).values["trial"]
+
+
+def paths(document: dict[str, Any]) -> list[str]:
+    """Return the paths of the remarks on a document."""
+    return [".".join(map(str, remark.path)) for remark in adapt(document).remarks]
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (Plain(1.5, "1.5"), "1-5"),
+        (Plain(12, "12"), Plain(12, "12")),
+        (Plain(True, "yes"), Plain(True, "yes")),
+        ("X study", "X-study"),
+        ("", ""),
+        (None, None),
+        (["a"], ["a"]),
+        ("…", "…"),
+    ],
+)
+def test_an_id_is_replaced_only_if_it_is_a_text_of_which_an_id_can_be_made(given: Any, found: Any) -> None:
+    assert project_of(id=given) == {"id": found}
+    if given:
+        assert project_of(id=given, useAWS=True) == {"id": found, "useAWS": True}
+
+
+def test_the_folders_name_takes_the_place_of_an_empty_id_but_not_on_aws() -> None:
+    assert adapt({"project": {"id": ""}}, "my study").values == {"project": {"id": "my-study"}}
+    assert adapt({"project": {}}, "my study").values == {"project": {}}
+    on_aws = {"project": {"id": "", "useAWS": "yes"}}
+    assert adapt(on_aws, "my study").values == on_aws
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        STUDY,
+        {},
+        {"0": "spare", "1": ["consent"]},  # a mistake that the check reports
+        {"1": "https://example.org/a.html", "2": "pages/", "3": "thanks"},
+        {"1": "consent", "2": "thanks", "1000": "survey"},
+        {"1": "consent", "2": "thanks", "Final_Step": "survey"},
+        {"1": "consent", "3": None, "spare": "survey"},  # a number is missing
+        {"1": "consent", "3": None, "finalStep": "thanks"},
+    ],
+)
+def test_steps_that_are_right_or_that_the_check_reports_stay(steps: dict[str, Any]) -> None:
+    assert steps_of(steps) == steps
+    assert list(steps_of(steps)) == list(steps)
+    assert paths({"project": {"steps": steps}}) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "found", "remarked"),
+    [
+        ({"1": None, "2": "pages/a"}, {"1": "a"}, ["2", "1", "2"]),
+        ({"1": "a", "2": "", "1000": "c"}, {"1": "a"}, ["2"]),
+        ({"1": "a", "2": "b", "spare": "c", "1000": "d"}, {"1": "a", "2": "b", "1000": "d"}, ["spare"]),
+        ({"spare": "x", "finalStep": "b"}, {"1": "b"}, ["spare", "finalStep"]),
+        ({"0": "x", "00": "y", "1": "a", "2": "b"}, {"1": "a", "2": "b"}, ["0", "00"]),
+    ],
+)
+def test_steps_that_are_not_shown_are_left_out_with_remarks(
+    given: dict[str, Any], found: dict[str, Any], remarked: list[str]
+) -> None:
+    assert steps_of(given) == found
+    assert paths({"project": {"steps": given}}) == [f"project.steps.{key}" for key in remarked]
+
+
+def test_more_than_nine_steps_are_numbered_in_their_order() -> None:
+    given = {str(number): f"page{number}" for number in range(1, 12)}
+    assert list(steps_of({**given, "2": None}).items()) == [
+        (str(at), f"page{number}") for at, number in enumerate([1, *range(3, 12)], 1)
+    ]
+
+
+def test_a_step_that_is_moved_is_found_in_the_file_under_its_own_key() -> None:
+    found = adapt({"project": {"step": {"1": "a", "2": None, "3": "b"}}})
+    assert found.values == {"project": {"steps": {"1": "a", "2": "b"}}}
+    assert [found.origin(("project", "steps", key)) for key in ("1", "2")] == [
+        ("project", "step", "1"),
+        ("project", "step", "3"),
+    ]
+    only = adapt({"project": {"steps": {"finalStep": "b"}}})
+    assert only.origin(("project", "steps", "1")) == ("project", "steps", "finalStep")
+    assert only.origin(("project", "name")) == ("project", "name")
+
+
+def test_another_spelling_of_a_key_that_is_given_too_stays_a_mistake() -> None:
+    both = {"project": {"step": {"1": "a"}, "steps": STUDY}}
+    assert adapt(both).values == both
+    assert paths(both) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ({"startServerStep": 1, "stopServerStep": 3}, {"startServerStep": 1, "stopServerStep": "2"}),
+        ({"startServerStep": 2, "stopServerStep": 4}, {"startServerStep": "2", "stopServerStep": "finalStep"}),
+        ({"startServerStep": 9, "stopServerStep": None}, {"startServerStep": 9, "stopServerStep": None}),
+    ],
+)
+def test_events_follow_their_steps(given: dict[str, Any], found: dict[str, Any]) -> None:
+    steps = {"1": "consent", "2": None, "3": "thanks", "4": "", "finalStep": "bye"}
+    assert project_of(steps=steps, events=given)["events"] == found
+
+
+@pytest.mark.parametrize(
+    ("stop", "found"),
+    [(3, 3), (4, 4), (5, "finalStep"), ("500", "finalStep"), (501, 501), ("x", "x"), (-1, -1)],
+)
+def test_a_stop_step_beyond_the_end_counts_as_the_last_step_as_far_as_steps_can_be_numbered(
+    stop: Any, found: Any
+) -> None:
+    for steps in (STUDY, {**STUDY, "1000": "survey"}):
+        assert project_of(steps=steps, events={"stopServerStep": stop})["events"] == {"stopServerStep": found}
+    assert project_of(events={"stopServerStep": stop})["events"] == {"stopServerStep": stop}
+
+
+@pytest.mark.parametrize(
+    ("ssl", "found"),
+    [
+        ({"sslBucket": "a", "fullchain": "b", "privkey": "c"}, True),
+        ({"sslBucket": "a", "fullchain": "b"}, False),
+        ({"sslBucket": "a", "fullchain": "b", "privkey": ""}, False),
+        ({"sslBucket": "a", "privkey": "c"}, False),
+        ({"fullchain": "b", "privkey": "c"}, False),
+        ("hello", True),
+    ],
+)
+def test_only_a_complete_certificate_stays(ssl: Any, found: bool) -> None:
+    assert ("ssl" in project_of(ssl=ssl)) is found
+
+
+@pytest.mark.parametrize(
+    "trial",
+    [
+        {"game": ""},  # no step plays it
+        {"ui": [["left"]]},
+        {"actionSpace": "noop"},
+        {"actionSpace": [None, "left", "left"]},
+        {"actionSpace": ["", ""]},
+        {"minFrameRate": "x", "maxFrameRate": 20},
+        {"maxFrameRate": "x", "minFrameRate": 40},
+        {"startingFrameRate": "x", "minFrameRate": 100},
+        {"startingFrameRate": 241},
+        {"startingFrameRate": 0},
+        {"minFrameRate": 30},
+        {"maxFrameRate": 30},
+        {"maxFrameRate": 20, "allowFrameRateChange": "yes"},
+        {"maxFrameRate": 20, "allowFramRateChange": "yes"},
+        {"allowFrameRateChange": False, "allowFramRateChange": False},
+        {"options": 3},
+    ],
+)
+def test_values_of_the_trial_that_are_right_or_that_the_check_reports_stay(trial: dict[str, Any]) -> None:
+    assert trial_of(**trial) == trial
+    assert paths({"trial": trial}) == []
+
+
+def test_bounds_that_are_not_given_follow_the_rate_without_a_remark() -> None:
+    assert trial_of(startingFrameRate=100) == {"startingFrameRate": 100, "minFrameRate": 1, "maxFrameRate": 100}
+    assert paths({"trial": {"startingFrameRate": 100}}) == []
+    assert trial_of(startingFrameRate=100, maxFrameRate=20)["maxFrameRate"] == 100
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"project": {"maxEpisodes": 3}, "trial": {"maxEpisodes": 2}},
+        {"trial": {"maxEpisodes": 2}, "trail": {"maxEpisodes": 3}},
+        {"trial": {"maxepisodes": 2}},
+    ],
+)
+def test_a_key_in_the_wrong_place_and_a_misspelt_section_stay_mistakes(document: dict[str, Any]) -> None:
+    assert adapt(document).values == document
 
 
 _NAMES = """project trial id steps step events ui options game actionSpace ssl awsSetup useAWS live 0 1 2 9 finalStep rows

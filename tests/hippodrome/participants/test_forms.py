@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.http import Request
+from hippodrome.model.texts import ENGLISH, IN_ENGLISH, Texts
 from hippodrome.participants import forms
 from hippodrome.participants.forms import BadForm
 
@@ -65,6 +66,24 @@ def test_a_form_that_cannot_be_accepted_is_refused_with_its_status(body: bytes, 
 def test_fields_that_the_frame_adds_are_no_answers() -> None:
     form = forms.read(posted(f"age=3&hippodrome-step=2&hippodrome-ticket={quote_plus('t&=')}".encode()))
     assert (form.answers, form.step, form.ticket) == ({"age": "3"}, "2", "t&=")
+
+
+def test_a_form_in_an_address_is_read_like_one_in_a_body() -> None:
+    form = forms.read_query([("a", "1"), ("a", "2"), ("b", ""), ("hippodrome-step", "11"), ("hippodrome-ticket", "t")])
+    assert form == forms.PostedForm({"a": ["1", "2"], "b": ""}, "11", "t", None)
+
+
+def test_a_refusal_has_a_reason_in_the_studys_own_words_or_in_english() -> None:
+    texts = Texts({"formTooLong": "Zu lang.", "formUnread": "Unlesbar."})
+    for refusal, english, own in (
+        (BadForm(413, name="formTooLong"), ENGLISH["formTooLong"], "Zu lang."),
+        (BadForm(415, "No form."), "No form.", "No form."),
+    ):
+        assert (refusal.text, refusal.reason(IN_ENGLISH), refusal.reason(texts)) == (english, english, own)
+    for body, own in ((None, "Unlesbar."), (b"a" * 300_000, "Zu lang.")):
+        with pytest.raises(BadForm) as bad:
+            forms.read(Request("POST", "/next", (), {"content-type": forms.FORM}, body))
+        assert bad.value.reason(texts) == own
 
 
 def test_a_name_that_comes_twice_in_json_keeps_both_values() -> None:

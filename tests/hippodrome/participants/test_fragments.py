@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from html.parser import HTMLParser
 from typing import Any
@@ -116,7 +117,14 @@ def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
 
 @pytest.mark.parametrize(
     ("source", "ends"),
-    [("<textarea>x", "</textarea>"), ("<script>x", "</script>"), ("<!-- x", "-->"), ("x <b", "&lt;b")],
+    [
+        ("<textarea>x", "</textarea>"),
+        ("<script>x", "</script>"),
+        ("<script>x</script y", "<script>x</script y</script>"),
+        ("<!-- x", "<!-- x-->"),
+        ("x <b", "x &lt;b"),
+        ("x </b", "x &lt;/b"),
+    ],
 )
 def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, ends: str) -> None:
     assert prepare(source).render({}).endswith(ends)
@@ -130,12 +138,15 @@ def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, e
     [
         ("<p>Hello</p>", False, False),
         ("<input>", False, False),
+        ("<input name>", False, False),
+        ("<input name='  '>", False, False),
         ("<input name=a>", True, False),
         ("<select name=a>", True, False),
         ("<textarea name=a></textarea>", True, False),
         ("<button>Go</button>", False, True),
         ('<button type="submit" name=a>Go</button>', True, True),
         ("<button type=button>No</button>", False, False),
+        ("<button type=' Reset '>No</button>", False, False),
         ("<INPUT TYPE=SUBMIT>", False, True),
         ("<input type='image' src=a.png>", False, True),
         ("<input type=reset>", False, False),
@@ -156,6 +167,7 @@ def test_fields_and_buttons_are_noted(source: str, fields: bool, submit: bool) -
     [
         ('<img src="cat.png">', '<img src="/steps/demo/cat.png">'),
         ("<img alt=x src=./cat.png>", "<img alt=x src=/steps/demo/cat.png>"),
+        ("<img src=X.png>", "<img src=/steps/demo/X.png>"),
         ("<img src='https://a.example/cat.png'>", "<img src='https://a.example/cat.png'>"),
         ('<img src="//a.example/cat.png">', '<img src="//a.example/cat.png">'),
         ('<img src="/x.png">', '<img src="/x.png">'),
@@ -199,11 +211,22 @@ def test_scripts_of_other_hosts_get_the_nonce_only_if_the_project_allows_the_hos
 
 @pytest.mark.parametrize(
     "address",
-    ["/\t/bad.example/a.js", "\n//bad.example/a.js", "https:///bad.example/a.js", "HTTPS:\\\\bad.example/a.js"],
+    [
+        "/\t/bad.example/a.js",
+        "\n//bad.example/a.js",
+        "\\\\bad.example/a.js",
+        "https:///bad.example/a.js",
+        "HTTPS:\\\\bad.example/a.js",
+    ],
 )
 def test_an_address_that_browsers_read_as_another_host_gets_no_nonce(address: str) -> None:
     (script,) = Tags(prepare(f'<script src="{address}"></script>', BASE).render({}, "N")).named("script")
     assert "nonce" not in script
+
+
+def test_a_script_whose_address_is_a_value_gets_no_nonce() -> None:
+    page = prepare('<script src="{{ x }}"></script>', BASE)
+    assert page.render({"x": "//bad.example/a.js"}, "N") == '<script src="//bad.example/a.js"></script>'
 
 
 def test_an_authors_nonce_has_no_effect() -> None:
@@ -249,8 +272,10 @@ def test_an_unknown_value_is_shown_as_nothing() -> None:
 
 
 def test_comparisons_and_texts_in_expressions_are_no_tags() -> None:
-    source = "{% if a <b and b> a %}<i>{{ '<form>'|length }}</i>{% endif %}"
+    source = "{% if a <b and b> a and '<form>' %}<i>{{ '<form>'|length }}{# <form> #}</i>{% endif %}"
     assert prepare(source).render({"a": 1, "b": 2}) == "<i>6</i>"
+    assert prepare(source).text == source
+    assert prepare("{% if a <b%}c{% endif %}").render({"a": 1, "b": 2}) == "c"
 
 
 def test_expressions_in_attributes() -> None:
@@ -268,6 +293,8 @@ def test_characters_of_private_use_stay_unchanged() -> None:
         ("<form\n>\n{{ 1 + }}", 3),
         ("a\n{% if x %}", 2),
         ("a\nb\n{{ 1 / 0 }}", 3),
+        ("a\nb\n{{ 'x' ~ 1 / 0 }}", 3),
+        ("{{ joiner()|tojson }}", 1),
         ("\n{{ x|nosuchfilter }}", 2),
         ("\n\n{{ 'x' * 10000000 * 1000 }}", 3),
         ("{{ name }", 1),
@@ -282,7 +309,7 @@ def test_a_page_that_fails_names_the_line(source: str, line: int) -> None:
     with pytest.raises(FragmentError) as caught:
         prepare(source).render({"answers": {"1": {}}})
     assert caught.value.line == line
-    assert caught.value.message
+    assert caught.value.message == str(caught.value)
 
 
 def test_a_page_cannot_grow_without_limit() -> None:
@@ -342,6 +369,7 @@ def test_the_content_of_a_raw_element_is_text_up_to_its_own_end_tag(name: str) -
 @pytest.mark.parametrize("name", ["html", "head", "body", "form", "meta", "base", "FORM"])
 def test_tags_of_a_whole_document_leave_their_line_ends(name: str) -> None:
     assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "a\nb\nc"
+    assert prepare("a<!DOCTYPE\nhtml>b<?xml\n?>c").render({}) == "a\nb\nc"
 
 
 @pytest.mark.parametrize(
@@ -386,13 +414,18 @@ def test_the_language_of_the_page_is_one_that_a_page_can_have(lang: str, kept: s
     assert prepare(f'<html lang="en"><html lang="{lang}">').lang == "en"
 
 
-@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b"])
+@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b", "{# {% {{ '<form>' }}"])
 def test_an_expression_that_never_ends_is_text_and_so_are_tags_in_it(source: str) -> None:
     assert prepare(f"{source}<form>").text == source
 
 
+def test_a_zero_byte_is_shown_as_browsers_show_it() -> None:
+    assert prepare("a\0b").text == "a\ufffdb"
+
+
 def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
     assert prepare("a{# <form> {{ x }} #}b").render({"x": 1}) == "ab"
+    assert prepare("a{# <form> #}b").render({}) == "ab"
     assert prepare("a{% if 1 < 2 %}<form>b{% endif %}").render({}) == "ab"
     css = "<style>@media print{#menu{color:red}}</style>"
     assert prepare(css).render({}) == css
@@ -412,12 +445,17 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("65 ** 2", False),
         ("100 ** 0.5", False),
         ("[['x' * 20]] * 1000000", True),
+        ("[{'x': 'y' * 1000000}] * 20", True),
+        ("[{'y' * 1000000: 1}] * 20", True),
         ("'x' + 'y'", False),
+        ("('x' * 1000000) + ('y' * 1000000)", False),
         ("('x' * 1000000) + ('y' * 1000001)", True),
         ("('x' * 1000000).encode() + ('y' * 1000001).encode()", True),
         ("'%999d' % 1", False),
         ("'%1000000000d' % 1", True),
         ("'%.1000000000f' % 1", True),
+        ("'%9d'.encode() % 1", False),
+        ("'%1000000000d'.encode() % 1", True),
         ("'%*d' % (9, 1)", True),
         ("'%.*f' % (9, 1)", True),
         ("'%(x)999d' % {'x': 1}", False),
@@ -434,6 +472,7 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("'x'|center(width=10 ** 9)", True),
         ("['x']|map('center', 10 ** 9)|list", True),
         ("(['x'] * 2000)|map('center', 1000000)|join", True),
+        ("(['x'] * 11)|map('center', 1000000)|join", False),
         ("'x'.center(80)", False),
         ("'x'.center(10 ** 9)", True),
         ("'x'['ljust'](10 ** 9)", True),
@@ -462,8 +501,15 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
         ("[1]|batch(10 ** 9, 'x')|list", True),
         ("1|round(10 ** 9, 'ceil')", True),
         ("''|default(10 ** 9)", False),
+        ("''|center(2 * 10 ** 7)", False),
+        ("''|center(2 * 10 ** 7 + 1)", True),
+        ("(['y' * 1000000] * 11)|join", False),
+        ("((['y' * 1000000] * 11)|join ~ (['y' * 1000000] * 11)|join)|length ~ ''", True),
         ("lipsum(2)", False),
         ("lipsum(10 ** 6)", True),
+        ("lipsum(10 ** 6, html=false)", True),
+        ("lipsum(1, true, 1, 20000)", False),
+        ("lipsum(1, true, 1, 20001)", True),
     ],
 )
 def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: bool) -> None:
@@ -473,6 +519,65 @@ def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: 
             page.render({})
     else:
         assert page.render({}) == "done"
+
+
+@pytest.mark.parametrize(
+    ("expression", "name"),
+    [
+        ("'x' * 2000001", "*"),
+        ("['x' * 1000000] * 21", "*"),
+        ("'%1000000000d' % 1", "%"),
+        ("9 ** 99", "**"),
+        ("'{:1000000000}'.format(1)", "format"),
+        ("'x'.center(10 ** 9)", "center"),
+        ("'x'|indent(10 ** 9)", "indent"),
+        ("lipsum(10 ** 6)", "lipsum"),
+    ],
+)
+def test_what_would_make_a_huge_text_is_named(expression: str, name: str) -> None:
+    with pytest.raises(FragmentError, match=re.escape(f"the result of {name} would be too large")):
+        prepare(f"{{{{ {expression} }}}}").render({})
+
+
+def test_a_filter_takes_no_more_of_a_long_sequence_than_it_may() -> None:
+    lines = iter(["x" * 1_000_000] * 40)
+    with pytest.raises(FragmentError, match="SecurityError"):
+        prepare("{{ lines|join }}").render({"lines": lines})
+    assert len(list(lines)) == 19
+
+
+def test_what_follows_a_list_in_a_list_counts_as_well() -> None:
+    most = 20_000_000 - 3  # the lists count 1 and 2
+    with pytest.raises(FragmentError, match="SecurityError"):
+        prepare("{{ x|join }}").render({"x": [["y" * most], "z"]})
+    assert prepare("{{ x|join|length }}").render({"x": ["y" * most]}) == str(most)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "{{ 'a'|center(width=5) }}.",
+        "{{ ['a', '<b>']|join(d=', ') }}",
+        "{{ ['a', 'b']|map('upper')|join('-') }}",
+        "{{ '%(n)05d <'|format(n=7) }}",
+        "{{ '{:>5} {x}'.format(1, x='<') }}",
+        "{{ dict(a=1)['a'] }}",
+        "{{ [1, 2, 3]|batch(2, 'z')|list }}{{ [1, 2, 3]|slice(2)|list }}",
+        "{{ 'a b c'|wordwrap(1) }}{{ 'abcdefgh'|truncate(4, leeway=0) }}{{ 2.345|round(2) }}",
+        "{{ {'b': 1, 'a': [2]}|tojson(indent=1) }}",
+        "{{ 7 % 4 }} {{ 2 ** 3 }} {{ 2 + 3 }} {{ 'a' * 3 }} {{ '%s' % '<' }} {{ ['a'] + ['b'] }}",
+        "{% set text %}a{{ 1 }}{{ '<' }}{% endset %}{{ text }}\n",
+        "{% macro m(x) %}<i>{{ x }}</i>{% endmacro %}{{ m('<') ~ m(2) }}\n",
+    ],
+)
+def test_what_is_limited_does_otherwise_what_jinja_does(source: str) -> None:
+    jinja = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
+    assert prepare(source).render({}) == jinja.from_string(source).render()
+
+
+def test_a_part_of_a_page_may_have_more_characters_than_the_page() -> None:
+    source = "{% set text %}{% for a in range(11) %}{{ x }}{% endfor %}{% endset %}{{ text|length }}"
+    assert prepare(source).render({"x": "x" * 1_000_000}) == "11000000"
 
 
 @pytest.mark.parametrize(

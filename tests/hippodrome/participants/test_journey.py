@@ -80,6 +80,14 @@ def test_a_participant_goes_from_the_link_to_the_completion_code(platform: FakeP
     assert stored(platform, "answers/4.json")["answers"] == {"words": "It was\nfun ☃"}
 
 
+def test_a_participants_documents_have_a_line_for_each_field(platform: FakePlatform, alice: Browser) -> None:
+    alice.answer(alice.get(), consent="yes")
+    for name in ("participant.json", "answers/1.json"):
+        lines = platform.documents.kept[f"maze/users/alice/{name}"][0].decode().splitlines()
+        named = [re.match(r'( +)"(\w+)": ', line) for line in lines]
+        assert [found[2] for found in named if found and found[1] == " "] == list(stored(platform, name))
+
+
 def test_a_get_never_moves_a_participant_on(platform: FakePlatform, alice: Browser) -> None:
     first = alice.get()
     before = dict(platform.documents.kept)
@@ -455,6 +463,7 @@ def test_a_program_gets_answers_as_from_hippo(platform: FakePlatform, alice: Bro
         ("projectId=maze%00&userId=alice", 404),
         ("projectId=maze&projectId=other&userId=alice", 404),
         ("projectId=maze&userId=", 400),
+        ("projectId=maze&PROLIFIC_PID=a%20b", 400),
         ("projectId=maze&userId=../bob", 400),
         ("projectId=maze&userId=a%00b", 400),
         ("projectId=maze&userId=a&userId=b", 400),
@@ -473,7 +482,69 @@ def test_a_broken_link_gets_an_error_page_and_changes_nothing(platform: FakePlat
 
 
 def test_the_page_without_a_study_shows_the_form_of_a_link(platform: FakePlatform) -> None:
-    assert "projectId=" in Browser(platform, "").get()
+    assert "projectId=your-project&amp;userId=… - please" in Browser(platform, "").get()
+
+
+def test_a_request_that_neither_reads_nor_answers_is_refused(platform: FakePlatform, alice: Browser) -> None:
+    assert [alice.send(method)["statusCode"] for method in ("PUT", "DELETE", "PATCH")] == [405] * 3
+    asked = alice.send("OPTIONS")
+    assert (asked["statusCode"], asked["body"]) == (204, "")
+
+
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_a_program_without_an_id_is_told_so_and_gets_none(platform: FakePlatform, method: str) -> None:
+    body = "a=1" if method == "POST" else None
+    answer = Browser(platform, "projectId=maze").send(method, body, accept="application/json", content_type=FORM)
+    assert (answer["statusCode"], "Location" in answer["headers"]) == (400, False)
+    assert json.loads(answer["body"])["message"]
+
+
+def test_a_form_without_an_id_is_refused(platform: FakePlatform) -> None:
+    answer = Browser(platform, "projectId=maze").post(consent="yes")
+    assert (answer["statusCode"], "Location" in answer["headers"]) == (400, False)
+
+
+def test_an_arrival_is_logged_once(platform: FakePlatform, alice: Browser, log: io.StringIO) -> None:
+    for _ in range(2):
+        alice.get()
+    assert log.getvalue().count('"arrived"') == 1
+
+
+def test_a_link_whose_project_no_study_can_have_costs_no_call(platform: FakePlatform, alice: Browser) -> None:
+    assert calls(platform, lambda: Browser(platform, "projectId=../maze&userId=alice").send()) == []
+
+
+def test_the_fields_of_a_recruiters_link_are_kept_up_to_a_length(platform: FakePlatform) -> None:
+    long, longer = "k" * 64, "k" * 65
+    Browser(platform, f"projectId=maze&userId=alice&{long}=1&{longer}=2&a={'v' * 257}").get()
+    assert stored(platform, "participant.json")["link"] == {long: "1", "a": "v" * 256}
+
+
+def test_the_fields_of_a_link_that_are_not_the_recruiters_are_not_kept(platform: FakePlatform) -> None:
+    browser = Browser(platform, "projectId=maze&userId=alice&poll=3&signature=x&a=1")
+    browser.send("POST", "b=1", accept="application/json", content_type=FORM)
+    assert stored(platform, "participant.json")["link"] == {"a": "1"}
+
+
+@pytest.mark.parametrize(
+    ("query", "title", "text"),
+    [
+        ("projectId=maze&userId=../bob", "Kaputt", "Noch einmal kopieren"),
+        ("projectId=maze&userId=a&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE", "Eine Studie", "Eine Vorschau"),
+    ],
+)
+def test_a_page_instead_of_the_study_is_in_its_language(query: str, title: str, text: str) -> None:
+    words = {
+        "language": "de",
+        "brokenLink": "Kaputt",
+        "brokenLinkText": "Noch einmal kopieren",
+        "preview": "Eine Vorschau",
+        "aStudy": "Eine Studie",
+    }
+    page = Browser(installed(study(texts=words, name="")), query).send()["body"]
+    assert '<html lang="de">' in page
+    assert f"<h1>{title}</h1>" in page
+    assert text in page
 
 
 def test_a_study_that_is_not_live_does_not_exist() -> None:
@@ -503,6 +574,15 @@ def test_answers_that_cannot_be_stored_are_refused_and_the_participant_stays_at_
     assert response["statusCode"] == status
     assert "no-store" not in response["headers"]["Cache-Control"]  # the browser keeps the form for Back
     assert platform.documents.kept == before
+
+
+def test_a_program_whose_answers_are_refused_is_told_why(platform: FakePlatform, alice: Browser) -> None:
+    answer = alice.send("POST", "a=1", content_type="text/plain", accept="application/json")
+    assert answer["statusCode"] == 415
+    assert json.loads(answer["body"])["message"] == (
+        "Your answers were not saved. Answers are accepted from a form or as JSON, and this was neither. "
+        "Please answer the page again."
+    )
 
 
 @pytest.mark.parametrize(

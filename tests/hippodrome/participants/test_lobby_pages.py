@@ -411,6 +411,16 @@ def test_participants_keep_their_own_game_while_it_has_a_server_or_a_next_one(fo
         assert ann.data["state"]["state"] == "lobby"
 
 
+def test_a_page_of_the_lobby_is_told_of_its_session_also_with_an_old_ticket(for_one: FakePlatform) -> None:
+    register_two(for_one)
+    ann, _ = matched_pair(for_one)
+    address = ann.data["poll"]
+    old = re.sub("ticket=[0-9a-f]+", "ticket=0", address)
+    assert old != address
+    assert (ann.poll(old)["status"], ann.poll(old)["state"]) == (200, "queued")
+    assert ann.poll(old.replace("&ticket=0", ""))["state"] == "ended", "so that a page for one is loaded again"
+
+
 def test_a_participant_whose_own_server_has_not_started_gets_the_lobby(for_one: FakePlatform) -> None:
     ann = Player(for_one, "ann").to_game()
     address = ann.data["poll"]

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
-from hippodrome.model.texts import IN_ENGLISH
+from hippodrome.model.texts import ENGLISH, IN_ENGLISH, SAID
 from hippodrome.participants import frame, pages, scripts
 from hippodrome.participants.frame import Page
 from hippodrome.participants.pages import GameView, StepView
@@ -219,10 +219,32 @@ def test_the_language_and_title_of_the_page_are_kept() -> None:
     assert "Fragen · step 2 of 5" in found.text
 
 
-def test_a_study_of_one_page_has_no_progress() -> None:
+def test_a_study_of_one_page_has_no_progress_and_without_a_name_it_is_called_by_its_id() -> None:
     project = Project(id="one", steps=[Step("1", "only")])
-    html = pages.step_page(StepView(project, project.steps[0], "P", "x", {}, "T", "/", True)).html
-    assert "Step 1" not in html
+    view = StepView(project, project.steps[0], "P", "x", {}, "T", "/", True)
+    found = Elements(pages.step_page(view).html)
+    assert "Step 1" not in found.text
+    assert not found.named("progress")
+    assert not found.named("footer")
+    assert "<title>one</title>" in pages.step_page(view).html
+    assert '<h1 class="study">one</h1>' in pages.step_page(view).html
+    titled = dataclasses.replace(view, source="<title>Mine</title>")
+    assert "<title>Mine</title>" in pages.step_page(titled).html
+
+
+def test_a_study_of_two_pages_has_progress() -> None:
+    project = Project(id="two", steps=[Step("1", "a"), Step("2", "b")])
+    html = pages.step_page(StepView(project, project.steps[0], "P", "x", {}, "T", "/", False)).html
+    assert "<title>two · step 1 of 2</title>" in html
+    assert Elements(html).named("progress") == [{"max": "1", "value": "0"}]
+
+
+def test_a_message_for_a_program_with_a_form_of_its_own_names_no_step_unless_it_is_given() -> None:
+    fields = '<input type="hidden" name="hippodrome-step" value="{}">\n<input type="hidden" name="hippodrome-ticket" value="{}">\n'
+    message = '<div class="page">\n<h1>A &amp; b</h1>\n<p>c</p>\n</div>'
+    assert frame.form_message("A & b", "c") == fields.format("", "") + message
+    given = frame.form_message("A & b", "c", step="3", ticket="T", also="<hr>")
+    assert given == f"{fields.format('3', 'T')}<hr>{message}"
 
 
 @given(answer=st.text() | st.just("</script><script>alert(1)</script>"), user=st.text(max_size=5))
@@ -258,6 +280,26 @@ def test_pages_without_expressions_do_not_import_jinja() -> None:
     assert out.stdout.split() == ["False", "False"]
 
 
+@pytest.mark.parametrize(("files", "folder"), [(None, "/steps/demo/"), ("steps/demo/", "steps/demo/")])
+def test_pictures_come_from_the_folder_of_the_projects_files(files: str | None, folder: str) -> None:
+    source = "<img src=a.png>"
+    view = dataclasses.replace(step_view(source), files=files)
+    reading = GameView(
+        PROJECT,
+        STEPS[2],
+        "P1",
+        {"state": "queued"},
+        "/next?poll=1",
+        "/next",
+        "TICKET",
+        "",
+        texts={"instructions": (source, {})},
+        files=files,
+    )
+    for html in (pages.step_page(view).html, pages.fragment(view), pages.game_page(reading).html):
+        assert Elements(html).named("img") == [{"src": f"{folder}a.png"}]
+
+
 # The game page
 
 
@@ -284,6 +326,34 @@ def test_without_javascript_the_waiting_page_reloads_itself_and_says_that_javasc
     assert "http-equiv" not in game(state="ended").html
 
 
+def test_the_game_page_is_in_the_frame_of_the_study() -> None:
+    page = game().html
+    assert "<title>Cats &amp; dogs · step 3 of 5</title>" in page
+    assert '<p class="study">Cats &amp; dogs</p>' in page
+    assert re.search("</footer>\n<script", page)
+    assert re.search('<script type="module" nonce=', page)
+    assert "module" not in step("<p>x</p>").html
+    assert page.split("<style>\n")[1].split("</style>")[0] == frame.style("game")
+    assert '<h1 id="over-title"></h1>\n<p></p>' in page, "nothing is over"
+
+
+def test_the_texts_of_a_page_are_the_studys_own_also_in_its_script() -> None:
+    own = {"language": "de", "sending": "Wird gesendet", "score": "Punkte", "studyBy": "Von {researcher}"}
+    study = msgspec.structs.replace(PROJECT, texts=own)
+    first = pages.step_page(dataclasses.replace(step_view("<p>x</p>"), project=study)).html
+    assert "Wird gesendet" in first.split("<script")[-1]
+    assert "Von Ada" in first
+    assert "Punkte" in game(study).html
+    assert not set(own.values()) & set(re.findall(r"Punkte|Wird gesendet", game().html + step("x").html))
+
+
+def test_the_game_page_hands_the_servers_sentences_in_the_studys_own_words_to_its_script() -> None:
+    said = next(iter(SAID))
+    study = msgspec.structs.replace(PROJECT, texts={said: "In eigenen Worten"})
+    assert data_of(game(study))["said"] == {ENGLISH[said]: "In eigenen Worten"}
+    assert "said" not in data_of(game())
+
+
 TOGETHER = msgspec.structs.replace(PROJECT, players=2)
 LOBBY = {"state": "lobby", "players": 2, "here": 1, "seconds": 3, "patience": 300, "then": "unmatched"}
 
@@ -302,6 +372,32 @@ def test_in_the_lobby_a_page_without_javascript_does_not_reload_itself() -> None
     assert "http-equiv" not in html
     assert "The game needs JavaScript" in html
     assert "http-equiv" in game(project=TOGETHER, state="queued").html
+
+
+def test_the_lobby_names_how_many_others_it_waits_for() -> None:
+    pair = game(project=TOGETHER, **LOBBY).html
+    assert '<h1 id="lobby-title">Waiting for another participant</h1>' in pair
+    three = game(project=TOGETHER, **{**LOBBY, "players": 3}).html
+    assert '<h1 id="lobby-title">Waiting for other participants</h1>' in three
+    assert re.search('<p id="lobby-text">[^<]*3', three)
+    assert not re.search('<p id="lobby-text">[^<]*[0-9]', pair)
+    assert [data_of(game(project=TOGETHER, players=players))["players"] for players in (2, 3)] == [2, 3]
+
+
+def test_the_page_of_a_game_for_several_has_its_own_text_and_style() -> None:
+    together, alone = game(project=TOGETHER).html, game().html
+    assert ("Your game is being prepared" in together, "Your game is being prepared" in alone) == (True, False)
+    assert ("Your game is getting ready" in together, "Your game is getting ready" in alone) == (False, True)
+    style = together.split("<style>\n")[1].split("</style>")[0]
+    assert style.startswith(frame.style("game"))
+    assert "#people" in style.removeprefix(frame.style("game"))
+
+
+def test_the_game_page_hands_the_players_names_to_its_script() -> None:
+    named = msgspec.structs.replace(TOGETHER, trial={"playerNames": {"a": "The red one"}})
+    assert data_of(game(project=named))["names"] == {"a": "The red one"}
+    assert "names" not in data_of(game(project=TOGETHER))
+    assert "names" not in data_of(game(project=msgspec.structs.replace(named, players=1)))
 
 
 @pytest.mark.parametrize(("after", "ends"), [("end", True), (None, True), ("policy", False)])
@@ -350,6 +446,42 @@ def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> 
     advice = later if reason in (Reason.NO_CAPACITY, Reason.FULL) else f"With “{button}” you go on."
     assert advice in text
     assert advice not in Elements(game(state=state, reason=reason).html).text
+
+
+@pytest.mark.parametrize(
+    ("reason", "title", "report"),
+    [
+        (Reason.LOST, "The game could not go on", True),
+        (Reason.FULL, "The study is full just now", False),
+        (Reason.REFUSED, "The game could not be started", True),
+        (Reason.NO_CAPACITY, "The game could not be started", False),
+        (Reason.DEADLINE, "The game has ended", False),
+    ],
+)
+def test_the_page_of_a_closed_server_says_what_happened_and_whom_to_tell(
+    reason: Reason, title: str, report: bool
+) -> None:
+    state = "failed" if reason in FAILURES else "ended"
+    again = game(state=state, reason=reason, again=True).html
+    assert f'<h1 id="over-title">{title}</h1>' in again
+    assert ("If this happens again, please tell" in again) is report
+    assert "<p hidden>" in again
+    last = game(state=state, reason=reason).html
+    assert "If this happens again" not in last
+    assert "<p hidden>" not in last
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [
+        ("lost", "failed, or it could not begin on them"),
+        ("refused", "as the study is set up"),
+        ("full", "All places for this game are taken"),
+        ("unheard of", "Its computer is not there any more."),
+    ],
+)
+def test_each_reason_has_its_sentence(reason: str, words: str) -> None:
+    assert words in game(state="failed", reason=reason).html
 
 
 @pytest.mark.parametrize(("state", "says"), [("failed", "Try again"), ("ended", "Start again")])

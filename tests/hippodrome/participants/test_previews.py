@@ -45,6 +45,7 @@ AHEAD = (
     {"sec_purpose": "prefetch;anonymous-client-ip"},
     {"purpose": "prefetch"},
     {"purpose": "Preview"},
+    {"purpose": " prerender"},
     {"x_purpose": "preview"},
     {"x_moz": "prefetch"},
 )
@@ -71,6 +72,7 @@ def test_a_program_that_previews_a_link_sees_the_study_and_begins_nothing(platfo
     for query in (LINK, "projectId=maze"):
         page = Browser(platform, query).get(user_agent=agent)
         assert "A maze" in page
+        assert "Open the link in a browser" in page
         assert "<form" not in page
         assert not re.search("agree|alice", page)
     assert untouched(platform)
@@ -81,16 +83,25 @@ def test_a_prefetch_of_a_browser_is_refused_and_not_cached(platform: FakePlatfor
     """After any status but a 2xx, the browser asks again when the person opens the link."""
     for query in (LINK, "projectId=maze"):
         answer = Browser(platform, query).send(**headers)
-        assert (answer["statusCode"], answer["headers"]["Cache-Control"]) == (403, "no-store")
+        assert (answer["statusCode"], answer["headers"]["Cache-Control"], answer["body"]) == (403, "no-store", "")
     assert untouched(platform)
     Browser(platform, LINK).get()
     assert not untouched(platform)
 
 
+@pytest.mark.parametrize("headers", [{"user_agent": PROGRAMS[0]}, *AHEAD])
+def test_a_form_that_is_sent_is_no_preview(platform: FakePlatform, headers: dict[str, str]) -> None:
+    alice = Browser(platform, LINK)
+    alice.get()
+    form = f"hippodrome-step=1&hippodrome-ticket={ids.ticket('secret', 'alice', '1')}&consent=yes"
+    alice.send("POST", form, content_type="application/x-www-form-urlencoded", **headers)
+    assert "maze/users/alice/answers/1.json" in platform.documents.kept
+
+
 @pytest.mark.parametrize("query", [LINK, "projectId=maze", "projectId=maze&workerId=W1"])
 def test_the_preview_of_a_task_on_mturk_begins_nothing(platform: FakePlatform, query: str) -> None:
     page = Browser(platform, f"{query}&assignmentId=ASSIGNMENT_ID_NOT_AVAILABLE&hitId=H").get()
-    assert "preview" in page
+    assert "This is a preview." in page
     assert untouched(platform)
     Browser(platform, f"{LINK}&assignmentId=3RANDOM&hitId=H").get()
     assert not untouched(platform)
@@ -152,6 +163,12 @@ def test_a_visitor_without_a_valid_signature_gets_nothing(closed: FakePlatform, 
     assert answer["statusCode"] in (400, 403)
     assert "agree" not in answer["body"]
     assert untouched(closed)
+
+
+def test_a_link_with_a_wrong_signature_is_said_to_be_broken(closed: FakePlatform) -> None:
+    answer = Browser(closed, f"{LINK}&signature=x").send()
+    assert answer["statusCode"] == 403
+    assert "This link is broken" in answer["body"]
 
 
 def test_a_link_without_an_id_is_refused_and_no_id_is_made(closed: FakePlatform) -> None:

@@ -117,3 +117,6 @@ def test_a_closed_server_has_failed_or_ended_and_may_be_asked_for_again(reason: 
 def test_a_server_after_a_lost_one_is_shown_as_its_replacement(reason: Reason, replaces: bool) -> None:
     assert state_of(server.replacing(server.close(started(), reason, NOW), started(2)))["replaces"] is replaces
     assert state_of(started())["replaces"] is False
+    second = server.replacing(server.close(started(), reason, NOW), started(2))
+    third = server.replacing(server.close(second, Reason.STOPPED, NOW), started(3))
+    assert state_of(third)["replaces"] is False, "the latest of the earlier ones counts"
