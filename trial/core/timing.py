@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import Enum
+from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from protocol.trial import TrialSection
@@ -18,10 +18,10 @@ from trial.core.progress import TrialProgress
 class Due(Enum):
     """What is due now. MORE: nothing for the caller to do, but the progress has changed, so ask again."""
 
-    NOTHING = "nothing"
-    MORE = "more"
-    RESET = "reset"
-    STEP = "step"
+    NOTHING = auto()
+    MORE = auto()
+    RESET = auto()
+    STEP = auto()
 
 
 class StateTimes(NamedTuple):

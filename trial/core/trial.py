@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from enum import Enum
+from enum import Enum, auto
 from typing import Any, Literal
 
 from trial.core import messages, records
@@ -82,11 +82,11 @@ TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you h
 class Phase(Enum):
     """The phases of a trial, which the module's docstring explains."""
 
-    STARTING = "starting"
-    PLAYING = "playing"
-    SAVING = "saving"
-    FINISHED = "finished"
-    CLOSED = "closed"
+    STARTING = auto()
+    PLAYING = auto()
+    SAVING = auto()
+    FINISHED = auto()
+    CLOSED = auto()
 
 
 class Trial:

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import math
 import struct
 import zlib
 
@@ -14,6 +15,7 @@ from trial.core import commands, messages
 from trial.core.controls import Controls
 from trial.pictures import frames
 from trial.server.watchdog import Watchdog
+from trial.settings import trial_section
 
 # ---- what a client says
 
@@ -168,6 +170,132 @@ def test_the_servers_messages_are_json_with_the_names_of_docs_wire(next_in):
     failed = {"done": True, "episodes": 2, "score": 7, "error": "It failed."}
     assert json.loads(messages.done(2, 7.0, words="It failed.")) == failed
     assert json.loads(messages.error("no")) == {"error": "no"}
+
+
+# ---- fields that are there only sometimes
+
+ALWAYS: dict = {
+    "ui": (),
+    "frame_rate": 30,
+    "min_frame_rate": 1,
+    "max_frame_rate": 90,
+    "frame_rate_step_size": 5,
+    "allow_frame_rate_change": True,
+    "action_space": ("noop",),
+    "state": "playing",
+    "episode": 1,
+    "max_episodes": 3,
+    "score": 0.0,
+    "episode_score": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"words": ("wellDone",)}, {"words": ["wellDone"]}),
+        ({"player": "a", "players": ("a",)}, {}),
+        ({"player": "a", "players": ("a", "b")}, {"player": "a", "players": ["a", "b"]}),
+        ({"to_act": False}, {"pace": "turns", "toAct": False}),
+        ({"to_act": True, "turn_ends_in": 1.5}, {"pace": "turns", "toAct": True, "turnEndsIn": 1.5}),
+        ({"starts_in": 0.0, "time_left": 2.0004}, {"startsIn": 0.0, "timeLeft": 2.0}),
+        ({"next_in": math.inf}, {}),
+        ({"scene": {"scene": {"width": 3}, "assets": []}}, {"scene": {"width": 3}, "assets": []}),
+        ({"input_of_project": {"input": "single"}}, {"input": "single"}),
+        ({"session": {"you": "a"}}, {"you": "a"}),
+    ],
+)
+def test_the_message_about_the_controls_has_a_further_field_only_if_there_is_something_to_tell(given, told):
+    plain = json.loads(messages.controls(**ALWAYS))
+    assert json.loads(messages.controls(**ALWAYS, **given)) == plain | told
+    assert plain.keys().isdisjoint(told)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"to_act": False}, {"toAct": False}),
+        ({"to_act": True, "turn_ends_in": 1.5}, {"toAct": True, "turnEndsIn": 1.5}),
+        ({"starts_in": 0.0, "time_left": 2.0004}, {"startsIn": 0.0, "timeLeft": 2.0}),
+        ({"next_in": math.inf}, {}),
+        ({"session": {"you": "a"}}, {"you": "a"}),
+    ],
+)
+def test_the_message_with_the_state_has_a_further_field_only_if_there_is_something_to_tell(given, told):
+    plain = {"state": "playing", "episode": 1, "frameRate": 30, "score": 2, "episodeScore": 1}
+    assert json.loads(messages.state("playing", 1, 2.0, 30, episode_score=1.0, **given)) == plain | told
+
+
+def test_the_last_message_says_how_the_trial_of_a_session_has_ended():
+    assert json.loads(messages.done(2, 1.5, "stopped")) == {
+        "done": True,
+        "episodes": 2,
+        "score": 1.5,
+        "outcome": "stopped",
+    }
+
+
+def test_a_hello_names_its_project_also_if_the_name_is_no_text():
+    hello = messages.parse_hello(json.dumps({"projectId": 3}))
+    assert (hello.names_project, hello.project_id) == (True, None)
+    hello = messages.parse_hello(json.dumps({"step": 0}))
+    assert (hello.names_project, hello.project_id, hello.step) == (False, None, "0")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message", "recorded"),
+    [
+        ({"key": "x" * 32}, {"key": "x" * 32}, {"key": "x" * 32}),
+        ({"key": "x", "held": False}, {"key": "x", "held": False}, {"key": "x", "held": False}),
+        ({"asset": "a" * 200}, {"asset": "a" * 200}, {}),
+        ({"hidden": True}, {"hidden": True}, {}),
+        ({"hidden": False}, {"hidden": False}, {}),
+        ({"changeFrameRate": 2e6}, {"frame_rate": 2e6}, {"changeFrameRate": 2e6}),
+        ({"command": "wellDone"}, {"command": "wellDone"}, {"command": "wellDone"}),
+    ],
+)
+def test_a_key_an_image_a_hidden_page_and_a_word_of_the_project_are_read(fields, message, recorded):
+    found = messages.parse(json.dumps(fields), ("wellDone",))
+    assert found == messages.Message(**message)
+    assert found.record() == recorded
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"key": "x", "action": "up"}, "key must be the name of a key, and come without an action"),
+        ({"key": "x" * 33}, "key must be the name of a key, and come without an action"),
+        ({"hidden": 1}, "hidden must be true or false"),
+        ({"hidden": None}, "hidden must be true or false"),
+        ({"command": "welldone"}, "unknown command 'welldone'"),
+        ({"changeFrameRate": math.nan}, "changeFrameRate must be 'faster', 'slower' or a number"),
+    ],
+)
+def test_a_wrong_key_or_word_is_refused_with_the_reason(fields, words):
+    with pytest.raises(messages.BadMessage) as refused:
+        messages.parse(json.dumps(fields), ("wellDone",))
+    assert str(refused.value) == words
+
+
+def test_the_recording_has_what_it_knows_of_unknown_fields():
+    assert messages.Message(fields={"x": 1}).record() == {"fields": {"x": 1}}
+    assert messages.Message(fields_dropped=2).record() == {"fieldsDropped": 2}
+
+
+def test_the_words_of_a_project_are_its_controls_that_name_no_action():
+    section = trial_section(
+        {"game": "g", "actionSpace": ["noop", "Jump"], "ui": {"jump": True, "Fire": True, "wait": True}}
+    )
+    assert messages.words_of(section) == ("wait",)
+    assert [messages.is_feedback(name) for name in ("wait", "good", "start", None)] == [True, True, False, False]
+
+
+def test_a_connection_is_closed_with_a_code_and_words():
+    closed = messages.CloseConnection(4400, "that is not JSON")
+    assert (closed.code, closed.words, str(closed)) == (4400, "that is not JSON", "that is not JSON")
+
+
+# ---- what ui offers
 
 
 @pytest.mark.parametrize(
