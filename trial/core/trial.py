@@ -266,7 +266,6 @@ class Trial:
 
     def round_trip(self, human: str, seconds: float, now: float) -> list[Effect]:
         """Take a sample of a human's round trip, in seconds, which their browser's answer to a ping has measured."""
-        self._now = now
         if self.phase is not Phase.PLAYING:
             return []
         self._participants.round_trip(self._participants.place_of(human), seconds, now)
@@ -274,7 +273,6 @@ class Trial:
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
         """Carry out a client's message. It changes nothing if another connection has replaced this one."""
-        self._now = now
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
             return []
@@ -338,7 +336,6 @@ class Trial:
 
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
         """Take the action that the player's policy has chosen. An answer to an earlier question changes nothing."""
-        self._now = now
         problem = self.progress.choices.policies.acted(player, ask_id, action)
         if problem is not None:
             self._recording.policy_failed(self.progress, player, problem)
@@ -347,7 +344,6 @@ class Trial:
 
     def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
         """Go on after the player's policy has raised this error."""
-        self._now = now
         if self.progress.choices.policies.failed(player, ask_id):
             self._recording.policy_failed(self.progress, player, words_of(error))
         return self.advance(now)
@@ -363,14 +359,12 @@ class Trial:
 
     def recording_failed(self, now: float) -> list[Effect]:
         """End the game, since its recording cannot be opened and every game must be recorded."""
-        self._now = now
         self._recording.failed()
         self._fail(fatal=True)
         return self.advance(now)
 
     def answer_saved(self, now: float) -> list[Effect]:
         """Finish the trial, since all recordings and answers are stored, or close it if it has no answer."""
-        self._now = now
         if not self.progress.over or self.broken:
             self.phase = Phase.CLOSED
             return []
@@ -383,7 +377,6 @@ class Trial:
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
         """Let a member whose answer is stored go on to the next step, even if the others still play."""
-        self._now = now
         self._participants.saved(human)
         client = self._clients.by_human.get(human)
         if client is not None and not self.finished:

@@ -189,7 +189,7 @@ def test_an_agent_that_does_not_start_leaves_no_answer():
 def test_a_game_step_that_an_earlier_server_has_answered_is_done_at_once():
     driver = Driver()
     driver.event("already_played", {"episodes": 2, "score": 340})
-    assert driver.trial.finished
+    assert (driver.trial.finished, driver.trial.ready) == (True, True)
     assert driver.connect() == [SendDone("tab", 2, 340)]
 
 
@@ -349,6 +349,16 @@ def test_the_words_of_the_project_are_told_and_those_that_are_actions_are_not():
     driver.event("start", alone(("noop", "hop")), None, driver.now)
     driver.reset()
     assert sent(driver.connect())[0]["words"] == ["wellDone"]
+
+
+def test_a_round_trip_of_the_only_participant_changes_nothing():
+    driver = Driver()
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
+    driver.playing()
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
+    driver.event("close", driver.now)
+    driver.wait(2)
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
 
 
 # ---- steps
@@ -515,13 +525,18 @@ def test_the_line_of_the_first_step_says_who_has_connected_and_left():
     driver.connect()
     driver.now += 1
     driver.connect("other tab")
-    driver.say("other tab", command="start")
-    at = [100_000_000_000, 101_000_000_000]
-    assert driver.call.fields["messages"] == [
-        {"ns": at[0], "event": "connected"},
-        {"ns": at[1], "event": "disconnected"},
-        {"ns": at[1], "event": "connected"},
-        {"ns": at[1], "command": "start"},
+    driver.now += 1
+    driver.event("disconnect", "other tab", driver.now)
+    driver.now += 1
+    driver.connect()
+    driver.say(command="start")
+    assert [(message["ns"] // 10**9, message.get("event")) for message in driver.call.fields["messages"]] == [
+        (100, "connected"),
+        (101, "disconnected"),
+        (101, "connected"),
+        (102, "disconnected"),
+        (103, "connected"),
+        (103, None),
     ]
 
 
@@ -766,7 +781,9 @@ def test_a_call_that_comes_back_after_its_time_changes_nothing():
     late = driver.call
     driver.fails(AgentTimeout("no answer within 30 s"))
     assert driver.event("call_returned", late, StepTaken({PLAYER: 5.0}, False, False, FRAME, b"late"), driver.now) == []
+    assert driver.event("call_failed", late, ValueError("late"), driver.now) == []
     assert driver.trial.progress.score == 0
+    assert len(driver.records("error")) == 1
 
 
 def test_feedback_that_the_agent_has_heard_is_not_told_again_after_an_error():
@@ -796,11 +813,13 @@ def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
     driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
     assert isinstance(driver.call, ReplayCall)
     assert driver.call.unfinished.seed == 11
+    driver.now += 5
     driver.returns(Replayed(FRAME))
     assert driver.records("resume") == [{"episode": 2, "steps": 2}]
     driver.connect()
     driver.say(command="start")
     assert driver.call.feedback == (Word("good"),), "the earlier agent did not hear it"
+    assert driver.call.fields["messages"][0] == {"ns": 105_000_000_000, "command": "good", "again": True}
     assert driver.call.fields["step"] == 3
     assert driver.trial.progress.score == 4.5
 
@@ -838,22 +857,26 @@ def test_the_time_of_an_episode_goes_on_after_the_steps_of_an_earlier_server():
 def test_a_replay_that_hangs_ends_the_trial_and_its_last_line_has_the_feedback_that_was_not_heard():
     driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
     driver.connect()
+    driver.now += 300
     driver.fails(AgentTimeout("no answer within 300 s"))
     assert driver.trial.progress.outcome == "failed"
     assert driver.records("resume") == []
     (end,) = driver.records("end")
     assert [message for message in end["messages"] if "command" in message] == [
-        {"ns": 100_000_000_000, "command": "good", "again": True}
+        {"ns": 400_000_000_000, "command": "good", "again": True}
     ]
 
 
 def test_feedback_that_was_not_heard_before_the_first_step_is_heard_at_it():
-    driver = Driver().begin(recorded([], unheard=[Word("good")]))
-    assert isinstance(driver.call, ResetCall)
+    driver = Driver()
+    driver.trial.start(alone(SPACE), recorded([], unheard=[Word("good")]), driver.now)
+    driver.now += 5
+    driver.event("recording_opened", driver.now)
     driver.reset()
     driver.connect()
     driver.say(command="start")
     assert driver.call.feedback == (Word("good"),)
+    assert driver.call.fields["messages"][0] == {"ns": 105_000_000_000, "command": "good", "again": True}
 
 
 def test_only_who_comes_before_its_first_step_is_told_that_an_episode_begins_again():

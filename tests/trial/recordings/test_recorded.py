@@ -2,6 +2,11 @@
 
 import gzip
 import json
+import platform
+from collections import UserDict
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -310,6 +315,72 @@ def test_a_line_is_short_and_ends_where_the_next_begins():
     assert recording.line("step", a=float("nan"), b=1) == b'{"kind":"step","a":null,"b":1}\n'
 
 
+def test_the_time_of_a_line_is_written_in_utc():
+    time = datetime(2026, 11, 21, 14, 46, 40, 123456, UTC)
+    assert recording.line("step", time=time) == b'{"kind":"step","time":"2026-11-21T14:46:40.123456Z"}\n'
+    assert recording.line("step", time="now") == b'{"kind":"step","time":"now"}\n'
+
+
+SETTLED = [
+    {},
+    {"lives": 3, "level": 0.5, "over": False, "who": None, "name": "x" * 1_000},
+    {2**63: -(2**63)},
+    dict.fromkeys(range(100)),
+]
+UNSETTLED = [
+    {"a": []},
+    {"a": {}},
+    {"a": np.float32(1)},
+    {"a": "x" * 1_001},
+    {"x" * 1_001: 1},
+    {"a": 2**63 + 1},
+    {"a": -(2**63) - 1},
+    {(1, 2): 1},
+    dict.fromkeys(range(101)),
+    UserDict(a=1),
+]
+
+
+def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written():
+    assert all(recording.is_settled(info) for info in SETTLED)
+    assert not any(recording.is_settled(info) for info in UNSETTLED)
+    for info in SETTLED:
+        fields = {"step": 1, "info": info, "reward": float("nan")}
+        line = recording.line("step", **fields)
+        assert recording.text_of_line(recording.LaterLine("step", fields)) == recording.text_of_line(line) == line
+
+
+def test_an_info_may_have_a_million_bytes_of_json():
+    room = 1_000_000 - len('{"a":""}')
+    assert not recording.is_too_large({"a": "x" * room})
+    assert recording.is_too_large({"a": "x" * (room + 1)})
+    assert recording.is_too_large({"a": "x" * 1_000_001})
+
+
+def test_the_values_of_a_step_share_a_million_bytes_of_json_in_their_order():
+    values = {"a": "x" * 999_994, "b": [1, 2], "c": 1, "d": 1234, "e": 123, "f": 1}
+    kept, too_large = recording.bounded_extra(values)
+    assert too_large == {"b": 5, "d": 4, "f": 1}
+    assert kept == values | {name: {"tooLarge": size} for name, size in too_large.items()}
+    assert recording.bounded_extra({"a": [1, 2]}, 5) == ({"a": [1, 2]}, {})
+    assert recording.bounded_extra({"a": [1, 2]}, 4) == ({"a": {"tooLarge": 5}}, {"a": 5})
+
+
+def test_after_a_hundred_values_that_are_too_large_the_rest_is_counted():
+    def left_out(values):
+        kept, too_large = recording.bounded_extra({str(number): "x" * 9 for number in range(values)}, 10)
+        assert len(too_large) == min(values, 100)
+        return kept.get("<cut off>")
+
+    assert [left_out(values) for values in (99, 100, 101, 103)] == [None, None, 1, 3]
+
+
+def test_a_name_for_which_there_is_no_room_is_cut_off():
+    kept, too_large = recording.bounded_extra({"n" * 2000: 1, "m" * 2001: 2}, 2001)
+    assert list(kept) == ["n" * 2000, "m" * 1000]
+    assert too_large == {}
+
+
 def test_an_observation_is_kept_with_its_shape():
     array = np.arange(6, dtype=np.int16).reshape(2, 3).T
     kept = recording.observation({"a": [array, "x"], "b": (np.array(["y"]),)})
@@ -333,8 +404,21 @@ def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_t
     assert recording.packages(tmp_path / "image") == names
 
 
+def test_a_recording_names_at_most_a_hundred_packages_whatever_is_written_in_the_file(tmp_path):
+    (tmp_path / "requirements.txt").write_text("\ufeff" + "\n".join(f"game{number}" for number in range(120)))
+    assert recording.packages(tmp_path) == tuple(f"game{number}" for number in range(100))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/requirements.txt").write_bytes(b"pillow\n\xff\n")
+    assert recording.packages(tmp_path / "other") == ()
+    assert Path(__file__).parents[3] / "requirements/project.txt" == recording.REQUIRED
+
+
 def test_the_versions_include_the_trial_python_and_its_packages():
-    assert {"trial", "python", "gymnasium", "numpy", "websockets"} <= recording.versions().keys()
+    found = recording.versions()
+    assert {"trial", "python", "gymnasium", "ale-py", "numpy", "websockets"} == found.keys()
+    assert (found["trial"], found["python"]) == ("1.0", platform.python_version())
+    installed = {name for name in ("pettingzoo", "onnxruntime") if find_spec(name)}
+    assert recording.versions(recording.OF_SEVERAL).keys() - found.keys() == installed
 
 
 def test_a_recording_is_dirty_until_it_is_flushed_and_closed_once(tmp_path):
