@@ -72,7 +72,7 @@ class Controls:
     def keep(self, name: str) -> None:
         """Choose an action that acts until another is chosen. NOOP and unknown names only end the earlier action."""
         self._press = self._index.get(name) if name != NOOP else None
-        self._press_left = math.inf if self._press is not None else 0
+        self._press_left = math.inf
 
     def press(self, name: str) -> None:
         """Choose an action by one press. It acts for `lifespan` steps (`single`: one), or until another is chosen."""
@@ -82,7 +82,7 @@ class Controls:
             return
         self.pressed_at = self.time
         self._press = index
-        self._press_left = self._lifespan if self._press is not None else 0
+        self._press_left = self._lifespan
 
     def hold(self, name: str) -> None:
         """Take a key that went down, and end a press that still acts."""

@@ -51,11 +51,11 @@ FRAME = np.zeros((2, 2, 3), np.uint8)
 class Driver:
     """Drives a trial by hand, with an agent that answers when a test tells it to, and a clock that the test sets."""
 
-    def __init__(self, **section):
+    def __init__(self, *, assets=(), **section):
         section = {"game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, **section}
         env = {"PROJECT_ID": "study", "USER_ID": "P1", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
         settings = TrialSettings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
-        self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7)
+        self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7, assets=assets)
         self.now = 100.0
         self.effects = []
         self.all = []
@@ -361,6 +361,39 @@ def test_a_round_trip_of_the_only_participant_changes_nothing():
     assert driver.event("round_trip", "P1", 9.0, driver.now) == []
 
 
+def test_the_controls_of_a_game_that_is_drawn_by_objects_hold_its_scene_and_its_images():
+    assets = [{"name": "ball.png", "size": 3}]
+    driver = Driver(assets=assets, scene={"width": 3, "height": 2}).begin()
+    driver.reset()
+    told = sent(driver.connect())[0]
+    assert (told["scene"]["width"], told["scene"]["height"], told["assets"]) == (3, 2, assets)
+    assert "assets" not in told["scene"]
+    plain = Driver(assets=assets).begin()
+    plain.reset()
+    assert {"scene", "assets"}.isdisjoint(sent(plain.connect())[0])
+
+
+def test_each_player_is_shown_their_own_picture_if_there_is_one():
+    driver = Driver().begin()
+    other = np.ones((2, 2, 3), np.uint8)
+    driver.returns(Begun(b"reset", {PLAYER: other, "player_1": FRAME}))
+    assert [frame.picture for frame in driver.connect() if isinstance(frame, SendPicture)] == [other]
+    driver.say(command="start")
+    driver.returns(StepTaken({PLAYER: 1.0}, False, False, {"player_1": FRAME}, b"step"))
+    assert driver.of(SendPicture) == []
+
+
+def test_the_ids_of_frames_count_up():
+    driver = Driver().playing()
+    ids = []
+    for _ in range(3):
+        driver.step()
+        ids += [frame.frame_id for frame in driver.of(SendPicture)]
+        driver.wait(0.1)
+    assert ids == [2, 3, 4]
+    assert [frame.frame_id for frame in driver.connect("other tab") if isinstance(frame, SendPicture)] == [4]
+
+
 # ---- steps
 
 
@@ -586,6 +619,31 @@ def test_each_episode_has_its_file_and_a_break_belongs_to_the_one_before():
     driver.say(command="start")
     kinds = [type(effect) for effect in driver.effects if not isinstance(effect, SendState)]
     assert kinds == [RecordLine, CloseRecording, OpenRecording, ResetCall]
+
+
+def test_all_episodes_of_a_trial_may_have_one_file():
+    driver = Driver(dataFile="trial", maxEpisodes=2, betweenEpisodes=3).playing()
+    driver.step(terminated=True)
+    driver.wait(3)
+    driver.reset()
+    driver.step(terminated=True)
+    kinds = [type(effect) for effect in driver.all]
+    assert (kinds.count(OpenRecording), kinds.count(CloseRecording)) == (1, 1)
+    assert kinds.index(CloseRecording) == kinds.index(SaveAnswer) - 1
+
+
+def test_what_is_said_while_the_agent_hears_the_last_feedback_belongs_to_the_next_episode():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    driver.say(command="bad")
+    driver.returns()
+    (end,) = driver.records("end")
+    assert [message["command"] for message in end["messages"]] == ["good"]
+    driver.reset()
+    driver.wait(0.1)
+    assert [message["command"] for message in driver.call.fields["messages"]] == ["bad"]
+    assert driver.call.feedback == (Word("bad"),)
 
 
 def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
@@ -937,6 +995,7 @@ def test_what_a_client_does_while_a_break_is_closed_does_not_end_it_again(last):
     driver.say(command="good")
     driver.event("close", driver.now)
     assert isinstance(driver.call, FeedbackCall), "the agent hears it before the server ends"
+    assert driver.call.limit == 2, "if it is quick"
     if last == "start":
         driver.say(command="start")
     else:

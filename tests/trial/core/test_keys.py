@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.trial.core.test_decisions import Driver
 from trial.core import messages
-from trial.core.controls import KEY, PRESSES, Controls
+from trial.core.controls import KEY, Controls
 from trial.core.effects import RecordLine, SendMessage, SendState, StepCall
 from trial.core.ended import Episode
 from trial.core.episode_time import EpisodeTime
@@ -96,10 +96,10 @@ def test_with_single_a_press_is_one_action_also_while_the_key_is_held():
 
 def test_with_single_no_press_is_lost_up_to_a_few():
     these = controls(single=True)
-    for _ in range(PRESSES + 3):
+    for _ in range(7):
         these.press("jump")
     these.press(KEY + "a")
-    assert actions_of(these, PRESSES + 2) == ["jump"] * PRESSES + ["noop"] * 2
+    assert actions_of(these, 6) == ["jump"] * 4 + ["noop"] * 2
 
 
 def test_with_single_the_action_is_that_of_the_keys_that_are_held_when_a_key_goes_down():

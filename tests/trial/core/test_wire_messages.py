@@ -508,6 +508,45 @@ def test_a_picture_becomes_exact_by_rows_in_their_order():
         decoder.decode(rows(0, b"")[: frames.HEADER.size + 1])
 
 
+@pytest.mark.parametrize("more", [bytes(18), bytes(13), b""])
+def test_rows_that_do_not_fit_the_rest_of_a_picture_are_refused(more):
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+    decoder.decode(rows(0, b"a" * 6))
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        decoder.decode(rows(1, more))
+
+
+def test_a_difference_may_follow_rows_only_when_all_of_them_have_come():
+    difference = struct.pack("!BIHHB", 1, 2, 2, 3, 3) + zlib.compress(bytes([1]) * 18, wbits=-15)
+    for parts in ((b"a" * 18,), (b"a" * 6, b"a" * 12), (b"a" * 12,)):
+        decoder, first = frames.Decoder(), 0
+        decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+        for part in parts:
+            _, shown = decoder.decode(rows(first, part))
+            first += len(part) // 6
+        if first == 3:
+            assert decoder.decode(difference)[1].tobytes() == b"`" * 18
+            assert shown.tobytes() == b"a" * 18, "a picture that was given away stays as it was"
+        else:
+            with pytest.raises(frames.FrameError, match="a difference to a frame that was not sent"):
+                decoder.decode(difference)
+
+
+def test_the_largest_frame_is_read():
+    head = struct.pack("!BIHHB", 0, 1, 4096, 4096, 1)
+    assert frames.Decoder().decode(head + zlib.compress(bytes(4096 * 4096), 1, -15))[1].shape == (4096, 4096, 1)
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        frames.Decoder().decode(head)
+
+
+def test_a_jpeg_may_have_as_long_a_side_as_libjpeg_allows():
+    long = frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE, 1), np.uint8))
+    assert Image.open(io.BytesIO(long)).size == (frames.MAX_JPEG_SIDE, 1)
+    with pytest.raises((OSError, SystemError)):
+        frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE + 1, 1), np.uint8))
+
+
 @pytest.mark.parametrize(
     "head", [(0, 1, 0, 3, 3), (0, 1, 2, 0, 3), (0, 1, 2, 3, 2), (0, 1, 4097, 4096, 1), (0, 1, 65535, 65535, 3)]
 )
