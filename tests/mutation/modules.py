@@ -176,7 +176,7 @@ TESTED_BY: dict[str, tuple[str, ...]] = {
         "trial/core/test_progress",
         "trial/core/test_controls",
         "trial/core/test_progress_any_order",
-        "trial/core/test_keys",
+        *TRIALS,
     ),
     "trial/core/presence.py": SESSIONS,
     "trial/core/session.py": SESSIONS,

@@ -261,6 +261,25 @@ def test_an_episode_is_truncated_after_its_seconds_of_play_and_pauses_do_not_cou
     assert driver.trial.progress.episode == 2
 
 
+@pytest.mark.parametrize(("left", "limit"), [(0.06, None), (0.04, "episodeSeconds")])
+def test_the_step_less_than_half_a_frame_before_the_limit_is_the_last_one(left, limit):
+    driver = Driver(episodeSeconds=2, startingFrameRate=10).playing()
+    driver.step()
+    driver.wait(2 - left)
+    assert driver.call.truncated_by == limit
+
+
+def test_in_a_break_no_time_of_an_episode_is_told():
+    driver = Driver(episodeSeconds=9, betweenEpisodes=3, maxEpisodes=2).playing()
+    assert state(driver)["timeLeft"] == 9
+    driver.step(terminated=True)
+    said = state(driver)
+    assert (said["state"], said["nextIn"], "timeLeft" in said) == ("break", 3, False)
+    driver.say(command="stop")
+    said = state(driver)
+    assert (said["state"], "nextIn" in said, "timeLeft" in said) == ("ended", False, False)
+
+
 @pytest.mark.parametrize("between", [0, 5])
 def test_the_next_episode_begins_with_all_its_time(between):
     driver = Driver(episodeSeconds=1, startingFrameRate=10, maxEpisodes=2, betweenEpisodes=between).playing()

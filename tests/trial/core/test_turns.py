@@ -234,6 +234,19 @@ def test_a_pause_stops_the_clock_of_the_turn() -> None:
     assert game.actions == {"me": (0, "none")}
 
 
+def test_the_clock_of_a_turn_does_not_run_while_the_first_picture_is_shown() -> None:
+    game = game_in_turns(turnSeconds=5, resetFreeze=2).playing(view_for("me"))
+    assert game.trial.wake_at == pytest.approx(102)
+    game.say(action="up")
+    game.wait(2.1)
+    assert game.open_call is None, "a press before does nothing"
+    assert game.states[-1]["turnEndsIn"] == pytest.approx(5)
+    game.wait(4.8)
+    assert game.open_call is None
+    game.wait(0.2)
+    assert game.actions == {"me": (0, "none")}
+
+
 def test_the_clock_of_a_turn_does_not_run_while_a_policy_thinks() -> None:
     game = game_in_turns(turnSeconds=5, policySeconds=60).playing(view_for("it"))
     game.wait(30)

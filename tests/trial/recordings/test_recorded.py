@@ -13,7 +13,7 @@ import pytest
 
 from trial.core.ended import Episode
 from trial.core.message_log import Word
-from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.recordings import recording
 from trial.recordings.resume import add_lines, load_recorded
 
@@ -134,6 +134,51 @@ def test_a_stop_in_the_break_after_an_episode_ends_the_trial():
     assert after_a_break("stop") == "stopped"
     assert after_a_break("over") == after_a_break("stop", number=2) == "terminated"
     assert recorded_trial({"kind": "break", "episode": 1, "why": "stop"}).ended == []
+
+
+@pytest.mark.parametrize(
+    ("by", "advice", "asked"),
+    [(None, 1, 1), ("agent", 1, 1), ("agent", None, None), ("none", None, 2), ("advice", 1, 2), ("human", 1, 2)],
+)
+def test_without_a_key_the_agent_was_asked_to_take_the_advice_or_the_action_that_was_taken(by, advice, asked):
+    line = step(**{key: value for key, value in {"by": by, "advice": advice}.items() if value is not None})
+    assert recorded_trial(reset(), line).unfinished.steps == [
+        RecordedStep(None, 2, 1.0, advice=asked if by else advice)
+    ]
+
+
+def test_the_actions_of_several_players_are_remembered_with_their_scores():
+    policy = {"action": 1, "reward": 2, "observed": 3, "by": "policy"}
+    watches = {"action": None, "reward": None}
+    past = recorded_trial(reset(), step(players={"a": policy, "b": watches}), step(players={"a": policy}))
+    first, second = past.unfinished.steps
+    assert first.players == {"a": RecordedAction(1, 2.0, 3, "policy"), "b": RecordedAction(None, 0.0)}
+    assert second.players == {"a": RecordedAction(1, 2.0, 3, "policy")}
+    assert past.unfinished.scores == {"a": 4.0, "b": 0.0}
+    assert recorded_trial(end(), past=past).ended == [Episode(1, 2, 2.0, "terminated", {"a": 4.0, "b": 0.0})]
+
+
+def test_it_is_remembered_for_which_members_of_a_session_the_trial_is_over():
+    refused = {"kind": "presence", "episode": 1, "player": "c", "what": "refused"}
+    came = {**refused, "player": "d", "what": "joined"}
+    assert recorded_trial(reset(), refused, came).outcomes == {"c": "ping"}
+    past = recorded_trial(reset(), refused, end("partnerLeft", outcomes={"a": "left", "b": "partnerLeft"}))
+    assert past.outcomes == {"a": "left", "b": "partnerLeft", "c": "ping"}
+    over = {"kind": "break", "episode": 1, "why": "partnerLeft", "outcomes": {"a": "left"}}
+    past = recorded_trial(reset(), step(), end(), over)
+    assert (past.outcomes, past.ended[0].why) == ({"a": "left"}, "partnerLeft")
+    for line in (end(outcomes=["a"]), step(outcomes={"a": "left"}), {**over, "outcomes": None}):
+        assert recorded_trial(reset(), line).outcomes == {}
+
+
+def test_a_step_that_is_the_last_for_two_reasons_has_terminated():
+    assert recorded_trial(reset(), step(terminated=True, truncated=True)).ended == [Episode(1, 1, 1.0, "terminated")]
+
+
+def test_feedback_names_the_player_who_gave_it():
+    said = [{"command": "good", "player": "b"}, {"command": "bad"}]
+    past = recorded_trial(reset(), step(messages=said))
+    assert past.unfinished.steps[0].feedback == (Word("good", "b"), Word("bad"))
 
 
 class MemoryStore:
