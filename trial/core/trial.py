@@ -421,7 +421,8 @@ class Trial:
         if self.phase is Phase.PLAYING:
             return self._play()
         if self.phase is Phase.SAVING and not self._ending.all_written:
-            return self._write_last_lines()
+            self._write_last_lines()
+            return True
         return False
 
     def _play(self) -> bool:
@@ -431,7 +432,8 @@ class Trial:
             if self._commands.waiting:
                 self._commands.carry_out_waiting(progress, self._participants, self._timing)
             if progress.ended:
-                return self._write_end()
+                self._write_end()
+                return True
         if progress.over or closing:
             self.phase = Phase.SAVING
             self.ready = True
@@ -442,11 +444,9 @@ class Trial:
             if stalled is None:
                 self.wake_at = self._now + LOOK_AGAIN
                 return False
-            if self._paused_by(stalled):
-                return True
-            self._agent.make(self._steps.take(progress, self._now))
-            return False
-        if due is Due.RESET:
+            if not self._paused_by(stalled):
+                self._agent.make(self._steps.take(progress, self._now))
+        elif due is Due.RESET:
             call = self._beginning.begin(progress, self._participants)
             if call is not None:
                 self._agent.make(call)
@@ -470,21 +470,20 @@ class Trial:
             self._note("stopped answering", client)
         return bool(newly)
 
-    def _write_end(self) -> bool:
+    def _write_end(self) -> None:
         """Record the end of an episode or a break, after a last call that gives the agent the feedback before it."""
         call = self._ending.last_feedback(self.progress)
         if (call.feedback or self.callbacks) and not self._agent.hangs:
             self._agent.make(call)
-            return False
-        self._ending.record(call, self.progress, self._participants)
-        return True
+        else:
+            self._ending.record(call, self.progress, self._participants)
 
-    def _write_last_lines(self) -> bool:
+    def _write_last_lines(self) -> None:
         self._ending.shut_down_break(self.progress)
         if self.progress.ended:
-            return self._write_end()
-        self._ending.write_last(self.progress, self._participants, broken=self.broken)
-        return False
+            self._write_end()
+        else:
+            self._ending.write_last(self.progress, self._participants, broken=self.broken)
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)

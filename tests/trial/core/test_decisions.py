@@ -871,8 +871,10 @@ def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
     driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
     assert isinstance(driver.call, ReplayCall)
     assert driver.call.unfinished.seed == 11
+    assert not driver.trial.ready
     driver.now += 5
     driver.returns(Replayed(FRAME))
+    assert driver.trial.ready
     assert driver.records("resume") == [{"episode": 2, "steps": 2}]
     driver.connect()
     driver.say(command="start")

@@ -134,6 +134,19 @@ def test_the_game_asks_to_be_woken_when_a_countdown_a_wait_or_a_measurement_is_o
     assert driver.trial.wake_at is None, "a pause has no end"
 
 
+@pytest.mark.parametrize(("absent", "until"), [(30, 20), (10, 10)])
+def test_in_a_break_the_game_asks_to_be_woken_at_the_end_of_the_break_or_of_a_wait(absent, until):
+    driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2, absent=absent).begin().take(terminated=True).go(1)
+    assert driver.trial.wake_at == pytest.approx(driver.now + until)
+
+
+def test_a_server_that_ends_waits_for_no_member_any_more():
+    driver = SessionDriver().come(0)
+    driver.event("close", driver.now)
+    assert driver.trial.wake_at is None
+    assert driver.answers == []
+
+
 def test_the_recording_says_at_which_step_a_member_came_or_a_policy_replaced_them():
     driver = SessionDriver(**POLICY).begin().take().go(1).wait(30)
     where = {"episode": 1, "step": 1, "player": "right"}
@@ -389,6 +402,15 @@ def test_each_member_has_their_own_score():
     assert driver.done(0).outcome == "finished"
 
 
+def test_a_member_is_told_when_their_own_score_changes():
+    driver = SessionDriver().begin().take(rewards={"right": 5.0})
+    assert [driver.state_seen_by(number)["score"] for number in (0, 1)] == [0, 5]
+    driver.now += 0.1
+    driver.event("advance", driver.now)
+    driver.take(rewards={"left": -1.0})
+    assert [driver.state_seen_by(number)["score"] for number in (0, 1)] == [-1, 5]
+
+
 def test_a_member_whom_a_policy_replaces_at_the_end_has_left():
     driver = SessionDriver(maxEpisodes=1, **POLICY).begin().wait(1).go(1).wait(33.05)
     driver.trial.progress.stop()
@@ -561,6 +583,7 @@ def test_a_member_goes_on_when_their_own_answer_is_stored_and_hears_so_once():
     told = driver.count(SendDone)
     driver.event("answer_saved", driver.now)
     assert driver.trial.finished
+    driver.event("member_saved", "P1", driver.now)
     assert driver.count(SendDone) == told
 
 
