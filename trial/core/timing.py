@@ -55,9 +55,8 @@ class Pacer:
             self._due = now
             return now
         self._due += interval
-        missed = int((now - self._due) / interval)
-        if missed > 0:  # whole intervals, so that the next frames are due at the same regular times as before
-            self._due += missed * interval
+        missed = max(0, int((now - self._due) / interval))
+        self._due += missed * interval  # whole intervals: the next frames are due at the same regular times as before
         return self._due
 
 
@@ -132,7 +131,6 @@ class Timing:
         The time of a break runs from the first call in it.
         """
         if not progress.on_break:
-            self._break_began = None
             return None
         if self._break_began is None:
             self._break_began = now

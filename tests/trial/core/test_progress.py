@@ -426,4 +426,5 @@ def test_missed_frames_are_skipped_and_the_intervals_stay_as_they_were():
     assert pacer.next(0.15, 10) == pytest.approx(0.1), "less than one frame late: it is due at once"
     assert pacer.next(0.95, 10) == pytest.approx(0.9)
     assert pacer.next(0.95, 10) == pytest.approx(1.0)
-    assert pacer.next(1.05, 20) == pytest.approx(1.05), "a new rate counts from the next frame on"
+    assert pacer.next(1.25, 10) == pytest.approx(1.2), "one was missed"
+    assert pacer.next(1.25, 20) == pytest.approx(1.25), "a new rate counts from the next frame on"
