@@ -479,6 +479,33 @@ def test_pixels_are_packed_unless_that_takes_more_bytes_than_allowed():
     assert zlib.decompress(chunked, wbits=-15) == np.bitwise_xor(noise, base).tobytes()
 
 
+def test_a_large_picture_is_packed_in_parts_if_its_size_is_limited():
+    noise = np.random.default_rng(1).integers(0, 256, (2000, 100, 3), dtype=np.uint8)
+    for base in (None, np.roll(noise, 1)):
+        plain = noise if base is None else np.bitwise_xor(noise, base)
+        data = frames.packed(noise, base, limit=1e9)
+        assert data is not None
+        assert zlib.decompress(data, wbits=-15) == plain.tobytes()
+        assert frames.packed(noise, base, limit=len(data)) == data
+        assert frames.packed(noise, base, limit=len(data) - 1) is None
+    assert zlib.decompress(frames.packed(noise[:1], limit=1e9), wbits=-15) == noise[:1].tobytes()
+
+
+def test_jpegs_have_quality_80_and_those_for_hippos_page_75():
+    picture = np.random.default_rng(1).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+
+    def tables(data):
+        return Image.open(io.BytesIO(data)).quantization
+
+    def of_quality(quality):
+        out = io.BytesIO()
+        Image.fromarray(picture).save(out, "JPEG", quality=quality)
+        return tables(out.getvalue())
+
+    assert tables(frames.jpeg(picture)) == of_quality(80)
+    assert tables(base64.b64decode(json.loads(frames.jpeg_message(picture, 1))["frame"])) == of_quality(75)
+
+
 def test_a_frame_of_the_wrong_length_is_refused():
     def key(pixels, more=b""):
         return struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(pixels, wbits=-15) + more
@@ -506,6 +533,15 @@ def test_a_picture_becomes_exact_by_rows_in_their_order():
         frames.Decoder().decode(rows(0, b"a" * 6))
     with pytest.raises(frames.FrameError, match="rows of no picture"):
         decoder.decode(rows(0, b"")[: frames.HEADER.size + 1])
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        decoder.decode(rows(0, b"")[: frames.HEADER.size + 2])
+
+
+def test_rows_begin_with_the_first_one_after_a_whole_picture():
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+    with pytest.raises(frames.FrameError, match="rows are missing"):
+        decoder.decode(rows(1, b"a" * 6))
 
 
 @pytest.mark.parametrize("more", [bytes(18), bytes(13), b""])
@@ -553,6 +589,23 @@ def test_a_jpeg_may_have_as_long_a_side_as_libjpeg_allows():
 def test_a_frame_of_an_impossible_size_is_refused(head):
     with pytest.raises(frames.FrameError, match="no such picture"):
         frames.Decoder().decode(struct.pack("!BIHHB", *head))
+
+
+def test_a_jpeg_with_as_many_pixels_in_another_form_and_a_picture_that_is_no_jpeg_are_refused():
+    whole = frames.jpeg(np.full((16, 16, 3), 99, np.uint8))
+    with pytest.raises(frames.FrameError, match="not a JPEG of this size"):
+        frames.Decoder().decode(frames.HEADER.pack(2, 1, 8, 32, 3) + whole)
+    png = io.BytesIO()
+    Image.fromarray(np.full((16, 16, 3), 99, np.uint8)).save(png, "PNG")
+    with pytest.raises(frames.FrameError, match="not a JPEG of this size"):
+        frames.Decoder().decode(frames.HEADER.pack(2, 1, 16, 16, 3) + png.getvalue())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_jpeg_is_shown_with_as_many_channels_as_the_picture_has(channels):
+    whole = frames.jpeg(np.full((8, 16, channels), 99, np.uint8))
+    _, shown = frames.Decoder().decode(frames.HEADER.pack(2, 1, 16, 8, channels) + whole)
+    assert shown.shape == (8, 16, channels)
 
 
 def test_a_jpeg_of_another_size_or_cut_off_is_refused():

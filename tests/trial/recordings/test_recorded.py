@@ -400,6 +400,7 @@ def test_an_info_may_have_a_million_bytes_of_json():
     assert not recording.is_too_large({"a": "x" * room})
     assert recording.is_too_large({"a": "x" * (room + 1)})
     assert recording.is_too_large({"a": "x" * 1_000_001})
+    assert recording.is_too_large({"a": np.broadcast_to(np.uint8(0), (1 << 40,))}), "it is not even looked at"
 
 
 def test_the_values_of_a_step_share_a_million_bytes_of_json_in_their_order():
@@ -462,6 +463,7 @@ def test_the_versions_include_the_trial_python_and_its_packages():
     found = recording.versions()
     assert {"trial", "python", "gymnasium", "ale-py", "numpy", "websockets"} == found.keys()
     assert (found["trial"], found["python"]) == ("1.0", platform.python_version())
+    assert "pillow" in recording.versions(("no-such-package-there-is", "pillow"))
     installed = {name for name in ("pettingzoo", "onnxruntime") if find_spec(name)}
     assert recording.versions(recording.OF_SEVERAL).keys() - found.keys() == installed
 
