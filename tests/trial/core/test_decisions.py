@@ -939,6 +939,12 @@ def test_feedback_that_was_not_heard_before_the_first_step_is_heard_at_it():
     assert driver.call.fields["messages"][0] == {"ns": 105_000_000_000, "command": "good", "again": True}
 
 
+def test_an_episode_of_an_earlier_server_without_a_seed_begins_with_a_new_one():
+    driver = Driver().begin(RecordedTrial(unfinished=UnfinishedEpisode(1, None)))
+    assert isinstance(driver.call, ResetCall)
+    assert driver.call.seed == 7
+
+
 def test_only_who_comes_before_its_first_step_is_told_that_an_episode_begins_again():
     driver = Driver().begin(recorded(STEPS))
     driver.fails(ValueError("it plays differently now"))

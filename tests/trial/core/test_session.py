@@ -323,6 +323,20 @@ def test_a_members_keys_move_their_own_player_alone():
     assert (step["left"].name, step["right"].name) == ("noop", "right"), "only the keys of who left are let go"
 
 
+def test_a_members_own_keys_of_the_project_move_their_own_player():
+    driver = SessionDriver(keys={"x": "up"}).begin().say(1, key="x", held=True).wait(0.2)
+    assert {name: action.name for name, action in driver.taken[-1].actions.items()} == {"left": "noop", "right": "up"}
+
+
+def test_only_the_last_line_says_how_the_trial_has_ended_for_each_member():
+    driver = SessionDriver(maxEpisodes=2).begin().take(terminated=True)
+    driver.now += 0.1
+    driver.event("advance", driver.now)
+    driver.take(terminated=True)
+    finished = {"left": "finished", "right": "finished"}
+    assert [end.get("outcomes") for end in driver.lines("end")] == [None, finished]
+
+
 def test_an_action_says_when_its_key_was_pressed():
     driver = SessionDriver().begin()
     driver.now += 0.03
@@ -797,6 +811,12 @@ def test_the_next_server_waits_for_all_members_again_without_the_instructions():
     second.come(1)
     assert second.state_seen_by(1)["beginsIn"] == 3
     assert second.wait(3.1).taken[0].fields["step"] == first.steps + 1
+
+
+def test_a_policy_that_replaces_a_member_on_the_next_server_has_the_seed_of_the_episode():
+    first = SessionDriver(**POLICY).begin().wait(1)
+    second = SessionDriver(recorded=recorded_of(first, ended=False), **POLICY).begin().go(1).wait(30)
+    assert second.lines("presence")[-1]["seed"] == policy_seed(7, "right")
 
 
 def test_a_game_that_had_not_begun_begins_on_the_next_server_as_on_the_first():

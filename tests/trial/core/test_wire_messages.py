@@ -247,6 +247,7 @@ def test_a_hello_names_its_project_also_if_the_name_is_no_text():
     [
         ({"key": "x" * 32}, {"key": "x" * 32}, {"key": "x" * 32}),
         ({"key": "x", "held": False}, {"key": "x", "held": False}, {"key": "x", "held": False}),
+        ({"asset": "a"}, {"asset": "a"}, {}),
         ({"asset": "a" * 200}, {"asset": "a" * 200}, {}),
         ({"hidden": True}, {"hidden": True}, {}),
         ({"hidden": False}, {"hidden": False}, {}),

@@ -463,6 +463,7 @@ def test_the_versions_include_the_trial_python_and_its_packages():
     found = recording.versions()
     assert {"trial", "python", "gymnasium", "ale-py", "numpy", "websockets"} == found.keys()
     assert (found["trial"], found["python"]) == ("1.0", platform.python_version())
+    assert recording.SCHEMA == 1, "as long as programs that read recordings may stay as they are"
     assert "pillow" in recording.versions(("no-such-package-there-is", "pillow"))
     installed = {name for name in ("pettingzoo", "onnxruntime") if find_spec(name)}
     assert recording.versions(recording.OF_SEVERAL).keys() - found.keys() == installed
