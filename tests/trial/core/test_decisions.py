@@ -792,6 +792,14 @@ def test_a_reset_that_fails_is_tried_again_and_the_third_failure_ends_the_trial(
     assert [error["step"] for error in driver.records("error")] == [0, 0, 0]
 
 
+def test_an_error_is_recorded_with_its_notes():
+    driver = Driver().playing()
+    error = ValueError("oops")
+    error.add_note("in level 3")
+    driver.fails(error)
+    assert driver.records("error")[0]["error"] == "ValueError: oops\nin level 3"
+
+
 def test_an_error_is_recorded_with_two_thousand_characters_at_most():
     driver = Driver().playing()
     driver.fails(ValueError("x" * 5000))
@@ -901,9 +909,11 @@ def test_the_seconds_that_were_played_on_an_earlier_server_count():
     driver.returns(Replayed(FRAME))
     driver.connect()
     driver.say(command="start")
+    driver.step()
+    driver.wait(0.10468)
     driver.step(terminated=True)
     (answer,) = driver.of(SaveAnswer)
-    assert (answer.answers["seconds"], answer.answers["frames"], answer.answers["episodes"]) == (4.1, 8, 2)
+    assert (answer.answers["seconds"], answer.answers["frames"], answer.answers["episodes"]) == (4.205, 9, 2)
 
 
 def test_the_time_of_an_episode_goes_on_after_the_steps_of_an_earlier_server():

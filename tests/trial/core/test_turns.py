@@ -620,6 +620,7 @@ def test_a_policy_idles_for_the_episode_after_three_failures_in_a_row() -> None:
     assert len(game.asks) == asked == 3
     told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert sum("no idea" in text for text in told) == 1
+    assert "the policy of it failed 3 times in a row: it idles until the episode is over" in told
     game.stepped(view_for(), over=True)
     game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
     assert len(game.asks) == 4, "it is asked again in the next episode"
