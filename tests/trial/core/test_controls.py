@@ -48,6 +48,14 @@ def test_a_tap_between_two_steps_is_not_lost():
     assert controls.take() == (2, True)
 
 
+def test_of_several_taps_between_two_steps_the_newest_acts():
+    controls = Controls(SPACE, 1)
+    for key in ("up", "down"):
+        controls.hold(key)
+        controls.release(key)
+    assert [controls.take(), controls.take()] == [(4, True), (0, False)]
+
+
 @given(
     st.lists(
         st.tuples(

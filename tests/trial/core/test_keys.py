@@ -51,6 +51,13 @@ def test_keys_that_are_held_together_take_their_action_in_any_order_and_one_of_t
     assert actions_of(these) == ["leftup"]
 
 
+def test_keys_that_belong_to_no_combination_do_not_keep_others_from_one():
+    these = controls()
+    for key in ("ArrowUp", " ", "ArrowLeft"):
+        these.hold(KEY + key)
+    assert actions_of(these) == ["leftup"]
+
+
 def test_a_key_pressed_and_released_between_two_steps_acts_once():
     these = controls()
     these.hold(KEY + " ")

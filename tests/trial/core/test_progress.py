@@ -264,7 +264,7 @@ def test_a_trial_that_ends_in_a_break_ends_the_break_and_no_second_episode(how, 
 
 
 def test_in_a_break_a_session_that_lacks_a_member_is_not_held_and_an_error_ends_nothing():
-    game = playing(betweenEpisodes=5)
+    game = playing(betweenEpisodes=1)
     game.stepped({PLAYER: 1.0}, True, False)
     game.hold()
     game.failed()
@@ -293,7 +293,7 @@ def test_only_a_game_that_is_on_is_held():
 
 
 def test_the_first_picture_is_shown_while_the_game_is_on_from_the_reset_until_its_time_is_over():
-    game = new_game(resetFreeze=2)
+    game = new_game(resetFreeze=1)
     assert (game.frozen, game.shows_first_picture) == (True, False)
     game.start()
     assert not game.shows_first_picture, "the environment is not reset yet"

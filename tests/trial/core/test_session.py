@@ -485,6 +485,7 @@ def test_turn_by_turn_all_are_told_whose_turn_it_is():
     driver.say(0, action="right").take()
     assert [driver.state_seen_by(number)["turnOf"] for number in (0, 1)] == [["right"], ["right"]]
     assert driver.state_seen_by(1)["turnEndsIn"] == 20
+    assert "turnEndsIn" not in driver.state_seen_by(0)
     driver.say(0, command="pause")
     assert "turnOf" not in driver.state_seen_by(1), "while the game is held it is nobody's"
 
