@@ -1023,6 +1023,20 @@ def test_what_a_client_does_while_a_break_is_closed_does_not_end_it_again(last):
     assert len(driver.records("end")) == 1
 
 
+def test_an_agent_that_does_not_hear_the_last_feedback_in_time_is_called_no_more():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    late = driver.call
+    driver.event("close", driver.now)
+    assert driver.trial.wake_at == driver.now + 2
+    effects = driver.wait(2)
+    assert driver.of(Call) == []
+    assert [over["why"] for over in driver.records("end")][0] == "terminated"
+    assert effects[-1] == SaveAnswer(None)
+    assert driver.event("call_returned", late, None, driver.now) == []
+
+
 def test_closing_while_the_answer_is_stored_changes_nothing():
     driver = Driver(maxEpisodes=1).playing()
     driver.step(terminated=True)
