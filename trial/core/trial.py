@@ -92,6 +92,9 @@ class Phase(Enum):
 class Trial:
     """Decides everything about the trial of one game step. The module's docstring lists events, effects and phases."""
 
+    _now: float
+    """The time of the present event, which sets it first if anything reads it."""
+
     def __init__(
         self,
         settings: TrialSettings,
@@ -114,7 +117,6 @@ class Trial:
         self.wake_at: float | None = None
         """The time at which the shell must call `advance` if no other event comes before; None if it need not."""
         self.progress = TrialProgress(self.config, alone(self.config.action_space or ("noop",)))
-        self._now = 0.0
         self._effects: list[Effect] = []
         self._emit = self._effects.append
         self._messages = MessageLog()

@@ -284,9 +284,8 @@ def test_the_recording_has_what_it_knows_of_unknown_fields():
 
 
 def test_the_words_of_a_project_are_its_controls_that_name_no_action():
-    section = trial_section(
-        {"game": "g", "actionSpace": ["noop", "Jump"], "ui": {"jump": True, "Fire": True, "wait": True}}
-    )
+    buttons = ("jump", "Fire", "leftUp", "rightUp", "leftDown", "rightDown", "wait")
+    section = trial_section({"game": "g", "actionSpace": ["noop", "Jump"], "ui": dict.fromkeys(buttons, True)})
     assert messages.words_of(section) == ("wait",)
     assert [messages.is_feedback(name) for name in ("wait", "good", "start", None)] == [True, True, False, False]
 
