@@ -1032,7 +1032,7 @@ def test_an_agent_that_does_not_hear_the_last_feedback_in_time_is_called_no_more
     assert driver.trial.wake_at == driver.now + 2
     effects = driver.wait(2)
     assert driver.of(Call) == []
-    assert [over["why"] for over in driver.records("end")][0] == "terminated"
+    assert driver.records("end")[0]["why"] == "terminated"
     assert effects[-1] == SaveAnswer(None)
     assert driver.event("call_returned", late, None, driver.now) == []
 
