@@ -250,6 +250,14 @@ def test_a_policy_takes_an_absent_members_place_and_gives_it_back_at_the_next_st
     assert driver.presence()[-2:] == [("right", "replaced"), ("right", "returned")]
 
 
+def test_a_failure_of_a_policy_that_plays_for_a_member_is_recorded_with_its_name():
+    driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
+    (ask,) = driver.calls(AskPolicy)
+    driver.event("policy_failed", "right", ask.ask_id, ValueError("no idea"), driver.now)
+    (line,) = driver.lines("error")
+    assert line["error"] == "the policy of right (random) failed: ValueError: no idea"
+
+
 def test_a_policys_answer_that_comes_after_the_return_changes_nothing():
     driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
     (ask,) = driver.calls(AskPolicy)
