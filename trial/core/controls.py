@@ -46,7 +46,7 @@ class Controls:
         self._lifespan = lifespan
         self._held: list[str] = []  # newest first
         self._tapped: list[str] = []  # pressed and released again between two steps
-        self._untaken: set[str] = set()  # held, but no step has taken them yet
+        self._untaken: set[str] = set()  # went down since the last step
         self._press: int | None = None
         self._press_left = 0.0
         self._keys = {
@@ -109,7 +109,6 @@ class Controls:
         if name not in self._untaken:
             self.pressed_at = self.time  # the other held keys choose the action from now on
         else:
-            self._untaken.discard(name)
             self._tapped.insert(0, name)
 
     def clear(self) -> None:
