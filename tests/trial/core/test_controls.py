@@ -142,6 +142,13 @@ def test_an_action_has_the_time_of_the_press_or_of_the_key_that_chose_it():
     assert chosen_at(controls, after=[(7, "hold", "left"), (8, "release", "left")]) == ("upleft", 7), "a tap"
 
 
+def test_with_single_presses_that_wait_are_forgotten_when_all_keys_are_let_go():
+    controls = Controls(SPACE, 1, single=True)
+    controls.press("left")
+    controls.clear()
+    assert controls.take() == (0, False)
+
+
 def test_with_single_each_press_that_waits_keeps_its_own_time():
     controls = Controls(SPACE, 1, single=True)
     assert chosen_at(controls, after=[(1, "press", "left"), (2, "hold", "up")]) == ("left", 1)
