@@ -37,11 +37,14 @@ FRAME = np.zeros((2, 2, 3), np.uint8)
 
 
 class SessionDriver:
-    """A trial of `count` members P0, P1 … who play left, right … Members in `vacant` places have not been found."""
+    """A trial of `count` members P0, P1 … who play left, right … Members in `vacant` places have not been found.
+
+    The data of members in `erased` places were erased.
+    """
 
     NAMES = ("left", "right", "third", "fourth")
 
-    def __init__(self, count=2, *, vacant=(), recorded=None, turns=None, answered=None, **section):
+    def __init__(self, count=2, *, vacant=(), erased=(), recorded=None, turns=None, answered=None, **section):
         self.names = self.NAMES[:count]
         section = {
             "game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, "players": dict.fromkeys(self.names, "human"),
@@ -50,7 +53,7 @@ class SessionDriver:
         sid = "s." + "0" * 20
         env = {"PROJECT_ID": "study", "USER_ID": "", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
         settings = TrialSettings.from_env({**env, "TLS": "off", "SESSION": sid, "TRIAL": json.dumps(section)})
-        places = {f"P{number}": name for number, name in enumerate(self.names) if name not in vacant}
+        places = {f"P{number}": name for number, name in enumerate(self.names) if name not in (*vacant, *erased)}
         members = tuple(Member(human, None, self.names.index(name)) for human, name in places.items())
         self.settings = replace(settings, members=members, players=count)
         self.places = places
@@ -67,7 +70,8 @@ class SessionDriver:
             Player(name, SPACE, (self.settings.trial.substitute or "idle") if name in vacant else "human")
             for name in self.names
         )
-        self.event("start", players, recorded, self.now, places=places, vacant=tuple(vacant), answered=answered)
+        seats = {"places": places, "vacant": tuple(vacant), "erased": tuple(erased)}
+        self.event("start", players, recorded, self.now, **seats, answered=answered)
         self.answer_calls()
 
     def view(self):

@@ -16,8 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from testing.exploration import examples
 from tests.trial.hippo_page import hippo_page
 from trial.core import messages
-from trial.core.controls import Controls
-from trial.core.message_log import FIELDS_KEPT, FIELDS_WAITING, MessageLog
+from trial.core.message_log import MessageLog
 from trial.recordings import recording
 from trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
 from trial.settings import TrialSettings
@@ -245,49 +244,6 @@ def test_fields_are_recorded_twenty_levels_deep(opened, closed):
 
     assert fields(20) is not None
     assert fields(21) is None
-
-
-def test_all_unknown_fields_of_a_trial_are_bounded():
-    log, message = MessageLog(), messages.Message(fields={"x": "y" * 900})
-    for _ in range(FIELDS_KEPT // 900 + 2):
-        log.add(message, 0)
-        last = log.messages[-1]
-        log.recorded(1, 0)
-    assert last == {"ns": 0, "fieldsDropped": 1}
-
-
-def test_unknown_fields_that_wait_for_a_line_of_the_recording_are_bounded():
-    log, message = MessageLog(), messages.Message(fields={"x": "y" * 900})
-    for _ in range(FIELDS_WAITING // 900 + 2):
-        log.add(message, 0)
-    assert len(json.dumps(log.messages)) < FIELDS_WAITING * 1.1
-    assert log.messages[-1] == {"ns": 0, "fieldsDropped": 1}
-    log.recorded(len(log.messages), 0)
-    log.add(message, 0)
-    assert "fields" in log.messages[0]
-
-
-def test_an_action_of_hippos_page_acts_until_the_next():
-    controls = Controls(("noop", "left", "right"), 1)
-    controls.keep("left")
-    assert [controls.take() for _ in range(3)] == [(1, True)] * 3
-    controls.forget_taps()
-    assert controls.take() == (1, True)
-    controls.keep("right")
-    assert [controls.take() for _ in range(2)] == [(2, True)] * 2
-    controls.keep("noop")
-    assert controls.take() == (0, False)
-    controls.keep("left")
-    controls.clear()
-    assert controls.take() == (0, False)
-
-
-def test_the_first_action_is_asked_for_where_no_action_is_called_noop():
-    controls = Controls(("left", "right"), 1)
-    controls.keep("left")
-    assert controls.take() == (0, True)
-    controls.keep("noop")
-    assert controls.take() == (0, False)
 
 
 # ---- who may play without a token

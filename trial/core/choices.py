@@ -187,7 +187,7 @@ class Choices:
 
     def asks(self, steps: int, now: float) -> Sequence[AskPolicy]:
         """Return the questions to policies that are due after `see`."""
-        return self.policies.asks(self._view, steps, now) if self._view is not None and self.policies else ()
+        return () if self._view is None else self.policies.asks(self._view, steps, now)
 
     def take_place(self, player: str, plays: str) -> None:
         """Let the policy `plays` choose this player's actions from now on, in the place of its human."""

@@ -103,7 +103,7 @@ def not_offered(message: Message, ui: Collection[str]) -> str | None:
     if command is not None and command not in ALWAYS_ALLOWED and command not in ui:
         return command
     if wish is not None:
-        control = messages.FRAME_RATE_CONTROLS.get(wish, "fpsSet") if isinstance(wish, str) else "fpsSet"
+        control = messages.FRAME_RATE_CONTROLS.get(str(wish), "fpsSet")
         if control not in ui:
             return control
     if name is not None and _COMBINED.fullmatch(name):

@@ -46,7 +46,7 @@ class Controls:
         self._lifespan = lifespan
         self._held: list[str] = []  # newest first
         self._tapped: list[str] = []  # pressed and released again between two steps
-        self._untaken: set[str] = set()  # held, but no step has taken them yet
+        self._untaken: set[str] = set()  # went down since the last step
         self._press: int | None = None
         self._press_left = 0.0
         self._keys = {
@@ -72,7 +72,7 @@ class Controls:
     def keep(self, name: str) -> None:
         """Choose an action that acts until another is chosen. NOOP and unknown names only end the earlier action."""
         self._press = self._index.get(name) if name != NOOP else None
-        self._press_left = math.inf if self._press is not None else 0
+        self._press_left = math.inf
 
     def press(self, name: str) -> None:
         """Choose an action by one press. It acts for `lifespan` steps (`single`: one), or until another is chosen."""
@@ -82,7 +82,7 @@ class Controls:
             return
         self.pressed_at = self.time
         self._press = index
-        self._press_left = self._lifespan if self._press is not None else 0
+        self._press_left = self._lifespan
 
     def hold(self, name: str) -> None:
         """Take a key that went down, and end a press that still acts."""
@@ -109,7 +109,6 @@ class Controls:
         if name not in self._untaken:
             self.pressed_at = self.time  # the other held keys choose the action from now on
         else:
-            self._untaken.discard(name)
             self._tapped.insert(0, name)
 
     def clear(self) -> None:

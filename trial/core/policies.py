@@ -176,6 +176,10 @@ class Policies:
         place.failures += 1
         return True
 
+    def plays(self, player: str) -> str:
+        """Return the policy that plays this player now, as `Player.plays` names it."""
+        return self._places[player].player.plays
+
     def idles(self, player: str) -> bool:
         """Whether the policy has failed `FAILURES` times in a row, and is not asked any more in this episode."""
         return self._places[player].idles

@@ -73,7 +73,7 @@ class TrialProgress:
         self.ended: list[Episode | Break] = []
         """The episodes and breaks that are over and not recorded yet, in order. The caller removes them."""
         self._failures = 0
-        self._good_episodes = 0
+        self._has_good_episode = False  # whether an episode has ended without a failure
 
     @property
     def several(self) -> bool:
@@ -96,13 +96,13 @@ class TrialProgress:
             self.episodes_played += episode.steps > 0
             self.total_steps += episode.steps
             self._add(self.scores, episode.scores or {self.first: episode.score})
-            self._good_episodes += episode.why != "failed"
+            self._has_good_episode |= episode.why != "failed"
             self.episode = episode.number + 1
         if ended and ended[-1].why in ("stopped", PARTNER_LEFT):
             self._end(ended[-1].why)
         elif self.episode > self.config.max_episodes:
             self.episode = self.config.max_episodes
-            self._end("finished" if self._good_episodes else "failed")
+            self._end("finished" if self._has_good_episode else "failed")
 
     def _add(self, scores: dict[str, float], more: Mapping[str, float]) -> None:
         for player, score in more.items():
@@ -179,7 +179,7 @@ class TrialProgress:
     def reset(self) -> None:
         """End this episode and begin the next. It changes nothing in a break, or before the episode's first step."""
         if not self.over and not self.on_break and self.steps > 0:
-            self._good_episodes += 1
+            self._has_good_episode = True
             self._end_episode("reset")
 
     def stop(self) -> None:
@@ -222,7 +222,7 @@ class TrialProgress:
     def turn_over(self) -> None:
         """Choose for the humans who have not chosen in the turn's time, or end the episode, as `turnEnds` says."""
         if self.choices.turn_over(self.steps):
-            self._good_episodes += 1
+            self._has_good_episode = True
             self._end_episode("turnSeconds")
 
     def to_act(self, player: str) -> bool:
@@ -243,7 +243,7 @@ class TrialProgress:
 
     def time_over(self) -> None:
         """End the episode because `episodeSeconds` are over, and no step is due that could be its last one."""
-        self._good_episodes += 1
+        self._has_good_episode = True
         self._end_episode("truncated", "episodeSeconds")
 
     def stepped(
@@ -260,7 +260,7 @@ class TrialProgress:
             episode_scores[player] += reward
         if terminated or truncated or limit is not None:
             self._failures = 0
-            self._good_episodes += 1
+            self._has_good_episode = True
             own = terminated or truncated
             self._end_episode("terminated" if terminated else "truncated", None if own else limit)
 
@@ -285,7 +285,7 @@ class TrialProgress:
     def _end_episode(self, why: str, limit: str | None = None) -> None:
         self._close_episode(why, limit)
         if self.episode >= self.config.max_episodes:
-            self._end("finished" if self._good_episodes else "failed")
+            self._end("finished" if self._has_good_episode else "failed")
             return
         if self.playing and self.config.between_seconds > 0:
             self.state = PlayState.BREAK

@@ -54,7 +54,7 @@ class Recordings:
 
     def policy_failed(self, progress: TrialProgress, player: str, words: str) -> None:
         """Write `words` about a policy that has failed to the log and the recording; the same words only once."""
-        plays = progress.players[player].plays
+        plays = progress.choices.policies.plays(player)
         texts = [f"the policy of {player} ({plays}) failed: {words}"]
         if progress.choices.policies.idles(player):
             texts.append(f"the policy of {player} failed {FAILURES} times in a row: it idles until the episode is over")

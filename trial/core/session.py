@@ -378,10 +378,9 @@ class TrialSession:
 
     def wake_at(self, now: float) -> float | None:
         """Return when to call `attend` again if nothing happens before; None if there is no need."""
-        progress = self._progress
-        if progress.over or self.settled:
+        if self.settled:
             return None
-        wake_at = self.presence.wake_at(now, on_break=progress.on_break)
+        wake_at = self.presence.wake_at(now, on_break=self._progress.on_break)
         return wake_at if wake_at < math.inf else None
 
     def session_version(self) -> Hashable:

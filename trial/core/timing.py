@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import Enum
+from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from protocol.trial import TrialSection
@@ -16,12 +16,11 @@ from trial.core.progress import TrialProgress
 
 
 class Due(Enum):
-    """What is due now. MORE: nothing for the caller to do, but the progress has changed, so ask again."""
+    """What is due now."""
 
-    NOTHING = "nothing"
-    MORE = "more"
-    RESET = "reset"
-    STEP = "step"
+    NOTHING = auto()
+    RESET = auto()
+    STEP = auto()
 
 
 class StateTimes(NamedTuple):
@@ -55,9 +54,8 @@ class Pacer:
             self._due = now
             return now
         self._due += interval
-        missed = int((now - self._due) / interval)
-        if missed > 0:  # whole intervals, so that the next frames are due at the same regular times as before
-            self._due += missed * interval
+        missed = max(0, int((now - self._due) / interval))
+        self._due += missed * interval  # whole intervals: the next frames are due at the same regular times as before
         return self._due
 
 
@@ -98,8 +96,11 @@ class Timing:
 
     # ---- what is due
 
-    def next(self, progress: TrialProgress, now: float) -> Due:
-        """Return what is due now. If NOTHING is due, `wake_at` says when to ask again."""
+    def next(self, progress: TrialProgress, now: float) -> Due | None:
+        """Return what is due now. If NOTHING is due, `wake_at` says when to ask again.
+
+        None: nothing for the caller to do, but the progress has changed, so ask again at once.
+        """
         self.wake_at = None
         playing = progress.playing
         if not playing:
@@ -132,18 +133,17 @@ class Timing:
         The time of a break runs from the first call in it.
         """
         if not progress.on_break:
-            self._break_began = None
             return None
         if self._break_began is None:
             self._break_began = now
         return max(0.0, self._break_began + self._between - now)
 
-    def _break_over(self, progress: TrialProgress, left: float, now: float) -> Due:
+    def _break_over(self, progress: TrialProgress, left: float, now: float) -> Due | None:
         if left > 0.0:
             self.wake_at = now + left if left < math.inf else None
             return Due.NOTHING
         progress.go_on()
-        return Due.MORE
+        return None
 
     def _frozen(self, progress: TrialProgress, now: float) -> bool:
         """Return whether the first picture is still to be shown. If not, count the time from now on as played."""
@@ -169,7 +169,7 @@ class Timing:
         self._due = None
         return Due.STEP
 
-    def _turn_over(self, progress: TrialProgress, now: float) -> Due:
+    def _turn_over(self, progress: TrialProgress, now: float) -> Due | None:
         """Turn by turn: return STEP once all have chosen and the last picture was shown for one frame's time."""
         turns, choices = progress.turns, progress.choices
         assert turns is not None
@@ -178,12 +178,12 @@ class Timing:
         ends_in = turns.ends_in(now) if choices.waits_for else None
         if ends_in is not None and ends_in <= 0.0:
             progress.turn_over()
-            return Due.MORE
+            return None
         if turns.waiting:
             left = self._episode.left(now)
             if left is not None and left <= 0.0:
                 progress.time_over()
-                return Due.MORE
+                return None
             ends = (choices.policies_until(), *(None if each is None else now + each for each in (left, ends_in)))
             self.wake_at = min((each for each in ends if each is not None), default=None)
             return Due.NOTHING

@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from enum import Enum
+from enum import Enum, auto
 from typing import Any, Literal
 
 from trial.core import messages, records
@@ -82,15 +82,18 @@ TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you h
 class Phase(Enum):
     """The phases of a trial, which the module's docstring explains."""
 
-    STARTING = "starting"
-    PLAYING = "playing"
-    SAVING = "saving"
-    FINISHED = "finished"
-    CLOSED = "closed"
+    STARTING = auto()
+    PLAYING = auto()
+    SAVING = auto()
+    FINISHED = auto()
+    CLOSED = auto()
 
 
 class Trial:
     """Decides everything about the trial of one game step. The module's docstring lists events, effects and phases."""
+
+    _now: float
+    """The time of the present event, which sets it first if anything reads it."""
 
     def __init__(
         self,
@@ -114,7 +117,6 @@ class Trial:
         self.wake_at: float | None = None
         """The time at which the shell must call `advance` if no other event comes before; None if it need not."""
         self.progress = TrialProgress(self.config, alone(self.config.action_space or ("noop",)))
-        self._now = 0.0
         self._effects: list[Effect] = []
         self._emit = self._effects.append
         self._messages = MessageLog()
@@ -266,7 +268,6 @@ class Trial:
 
     def round_trip(self, human: str, seconds: float, now: float) -> list[Effect]:
         """Take a sample of a human's round trip, in seconds, which their browser's answer to a ping has measured."""
-        self._now = now
         if self.phase is not Phase.PLAYING:
             return []
         self._participants.round_trip(self._participants.place_of(human), seconds, now)
@@ -274,7 +275,6 @@ class Trial:
 
     def receive(self, connection: Hashable, message: messages.Message, now: float) -> list[Effect]:
         """Carry out a client's message. It changes nothing if another connection has replaced this one."""
-        self._now = now
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
             return []
@@ -338,7 +338,6 @@ class Trial:
 
     def policy_acted(self, player: str, ask_id: int, action: Any, now: float) -> list[Effect]:
         """Take the action that the player's policy has chosen. An answer to an earlier question changes nothing."""
-        self._now = now
         problem = self.progress.choices.policies.acted(player, ask_id, action)
         if problem is not None:
             self._recording.policy_failed(self.progress, player, problem)
@@ -347,7 +346,6 @@ class Trial:
 
     def policy_failed(self, player: str, ask_id: int, error: Exception, now: float) -> list[Effect]:
         """Go on after the player's policy has raised this error."""
-        self._now = now
         if self.progress.choices.policies.failed(player, ask_id):
             self._recording.policy_failed(self.progress, player, words_of(error))
         return self.advance(now)
@@ -363,14 +361,12 @@ class Trial:
 
     def recording_failed(self, now: float) -> list[Effect]:
         """End the game, since its recording cannot be opened and every game must be recorded."""
-        self._now = now
         self._recording.failed()
         self._fail(fatal=True)
         return self.advance(now)
 
     def answer_saved(self, now: float) -> list[Effect]:
         """Finish the trial, since all recordings and answers are stored, or close it if it has no answer."""
-        self._now = now
         if not self.progress.over or self.broken:
             self.phase = Phase.CLOSED
             return []
@@ -383,7 +379,6 @@ class Trial:
 
     def member_saved(self, human: str, now: float) -> list[Effect]:
         """Let a member whose answer is stored go on to the next step, even if the others still play."""
-        self._now = now
         self._participants.saved(human)
         client = self._clients.by_human.get(human)
         if client is not None and not self.finished:
@@ -428,7 +423,8 @@ class Trial:
         if self.phase is Phase.PLAYING:
             return self._play()
         if self.phase is Phase.SAVING and not self._ending.all_written:
-            return self._write_last_lines()
+            self._write_last_lines()
+            return True
         return False
 
     def _play(self) -> bool:
@@ -438,7 +434,8 @@ class Trial:
             if self._commands.waiting:
                 self._commands.carry_out_waiting(progress, self._participants, self._timing)
             if progress.ended:
-                return self._write_end()
+                self._write_end()
+                return True
         if progress.over or closing:
             self.phase = Phase.SAVING
             self.ready = True
@@ -449,11 +446,9 @@ class Trial:
             if stalled is None:
                 self.wake_at = self._now + LOOK_AGAIN
                 return False
-            if self._paused_by(stalled):
-                return True
-            self._agent.make(self._steps.take(progress, self._now))
-            return False
-        if due is Due.RESET:
+            if not self._paused_by(stalled):
+                self._agent.make(self._steps.take(progress, self._now))
+        elif due is Due.RESET:
             call = self._beginning.begin(progress, self._participants)
             if call is not None:
                 self._agent.make(call)
@@ -477,21 +472,20 @@ class Trial:
             self._note("stopped answering", client)
         return bool(newly)
 
-    def _write_end(self) -> bool:
+    def _write_end(self) -> None:
         """Record the end of an episode or a break, after a last call that gives the agent the feedback before it."""
         call = self._ending.last_feedback(self.progress)
         if (call.feedback or self.callbacks) and not self._agent.hangs:
             self._agent.make(call)
-            return False
-        self._ending.record(call, self.progress, self._participants)
-        return True
+        else:
+            self._ending.record(call, self.progress, self._participants)
 
-    def _write_last_lines(self) -> bool:
+    def _write_last_lines(self) -> None:
         self._ending.shut_down_break(self.progress)
         if self.progress.ended:
-            return self._write_end()
-        self._ending.write_last(self.progress, self._participants, broken=self.broken)
-        return False
+            self._write_end()
+        else:
+            self._ending.write_last(self.progress, self._participants, broken=self.broken)
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)

@@ -61,7 +61,7 @@ def as_frame(picture: Any) -> Frame:
         raise FrameError(f"render() must return height x width x 3 bytes, not {array.shape}")
     if height * width > LARGEST:
         raise FrameError(f"render() returned {width} x {height} pixels; browsers are shown {LARGEST} at most")
-    return np.array(array, dtype=np.uint8, order="C", copy=True)
+    return array.copy()  # contiguous, however the environment has stored it
 
 
 def header(kind: int, frame: Frame, frame_id: int) -> bytes:
@@ -144,8 +144,8 @@ class Decoder:
         (first,) = FIRST_ROW.unpack_from(body)
         if first not in (0, before):
             raise FrameError("rows are missing")
-        height, width, channels = shape
-        rows = _inflated(body[FIRST_ROW.size :], (-1, width, channels), most=height - first)
+        height = shape[0]
+        rows = _inflated(body[FIRST_ROW.size :], shape, most=height - first)
         shown = self._shown.copy()
         self._rows = first + len(rows)
         shown[first : self._rows] = rows

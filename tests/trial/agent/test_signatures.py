@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import textwrap
-from collections import UserDict
 from pathlib import Path
 from typing import Any
 
@@ -365,31 +364,6 @@ def test_an_info_that_the_game_changes_afterwards_stays_as_it_was(tmp_path: Path
     expected: dict[str, Any] = {"game.steps": [1, 2, 3], "[game.steps]": [[1], [2], [3]]}
     expected |= {"{'x': (game.steps,)}": [{"x": [1]}, {"x": [2]}, {"x": [3]}], "numpy.int64(game.steps)": [1, 2, 3]}
     assert [json.loads(text_of_line(line))["info"]["lives"] for line in lines] == expected[value]
-
-
-SETTLED: list[Any] = [
-    {},
-    {"lives": 3, "level": 0.5, "over": False, "who": None, "name": "x" * 1_000},
-    {2**63: -(2**63)},
-]
-UNSETTLED: list[Any] = [
-    {"a": []},
-    {"a": {}},
-    {"a": np.float32(1)},
-    {"a": "x" * 1_001},
-    {"x" * 1_001: 1},
-    {"a": 2**63 + 1},
-    {(1, 2): 1},
-    dict.fromkeys(range(101)),
-    UserDict(a=1),
-]
-
-
-def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written() -> None:
-    assert [recording.is_settled(info) for info in (*SETTLED, *UNSETTLED)] == [True] * 3 + [False] * len(UNSETTLED)
-    for info in SETTLED:
-        fields = {"step": 1, "info": info, "reward": float("nan")}
-        assert recording.LaterLine("step", fields).text() == recording.line("step", **fields)
 
 
 def test_a_dict_that_contains_itself_is_recorded(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The decisions of a trial, event by event: the test gives the core events and times, and checks the effects it returns."""
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +29,11 @@ from trial.core.effects import (
     SendState,
     StepCall,
     StepTaken,
+    TellMoved,
     WriteLine,
     WriteLog,
 )
-from trial.core.ended import Episode
+from trial.core.ended import Break, Episode
 from trial.core.flow_control import Window
 from trial.core.message_log import Word
 from trial.core.players import PLAYER, alone
@@ -49,11 +51,11 @@ FRAME = np.zeros((2, 2, 3), np.uint8)
 class Driver:
     """Drives a trial by hand, with an agent that answers when a test tells it to, and a clock that the test sets."""
 
-    def __init__(self, **section):
+    def __init__(self, *, assets=(), **section):
         section = {"game": "grid", "betweenEpisodes": 0, "ui": UI, "startingFrameRate": 10, **section}
         env = {"PROJECT_ID": "study", "USER_ID": "P1", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x"}
         settings = TrialSettings.from_env({**env, "TLS": "off", "TRIAL": json.dumps(section)})
-        self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7)
+        self.trial = Trial(settings, "3", trial_id="the-trial", new_seed=lambda: 7, assets=assets)
         self.now = 100.0
         self.effects = []
         self.all = []
@@ -138,6 +140,18 @@ def test_the_core_imports_nothing_that_waits_or_tells_the_time():
         assert names <= allowed, module
 
 
+def test_a_trial_begins_with_its_step_and_its_id_and_is_neither_ready_nor_over():
+    trial = Driver().trial
+    assert (trial.step, trial.id, trial.phase) == ("3", "the-trial", Phase.STARTING)
+    assert (trial.ready, trial.done, trial.saving, trial.broken, trial.wake_at) == (False, False, False, False, None)
+    assert not trial.callbacks
+
+
+@pytest.mark.parametrize(("section", "names"), [({"actionSpace": ["left", "Up"]}, ("left", "up")), ({}, ("noop",))])
+def test_before_the_agent_has_started_a_program_is_told_the_actions_that_the_project_names(section, names):
+    assert Driver(**section).trial.progress.choices.action_space_of(None) == names
+
+
 # ---- the first frame
 
 
@@ -175,7 +189,7 @@ def test_an_agent_that_does_not_start_leaves_no_answer():
 def test_a_game_step_that_an_earlier_server_has_answered_is_done_at_once():
     driver = Driver()
     driver.event("already_played", {"episodes": 2, "score": 340})
-    assert driver.trial.finished
+    assert (driver.trial.finished, driver.trial.ready) == (True, True)
     assert driver.connect() == [SendDone("tab", 2, 340)]
 
 
@@ -183,6 +197,38 @@ def test_a_client_that_comes_after_a_game_has_failed_is_told_so_with_the_end():
     driver = Driver()
     driver.event("already_played", {"episodes": 2, "score": 340, "outcome": "failed"})
     assert driver.connect() == [SendDone("tab", 2, 340, words=TRIAL_FAILED)]
+
+
+def test_an_agent_that_fails_to_start_a_second_time_changes_nothing():
+    driver = Driver().playing()
+    assert driver.event("agent_failed", driver.now) == []
+    assert driver.trial.progress.playing
+
+
+def test_a_game_begins_once():
+    driver = Driver().playing()
+    driver.step()
+    assert driver.event("start", alone(SPACE), None, driver.now) == []
+    assert driver.trial.progress.steps == 1
+
+
+def test_the_calls_of_the_agent_may_take_as_long_as_the_settings_say():
+    driver = Driver().playing()
+    limits = [(type(effect), effect.limit) for effect in driver.all if isinstance(effect, Call)]
+    assert limits == [(ResetCall, 30), (StepCall, 30)]
+    driver.say(command="good")
+    driver.step(terminated=True)
+    assert (type(driver.call), driver.call.limit) == (FeedbackCall, 30)
+    driver = Driver().begin(recorded(STEPS))
+    assert (type(driver.call), driver.call.limit) == (ReplayCall, 300)
+
+
+def test_each_episode_has_the_seed_after_that_of_the_episode_before():
+    driver = Driver(seed=40, maxEpisodes=3).playing()
+    for _ in range(2):
+        driver.step(terminated=True)
+        driver.reset()
+    assert [effect.seed for effect in driver.all if isinstance(effect, ResetCall)] == [40, 41, 42]
 
 
 # ---- clients
@@ -298,6 +344,56 @@ def test_the_state_is_sent_when_it_changes_and_not_before():
     assert state["state"] == "paused"
 
 
+def test_the_words_of_the_project_are_told_and_those_that_are_actions_are_not():
+    driver = Driver(ui={**UI, "wellDone": True, "hop": True})
+    driver.event("start", alone(("noop", "hop")), None, driver.now)
+    driver.reset()
+    assert sent(driver.connect())[0]["words"] == ["wellDone"]
+
+
+def test_a_round_trip_of_the_only_participant_changes_nothing():
+    driver = Driver()
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
+    driver.playing()
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
+    driver.event("close", driver.now)
+    driver.wait(2)
+    assert driver.event("round_trip", "P1", 9.0, driver.now) == []
+
+
+def test_the_controls_of_a_game_that_is_drawn_by_objects_hold_its_scene_and_its_images():
+    assets = [{"name": "ball.png", "size": 3}]
+    driver = Driver(assets=assets, scene={"width": 3, "height": 2}).begin()
+    driver.reset()
+    told = sent(driver.connect())[0]
+    assert (told["scene"]["width"], told["scene"]["height"], told["assets"]) == (3, 2, assets)
+    assert "assets" not in told["scene"]
+    plain = Driver(assets=assets).begin()
+    plain.reset()
+    assert {"scene", "assets"}.isdisjoint(sent(plain.connect())[0])
+
+
+def test_each_player_is_shown_their_own_picture_if_there_is_one():
+    driver = Driver().begin()
+    other = np.ones((2, 2, 3), np.uint8)
+    driver.returns(Begun(b"reset", {PLAYER: other, "player_1": FRAME}))
+    assert [frame.picture for frame in driver.connect() if isinstance(frame, SendPicture)] == [other]
+    driver.say(command="start")
+    driver.returns(StepTaken({PLAYER: 1.0}, False, False, {"player_1": FRAME}, b"step"))
+    assert driver.of(SendPicture) == []
+
+
+def test_the_ids_of_frames_count_up():
+    driver = Driver().playing()
+    ids = []
+    for _ in range(3):
+        driver.step()
+        ids += [frame.frame_id for frame in driver.of(SendPicture)]
+        driver.wait(0.1)
+    assert ids == [2, 3, 4]
+    assert [frame.frame_id for frame in driver.connect("other tab") if isinstance(frame, SendPicture)] == [4]
+
+
 # ---- steps
 
 
@@ -381,6 +477,102 @@ def test_reset_waits_for_the_end_of_the_step():
     assert (end["episode"], end["steps"], end["why"]) == (1, 2, "reset")
 
 
+def test_a_refused_message_is_not_recorded_and_one_that_is_not_possible_now_is():
+    driver = Driver(ui={"start": True}).playing()
+    driver.say(command="stop")
+    driver.say(changeFrameRate=20)
+    driver.say(action="jump")
+    driver.step()
+    driver.wait(0.1)
+    said = [message for message in driver.call.fields["messages"] if "event" not in message]
+    assert said == [{"ns": 100_000_000_000, "action": "jump"}]
+
+
+def test_one_message_may_hold_a_command_a_frame_rate_and_an_action():
+    driver = Driver(allowFrameRateChange=True).begin()
+    driver.reset()
+    driver.connect()
+    driver.say(command="start", action="up", held=True, changeFrameRate="faster")
+    assert driver.trial.progress.playing
+    assert driver.call.actions[PLAYER].name == "up"
+    assert sent(driver.effects, SendState)[-1]["frameRate"] == 15
+    assert driver.of(SendState)[-1].frame_rate == 15
+
+
+def test_a_client_that_asks_is_told_the_controls_again():
+    driver = Driver(allowFrameRateChange=True).playing()
+    driver.step()
+    (told,) = sent(driver.say(command="requestUI"))
+    assert (told["state"], told["score"], told["episodeScore"]) == ("playing", 1, 1)
+    assert (told["frameRate"], told["allowFrameRateChange"], told["actionSpace"]) == (10, True, list(SPACE))
+    assert (told["episode"], told["maxEpisodes"], told["UI"]) == (1, 20, list(driver.trial.config.ui.shown()))
+
+
+def test_a_reset_and_a_stop_are_carried_out_once_after_the_step_and_in_their_order():
+    driver = Driver().playing()
+    driver.step()
+    driver.wait(0.1)
+    for command in ("reset", "reset", "stop", "stop"):
+        assert driver.say(command=command) == []
+    driver.step()
+    assert [(end["episode"], end["steps"], end["why"]) for end in driver.records("end")] == [
+        (1, 2, "reset"),
+        (2, 0, "stopped"),
+    ]
+    assert driver.of(SaveAnswer)[0].answers["outcome"] == "stopped"
+
+
+def test_the_first_step_after_a_reset_is_due_one_frame_later_than_the_step_that_was_not_taken():
+    driver = Driver().playing()
+    driver.step()
+    driver.now += 0.05
+    driver.say(command="reset")
+    driver.reset()
+    assert driver.trial.wake_at == pytest.approx(100.2)
+
+
+def test_the_rhythm_follows_the_frame_rate_that_a_client_chooses():
+    driver = Driver(allowFrameRateChange=True).playing()
+    driver.say(changeFrameRate="faster")
+    driver.step()
+    assert driver.trial.wake_at == pytest.approx(100 + 1 / 15)
+
+
+def test_a_client_that_may_be_stalled_is_looked_at_again_a_tenth_of_a_second_later():
+    driver, window = second_frame_under_way()
+    driver.wait(STALLED_SECONDS)
+    driver.now += 1
+    driver.step()
+    assert driver.trial.wake_at == pytest.approx(driver.now + 0.1)
+    driver.wait(0.11)
+    assert driver.trial.progress.state is PlayState.PAUSED
+    window.acknowledged(2, driver.now)
+    driver.say(command="start")
+    (call,) = driver.of(StepCall)
+    assert [message.get("event") for message in call.fields["messages"]] == ["stopped answering", None]
+
+
+def test_the_line_of_the_first_step_says_who_has_connected_and_left():
+    driver = Driver().begin()
+    driver.reset()
+    driver.connect()
+    driver.now += 1
+    driver.connect("other tab")
+    driver.now += 1
+    driver.event("disconnect", "other tab", driver.now)
+    driver.now += 1
+    driver.connect()
+    driver.say(command="start")
+    assert [(message["ns"] // 10**9, message.get("event")) for message in driver.call.fields["messages"]] == [
+        (100, "connected"),
+        (101, "disconnected"),
+        (101, "connected"),
+        (102, "disconnected"),
+        (103, "connected"),
+        (103, None),
+    ]
+
+
 # ---- episodes and the end
 
 
@@ -429,6 +621,31 @@ def test_each_episode_has_its_file_and_a_break_belongs_to_the_one_before():
     assert kinds == [RecordLine, CloseRecording, OpenRecording, ResetCall]
 
 
+def test_all_episodes_of_a_trial_may_have_one_file():
+    driver = Driver(dataFile="trial", maxEpisodes=2, betweenEpisodes=3).playing()
+    driver.step(terminated=True)
+    driver.wait(3)
+    driver.reset()
+    driver.step(terminated=True)
+    kinds = [type(effect) for effect in driver.all]
+    assert (kinds.count(OpenRecording), kinds.count(CloseRecording)) == (1, 1)
+    assert kinds.index(CloseRecording) == kinds.index(SaveAnswer) - 1
+
+
+def test_what_is_said_while_the_agent_hears_the_last_feedback_belongs_to_the_next_episode():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    driver.say(command="bad")
+    driver.returns()
+    (end,) = driver.records("end")
+    assert [message["command"] for message in end["messages"]] == ["good"]
+    driver.reset()
+    driver.wait(0.1)
+    assert [message["command"] for message in driver.call.fields["messages"]] == ["bad"]
+    assert driver.call.feedback == (Word("bad"),)
+
+
 def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
     driver = Driver(maxEpisodes=1).playing()
     driver.say(command="good")  # the step is under way
@@ -441,7 +658,153 @@ def test_feedback_after_the_last_step_is_heard_before_the_episode_ends():
     assert [message.get("command") for message in end["messages"]] == ["good"]
 
 
+def test_a_trial_is_played_when_its_last_line_is_written_and_finished_when_its_answer_is_stored():
+    driver = Driver(maxEpisodes=1).playing()
+    trial = driver.trial
+    driver.say(command="good")
+    assert (trial.played, trial.saving, trial.finished) == (False, False, False)
+    driver.step(terminated=True)
+    assert (trial.played, trial.saving, trial.finished) == (False, True, False), "the agent hears the last feedback"
+    driver.returns()
+    assert (trial.played, trial.saving, trial.finished) == (True, True, False)
+    driver.event("answer_saved", driver.now)
+    assert (trial.played, trial.saving, trial.finished) == (True, False, True)
+    assert trial.done
+    driver = Driver()
+    driver.event("already_played", {})
+    assert driver.trial.played
+
+
+def test_a_trial_that_is_closed_is_not_played():
+    driver = Driver().playing()
+    driver.step()
+    driver.event("close", driver.now)
+    assert not driver.trial.played
+
+
+def test_the_log_says_how_a_trial_has_ended():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.step(terminated=True)
+    assert driver.event("answer_saved", driver.now)[0] == WriteLog(
+        logging.INFO, "trial over: finished after 1 episodes"
+    )
+
+
+def test_a_game_that_is_over_refuses_feedback_and_ignores_commands():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.step(terminated=True)
+    words = "the game is over, and no command has an effect any more"
+    assert sent(driver.say(command="good")) == [{"error": words}]
+    assert driver.say(command="stop") == driver.say(command="start") == []
+
+
+def test_a_client_that_comes_after_the_end_is_sent_on_at_once():
+    driver = Driver(maxEpisodes=1).playing()
+    driver.step(reward=3.0, terminated=True)
+    driver.event("answer_saved", driver.now)
+    assert driver.connect("phone", player="P2") == [SendDone("phone", 1, 3.0)]
+
+
+# ---- the agent's callbacks
+
+
+def with_callbacks(**section):
+    driver = Driver(**section).begin()
+    driver.trial.callbacks = True
+    driver.reset()
+    return driver
+
+
+def test_callbacks_hear_that_a_participant_comes_leaves_and_returns():
+    driver = with_callbacks()
+    driver.connect()
+    assert driver.of(TellMoved) == [TellMoved("on_join", PLAYER)]
+    driver.connect("other tab")
+    assert driver.of(TellMoved) == [TellMoved("on_leave", PLAYER), TellMoved("on_return", PLAYER)]
+    driver.event("disconnect", "other tab", driver.now)
+    assert driver.of(TellMoved) == [TellMoved("on_leave", PLAYER)]
+    driver.trial.callbacks = False
+    driver.connect()
+    assert driver.of(TellMoved) == []
+
+
+def test_callbacks_hear_of_each_episode_and_break_that_is_over_and_which_is_the_last():
+    driver = with_callbacks(betweenEpisodes=3, maxEpisodes=2)
+    driver.connect()
+    driver.say(command="start")
+    told = []
+    for _ in range(2):
+        driver.step(terminated=True)
+        told.append((driver.call.over, driver.call.last))
+        assert driver.returns(), "nothing else happens meanwhile"
+        if not driver.trial.progress.over:
+            driver.wait(3)
+            told.append((driver.call.over, driver.call.last))
+            driver.returns()
+            driver.reset()
+    episodes = [Episode(number, 1, 1.0, "terminated") for number in (1, 2)]
+    assert told == [(episodes[0], False), (Break(1, "over"), False), (episodes[1], True)]
+    assert driver.of(SaveAnswer)
+
+
+def test_callbacks_hear_nothing_any_more_of_a_game_that_is_over_or_an_agent_that_hangs():
+    driver = with_callbacks()
+    driver.connect()
+    driver.say(command="start")
+    driver.fails(AgentTimeout("no answer within 30 s"))
+    driver.connect("other tab")
+    assert driver.of(TellMoved) == []
+    driver = with_callbacks(maxEpisodes=1)
+    driver.connect()
+    driver.say(command="start")
+    driver.step(terminated=True)
+    driver.returns()
+    driver.connect("other tab")
+    assert driver.of(TellMoved) == []
+
+
 # ---- what fails
+
+
+def test_an_error_in_the_last_feedback_is_recorded_with_its_episode_and_the_game_goes_on():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    error = ValueError("no ears")
+    effects = driver.fails(error)
+    assert LogAgentError(error) in effects
+    assert driver.records("error") == [{"episode": 1, "step": 0, "error": "ValueError: no ears"}]
+    assert [over["why"] for over in driver.records("end")] == ["terminated"]
+    assert sent(effects) == []
+    assert isinstance(driver.call, ResetCall)
+
+
+def test_a_reset_that_fails_is_tried_again_and_the_third_failure_ends_the_trial():
+    driver = Driver().begin()
+    driver.connect()
+    for _ in range(2):
+        driver.fails(ValueError("no level"))
+        assert isinstance(driver.call, ResetCall)
+        assert not driver.trial.progress.over
+    driver.fails(ValueError("no level"))
+    assert driver.trial.progress.outcome == "failed"
+    assert driver.of(SaveAnswer) == [SaveAnswer(None)], "no one has seen a picture"
+    assert [error["step"] for error in driver.records("error")] == [0, 0, 0]
+
+
+def test_an_error_is_recorded_with_its_notes():
+    driver = Driver().playing()
+    error = ValueError("oops")
+    error.add_note("in level 3")
+    driver.fails(error)
+    assert driver.records("error")[0]["error"] == "ValueError: oops\nin level 3"
+
+
+def test_an_error_is_recorded_with_two_thousand_characters_at_most():
+    driver = Driver().playing()
+    driver.fails(ValueError("x" * 5000))
+    (error,) = driver.records("error")
+    assert error["error"] == "ValueError: " + "x" * (2000 - len("ValueError: "))
 
 
 def test_an_error_of_the_agent_ends_the_episode_and_the_next_begins():
@@ -484,7 +847,9 @@ def test_a_call_that_comes_back_after_its_time_changes_nothing():
     late = driver.call
     driver.fails(AgentTimeout("no answer within 30 s"))
     assert driver.event("call_returned", late, StepTaken({PLAYER: 5.0}, False, False, FRAME, b"late"), driver.now) == []
+    assert driver.event("call_failed", late, ValueError("late"), driver.now) == []
     assert driver.trial.progress.score == 0
+    assert len(driver.records("error")) == 1
 
 
 def test_feedback_that_the_agent_has_heard_is_not_told_again_after_an_error():
@@ -514,11 +879,15 @@ def test_an_episode_of_an_earlier_server_is_replayed_and_goes_on():
     driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
     assert isinstance(driver.call, ReplayCall)
     assert driver.call.unfinished.seed == 11
+    assert not driver.trial.ready
+    driver.now += 5
     driver.returns(Replayed(FRAME))
+    assert driver.trial.ready
     assert driver.records("resume") == [{"episode": 2, "steps": 2}]
     driver.connect()
     driver.say(command="start")
     assert driver.call.feedback == (Word("good"),), "the earlier agent did not hear it"
+    assert driver.call.fields["messages"][0] == {"ns": 105_000_000_000, "command": "good", "again": True}
     assert driver.call.fields["step"] == 3
     assert driver.trial.progress.score == 4.5
 
@@ -533,6 +902,70 @@ def test_an_episode_whose_replay_differs_begins_again_with_its_seed():
     assert controls["episode"] == 2
     assert "begins again" in words["error"]
     assert driver.records("error") == []
+
+
+def test_the_seconds_that_were_played_on_an_earlier_server_count():
+    driver = Driver(maxEpisodes=2).begin(recorded(STEPS))
+    driver.returns(Replayed(FRAME))
+    driver.connect()
+    driver.say(command="start")
+    driver.step()
+    driver.wait(0.10468)
+    driver.step(terminated=True)
+    (answer,) = driver.of(SaveAnswer)
+    assert (answer.answers["seconds"], answer.answers["frames"], answer.answers["episodes"]) == (4.205, 9, 2)
+
+
+def test_the_time_of_an_episode_goes_on_after_the_steps_of_an_earlier_server():
+    driver = Driver(episodeSeconds=1).begin(recorded(STEPS))
+    driver.returns(Replayed(FRAME))
+    driver.connect()
+    driver.say(command="start")
+    assert sent(driver.all, SendState)[-1]["timeLeft"] == pytest.approx(0.8), "two steps, a tenth of a second each"
+
+
+def test_a_replay_that_hangs_ends_the_trial_and_its_last_line_has_the_feedback_that_was_not_heard():
+    driver = Driver().begin(recorded(STEPS, unheard=[Word("good")]))
+    driver.connect()
+    driver.now += 300
+    driver.fails(AgentTimeout("no answer within 300 s"))
+    assert driver.trial.progress.outcome == "failed"
+    assert driver.records("resume") == []
+    (end,) = driver.records("end")
+    assert [message for message in end["messages"] if "command" in message] == [
+        {"ns": 400_000_000_000, "command": "good", "again": True}
+    ]
+
+
+def test_feedback_that_was_not_heard_before_the_first_step_is_heard_at_it():
+    driver = Driver()
+    driver.trial.start(alone(SPACE), recorded([], unheard=[Word("good")]), driver.now)
+    driver.now += 5
+    driver.event("recording_opened", driver.now)
+    driver.reset()
+    driver.connect()
+    driver.say(command="start")
+    assert driver.call.feedback == (Word("good"),)
+    assert driver.call.fields["messages"][0] == {"ns": 105_000_000_000, "command": "good", "again": True}
+
+
+def test_an_episode_of_an_earlier_server_without_a_seed_begins_with_a_new_one():
+    driver = Driver().begin(RecordedTrial(unfinished=UnfinishedEpisode(1, None)))
+    assert isinstance(driver.call, ResetCall)
+    assert driver.call.seed == 7
+
+
+def test_only_who_comes_before_its_first_step_is_told_that_an_episode_begins_again():
+    driver = Driver().begin(recorded(STEPS))
+    driver.fails(ValueError("it plays differently now"))
+    driver.reset()
+    assert len(sent(driver.connect())) == 2
+    driver.say(command="start")
+    driver.step()
+    assert len(sent(driver.connect("other tab"))) == 1
+    driver = Driver().playing()
+    driver.step(terminated=True)
+    assert len(sent(driver.connect("other tab"))) == 1, "it has begun here"
 
 
 # ---- the server must end
@@ -580,6 +1013,7 @@ def test_what_a_client_does_while_a_break_is_closed_does_not_end_it_again(last):
     driver.say(command="good")
     driver.event("close", driver.now)
     assert isinstance(driver.call, FeedbackCall), "the agent hears it before the server ends"
+    assert driver.call.limit == 2, "if it is quick"
     if last == "start":
         driver.say(command="start")
     else:
@@ -587,6 +1021,20 @@ def test_what_a_client_does_while_a_break_is_closed_does_not_end_it_again(last):
     driver.returns()
     assert [over["why"] for over in driver.records("break")] == ["shutdown"]
     assert len(driver.records("end")) == 1
+
+
+def test_an_agent_that_does_not_hear_the_last_feedback_in_time_is_called_no_more():
+    driver = Driver().playing()
+    driver.say(command="good")
+    driver.step(terminated=True)
+    late = driver.call
+    driver.event("close", driver.now)
+    assert driver.trial.wake_at == driver.now + 2
+    effects = driver.wait(2)
+    assert driver.of(Call) == []
+    assert driver.records("end")[0]["why"] == "terminated"
+    assert effects[-1] == SaveAnswer(None)
+    assert driver.event("call_returned", late, None, driver.now) == []
 
 
 def test_closing_while_the_answer_is_stored_changes_nothing():

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trial.core.clients import Client
 from trial.core.flow_control import Window
 from trial.settings import STALLED_SECONDS
 
@@ -36,6 +37,20 @@ def send_until_it_must_wait(window: Window, rate: int, first: int, now: float) -
         window.sent(number, now)
         number += 1
     return number - first
+
+
+def test_a_client_is_stalled_if_two_looks_a_tenth_of_a_second_apart_find_it_so():
+    window = Window()
+    client = Client("tab", window, "player_0")
+    window.sent(1, -10.0)
+    window.acknowledged(1, -9.9)
+    window.sent(2, -9.0)
+    window.sent(3, -9.0)
+    assert [client.stalled(now) for now in (0.0, 0.05, 0.1)] == [None, None, True]
+    window.acknowledged(2, 0.1)
+    assert [client.stalled(now) for now in (1.0, 1.2)] == [None, True], "it has acknowledged one since"
+    window.acknowledged(3, 1.2)
+    assert client.stalled(1.3) is False
 
 
 def test_a_client_that_acknowledges_two_frames_at_once_may_have_one_more_under_way():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.trial.core.test_decisions import Driver
 from trial.core import messages
-from trial.core.controls import KEY, PRESSES, Controls
+from trial.core.controls import KEY, Controls
 from trial.core.effects import RecordLine, SendMessage, SendState, StepCall
 from trial.core.ended import Episode
 from trial.core.episode_time import EpisodeTime
@@ -48,6 +48,13 @@ def test_keys_that_are_held_together_take_their_action_in_any_order_and_one_of_t
     these.release(KEY + "ArrowUp")
     assert actions_of(these) == ["left"]
     these.hold(KEY + "ArrowUp")
+    assert actions_of(these) == ["leftup"]
+
+
+def test_keys_that_belong_to_no_combination_do_not_keep_others_from_one():
+    these = controls()
+    for key in ("ArrowUp", " ", "ArrowLeft"):
+        these.hold(KEY + key)
     assert actions_of(these) == ["leftup"]
 
 
@@ -96,10 +103,10 @@ def test_with_single_a_press_is_one_action_also_while_the_key_is_held():
 
 def test_with_single_no_press_is_lost_up_to_a_few():
     these = controls(single=True)
-    for _ in range(PRESSES + 3):
+    for _ in range(7):
         these.press("jump")
     these.press(KEY + "a")
-    assert actions_of(these, PRESSES + 2) == ["jump"] * PRESSES + ["noop"] * 2
+    assert actions_of(these, 6) == ["jump"] * 4 + ["noop"] * 2
 
 
 def test_with_single_the_action_is_that_of_the_keys_that_are_held_when_a_key_goes_down():
@@ -259,6 +266,25 @@ def test_an_episode_is_truncated_after_its_seconds_of_play_and_pauses_do_not_cou
         (12, "truncated", "episodeSeconds")
     ]
     assert driver.trial.progress.episode == 2
+
+
+@pytest.mark.parametrize(("left", "limit"), [(0.06, None), (0.04, "episodeSeconds")])
+def test_the_step_less_than_half_a_frame_before_the_limit_is_the_last_one(left, limit):
+    driver = Driver(episodeSeconds=2, startingFrameRate=10).playing()
+    driver.step()
+    driver.wait(2 - left)
+    assert driver.call.truncated_by == limit
+
+
+def test_in_a_break_no_time_of_an_episode_is_told():
+    driver = Driver(episodeSeconds=9, betweenEpisodes=3, maxEpisodes=2).playing()
+    assert state(driver)["timeLeft"] == 9
+    driver.step(terminated=True)
+    said = state(driver)
+    assert (said["state"], said["nextIn"], "timeLeft" in said) == ("break", 3, False)
+    driver.say(command="stop")
+    said = state(driver)
+    assert (said["state"], "nextIn" in said, "timeLeft" in said) == ("ended", False, False)
 
 
 @pytest.mark.parametrize("between", [0, 5])

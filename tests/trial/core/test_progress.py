@@ -4,9 +4,9 @@ import pytest
 
 from trial.core.actions import Action
 from trial.core.controls import Controls
-from trial.core.ended import Episode
+from trial.core.ended import Break, Episode
 from trial.core.messages import CommandRefused
-from trial.core.players import PLAYER, alone
+from trial.core.players import PLAYER, Player, alone
 from trial.core.progress import PlayState, TrialProgress
 from trial.core.timing import Pacer
 from trial.settings import trial_section
@@ -224,6 +224,192 @@ def test_taps_are_forgotten_and_held_keys_are_not():
     assert [controls.take(), controls.take()] == [(1, True), (1, True)]
 
 
+# ---- breaks
+
+
+@pytest.mark.parametrize(
+    ("how", "why", "state"),
+    [
+        ("start", "start", PlayState.PLAYING),
+        ("go_on", "over", PlayState.PLAYING),
+        ("pause", "pause", PlayState.PAUSED),
+        ("leave", "left", PlayState.PAUSED),
+    ],
+)
+def test_a_break_ends_with_the_next_episode_which_is_played_or_held(how, why, state):
+    game = playing(betweenEpisodes=5)
+    game.stepped({PLAYER: 1.5}, True, False)
+    getattr(game, how)()
+    assert (game.state, game.ended[1:], game.needs_reset) == (state, [Break(1, why)], True)
+    assert counts(game) == (2, 0, 1, 1, 1.5, 0)
+
+
+@pytest.mark.parametrize(
+    ("how", "why", "outcome"),
+    [
+        (lambda game: game.stop(), "stop", "stopped"),
+        (lambda game: game.partner_left(), "partnerLeft", "partnerLeft"),
+        (lambda game: game.failed(fatal=True), "failed", "failed"),
+    ],
+    ids=["stop", "partnerLeft", "failed"],
+)
+def test_a_trial_that_ends_in_a_break_ends_the_break_and_no_second_episode(how, why, outcome):
+    game = playing(betweenEpisodes=5)
+    game.stepped({PLAYER: 1.0}, True, False)
+    how(game)
+    assert (game.outcome, game.ended) == (outcome, [Episode(1, 1, 1.0, "terminated"), Break(1, why)])
+    assert game.episodes_played == 1
+    game.partner_left()
+    assert (game.outcome, len(game.ended)) == (outcome, 2)
+
+
+def test_in_a_break_a_session_that_lacks_a_member_is_not_held_and_an_error_ends_nothing():
+    game = playing(betweenEpisodes=1)
+    game.stepped({PLAYER: 1.0}, True, False)
+    game.hold()
+    game.failed()
+    game.reset()
+    assert (game.on_break, len(game.ended)) == (True, 1)
+
+
+def test_an_episode_that_is_held_when_it_ends_is_followed_by_the_next_one_without_a_break():
+    game = playing(betweenEpisodes=5)
+    game.act("up", True)
+    game.pause()
+    game.stepped({PLAYER: 1.0}, True, False)
+    assert (game.state, game.episode, game.needs_reset) == (PlayState.PAUSED, 2, True)
+
+
+def test_only_a_game_that_is_on_is_held():
+    game = new_game()
+    game.hold()
+    assert game.state is PlayState.READY
+    game.start()
+    game.hold()
+    assert game.state is PlayState.PAUSED
+
+
+# ---- the first picture
+
+
+def test_the_first_picture_is_shown_while_the_game_is_on_from_the_reset_until_its_time_is_over():
+    game = new_game(resetFreeze=1)
+    assert (game.frozen, game.shows_first_picture) == (True, False)
+    game.start()
+    assert not game.shows_first_picture, "the environment is not reset yet"
+    game.began()
+    assert game.shows_first_picture
+    game.pause()
+    assert not game.shows_first_picture
+    game.start()
+    game.act("up", None)
+    game.act("left", True)
+    game.thaw()
+    assert (game.frozen, game.shows_first_picture) == (False, False)
+    assert game.next_actions()[PLAYER] == Action(2, "left", "human"), "presses before are forgotten"
+    game.stepped({PLAYER: 1.0}, True, False)
+    assert game.frozen, "each episode has its own first picture"
+    assert not playing().frozen
+
+
+def test_an_episode_that_goes_on_where_it_was_shows_no_first_picture():
+    game = new_game(resetFreeze=2)
+    game.replayed(1, {PLAYER: 1.0})
+    game.start()
+    assert not game.shows_first_picture
+
+
+# ---- limits
+
+
+@pytest.mark.parametrize(
+    ("step", "why", "limit"),
+    [
+        ((True, False, "maxSteps"), "terminated", None),
+        ((False, True, "maxSteps"), "truncated", None),
+        ((False, False, "maxSteps"), "truncated", "maxSteps"),
+    ],
+)
+def test_a_limit_is_recorded_only_if_the_environment_does_not_end_the_episode_itself(step, why, limit):
+    game = playing()
+    game.stepped({PLAYER: 1.0}, *step)
+    assert game.ended == [Episode(1, 1, 1.0, why, limit=limit)]
+
+
+@pytest.mark.parametrize("limit", [None, "maxSteps"])
+def test_failures_are_counted_anew_after_an_episode_that_ended_by_itself_or_at_a_limit(limit):
+    game = playing(maxEpisodes=9)
+    for _ in range(2):
+        game.failed()
+        game.began()
+    game.stepped({PLAYER: 1.0}, limit is None, False, limit)
+    for _ in range(2):
+        game.failed()
+        game.began()
+    assert not game.over
+
+
+@pytest.mark.parametrize("how", ["time_over", "reset", "stepped"])
+def test_a_trial_whose_last_episode_fails_is_finished_if_another_did_not(how):
+    game = playing(maxEpisodes=2)
+    game.stepped({PLAYER: 1.0}, False, False)
+    if how == "stepped":
+        game.stepped({PLAYER: 1.0}, False, False, "maxSteps")
+    else:
+        getattr(game, how)()
+    game.began()
+    game.failed()
+    assert (game.outcome, [each.why for each in game.ended][1]) == ("finished", "failed")
+
+
+# ---- several players
+
+TWO = (Player("a", SPACE), Player("b", SPACE, "random"))
+
+
+def test_with_several_players_each_has_their_score_and_the_first_humans_comes_first():
+    section = trial_section({"maxEpisodes": 3, "betweenEpisodes": 0, "players": {"a": "random", "b": "human"}})
+    game = TrialProgress(section, (Player("a", SPACE, "random"), Player("b", SPACE)))
+    assert (game.several, game.first, game.humans) == (True, "b", ("b",))
+    game.start()
+    game.began()
+    game.stepped({"a": 1.0, "b": 2.0}, False, False)
+    assert (game.score, game.episode_score, game.scores) == (2.0, 2.0, {"a": 1.0, "b": 2.0})
+    game.stepped({"a": 1.0}, True, False)
+    assert game.ended == [Episode(1, 2, 2.0, "terminated", {"a": 2.0, "b": 2.0})]
+    assert (game.scores, game.episode_scores) == ({"a": 2.0, "b": 2.0}, {"a": 0.0, "b": 0.0})
+    assert not new_game().several
+
+
+def test_scores_of_an_earlier_server_count_for_the_players_that_still_are_there():
+    game = TrialProgress(trial_section({"maxEpisodes": 3, "players": {"a": "human", "b": "random"}}), TWO)
+    game.resume([Episode(1, 4, 1.0, "truncated", {"a": 1.0, "b": 3.0, "gone": 9.0})])
+    game.replayed(2, {"b": 0.5, "gone": 9.0})
+    assert (game.scores, game.episode_scores) == ({"a": 1.0, "b": 3.5}, {"a": 0.0, "b": 0.5})
+    assert counts(game) == (2, 2, 6, 1, 1.0, 0.0)
+
+
+def test_a_trial_that_a_member_has_left_on_an_earlier_server_is_over():
+    game = new_game()
+    game.resume([Episode(1, 4, 1.0, "partnerLeft")])
+    assert (game.over, game.outcome, game.episode) == (True, "partnerLeft", 2)
+
+
+def test_an_action_is_the_first_humans_unless_another_player_is_named():
+    section = trial_section({"players": {"a": "human", "b": "human"}})
+    game = TrialProgress(section, (Player("a", SPACE), Player("b", SPACE)))
+    game.start()
+    game.began()
+    game.act("up", True)
+    game.act("left", True, player="b")
+    assert {name: action.name for name, action in game.next_actions().items()} == {"a": "up", "b": "left"}
+    game.leave("a")
+    assert (game.choices.controls["a"].held, game.choices.controls["b"].held) == ((), ("left",))
+    game.leave()
+    assert game.choices.controls["b"].held == ()
+    assert not game.to_act("a"), "in real time it is nobody's turn"
+
+
 # ---- the rhythm
 
 
@@ -240,4 +426,5 @@ def test_missed_frames_are_skipped_and_the_intervals_stay_as_they_were():
     assert pacer.next(0.15, 10) == pytest.approx(0.1), "less than one frame late: it is due at once"
     assert pacer.next(0.95, 10) == pytest.approx(0.9)
     assert pacer.next(0.95, 10) == pytest.approx(1.0)
-    assert pacer.next(1.05, 20) == pytest.approx(1.05), "a new rate counts from the next frame on"
+    assert pacer.next(1.25, 10) == pytest.approx(1.2), "one was missed"
+    assert pacer.next(1.25, 20) == pytest.approx(1.25), "a new rate counts from the next frame on"

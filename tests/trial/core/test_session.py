@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 
 from tests.trial.session_driver import SessionDriver
 from trial.core import messages
-from trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SendDone, WriteLog
+from trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SaveMember, SendDone, WriteLog
 from trial.core.flow_control import Window
 from trial.core.message_log import MESSAGES_KEPT
+from trial.core.seeds import policy_seed
 from trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
+from trial.core.trial import TRIAL_FAILED, Trial
 from trial.core.unfinished import RecordedTrial
 from trial.recordings.resume import add_lines
 from trial.settings import STALLED_SECONDS
@@ -106,6 +110,66 @@ def test_a_member_who_reads_for_ever_holds_the_others_only_for_gather_seconds():
     assert driver.wait(3.1).taken
 
 
+def test_without_a_substitute_the_game_ends_at_once_if_the_data_of_a_member_were_erased():
+    driver = SessionDriver(erased=("right",))
+    assert driver.outcomes == {"P0": "partnerLeft"}
+    assert driver.lines("end")[-1]["outcomes"] == {"left": "partnerLeft", "right": "left"}
+    assert driver.taken == []
+
+
+def test_the_game_asks_to_be_woken_when_a_countdown_a_wait_or_a_measurement_is_over():
+    driver = SessionDriver(maxPing=100, pingSamples=1)
+    assert driver.trial.wake_at is None, "nobody waits"
+    driver.come(0)
+    assert driver.trial.wake_at == 120, "the measurement"
+    driver.round_trip(0, 0.02)
+    assert driver.trial.wake_at == 160, "the wait for the other"
+    driver.come(1).round_trip(1, 0.02)
+    assert driver.trial.wake_at == 103, "the countdown"
+    driver.wait(3)
+    assert driver.trial.wake_at == pytest.approx(103.1), "the next step"
+    driver.go(1)
+    assert driver.trial.wake_at == pytest.approx(133), "the wait for who has left"
+    driver.come(1).say(1, command="pause")
+    assert driver.trial.wake_at is None, "a pause has no end"
+
+
+@pytest.mark.parametrize(("absent", "until"), [(30, 20), (10, 10)])
+def test_in_a_break_the_game_asks_to_be_woken_at_the_end_of_the_break_or_of_a_wait(absent, until):
+    driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2, absent=absent).begin().take(terminated=True).go(1)
+    assert driver.trial.wake_at == pytest.approx(driver.now + until)
+
+
+def test_a_server_that_ends_waits_for_no_member_any_more():
+    driver = SessionDriver().come(0)
+    driver.event("close", driver.now)
+    assert driver.trial.wake_at is None
+    assert driver.answers == []
+
+
+def test_the_recording_says_at_which_step_a_member_came_or_a_policy_replaced_them():
+    driver = SessionDriver(**POLICY).begin().take().go(1).wait(30)
+    where = {"episode": 1, "step": 1, "player": "right"}
+    assert driver.lines("presence")[0] == {"episode": 1, "step": 0, "player": "left", "what": "joined"}
+    assert driver.lines("presence")[-2:] == [
+        {**where, "what": "left"},
+        {**where, "what": "replaced", "seed": policy_seed(7, "right")},
+    ]
+    assert driver.calls(WriteLog)[-1] == WriteLog(logging.INFO, "random plays in the place of right")
+
+
+def test_a_refusal_is_recorded_once():
+    driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.2)
+    driver.wait(5).go(1).wait(5)
+    assert driver.presence().count(("right", "refused")) == 1
+
+
+def test_players_and_members_that_are_not_there_any_more_are_ignored():
+    outcomes = {"gone": "ping", "away": "left", "done": "stopped"}
+    driver = SessionDriver(recorded=RecordedTrial(outcomes=outcomes), answered={"P9": {"outcome": "ping"}}).begin()
+    assert driver.wait(0.2).taken
+
+
 def test_a_member_may_come_late_although_absent_is_zero():
     driver = SessionDriver(absent=0).come(0).wait(50).come(1).wait(3.2)
     assert driver.taken
@@ -186,6 +250,14 @@ def test_a_policy_takes_an_absent_members_place_and_gives_it_back_at_the_next_st
     assert driver.presence()[-2:] == [("right", "replaced"), ("right", "returned")]
 
 
+def test_a_failure_of_a_policy_that_plays_for_a_member_is_recorded_with_its_name():
+    driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
+    (ask,) = driver.calls(AskPolicy)
+    driver.event("policy_failed", "right", ask.ask_id, ValueError("no idea"), driver.now)
+    (line,) = driver.lines("error")
+    assert line["error"] == "the policy of right (random) failed: ValueError: no idea"
+
+
 def test_a_policys_answer_that_comes_after_the_return_changes_nothing():
     driver = SessionDriver(**POLICY).begin().wait(1).go(1).wait(30)
     (ask,) = driver.calls(AskPolicy)
@@ -257,6 +329,20 @@ def test_a_members_keys_move_their_own_player_alone():
     driver.go(0).come(0).wait(4)
     step = driver.taken[-1].actions
     assert (step["left"].name, step["right"].name) == ("noop", "right"), "only the keys of who left are let go"
+
+
+def test_a_members_own_keys_of_the_project_move_their_own_player():
+    driver = SessionDriver(keys={"x": "up"}).begin().say(1, key="x", held=True).wait(0.2)
+    assert {name: action.name for name, action in driver.taken[-1].actions.items()} == {"left": "noop", "right": "up"}
+
+
+def test_only_the_last_line_says_how_the_trial_has_ended_for_each_member():
+    driver = SessionDriver(maxEpisodes=2).begin().take(terminated=True)
+    driver.now += 0.1
+    driver.event("advance", driver.now)
+    driver.take(terminated=True)
+    finished = {"left": "finished", "right": "finished"}
+    assert [end.get("outcomes") for end in driver.lines("end")] == [None, finished]
 
 
 def test_an_action_says_when_its_key_was_pressed():
@@ -338,6 +424,15 @@ def test_each_member_has_their_own_score():
     assert driver.done(0).outcome == "finished"
 
 
+def test_a_member_is_told_when_their_own_score_changes():
+    driver = SessionDriver().begin().take(rewards={"right": 5.0})
+    assert [driver.state_seen_by(number)["score"] for number in (0, 1)] == [0, 5]
+    driver.now += 0.1
+    driver.event("advance", driver.now)
+    driver.take(rewards={"left": -1.0})
+    assert [driver.state_seen_by(number)["score"] for number in (0, 1)] == [-1, 5]
+
+
 def test_a_member_whom_a_policy_replaces_at_the_end_has_left():
     driver = SessionDriver(maxEpisodes=1, **POLICY).begin().wait(1).go(1).wait(33.05)
     driver.trial.progress.stop()
@@ -375,7 +470,9 @@ def test_a_page_between_episodes_holds_the_others_for_gather_seconds_at_most():
 
 def test_a_member_who_leaves_in_a_break_does_not_end_it_for_the_others():
     driver = SessionDriver(betweenEpisodes=20, maxEpisodes=2).begin()
-    driver.take(terminated=True).wait(5).go(1)
+    driver.take(terminated=True).wait(5)
+    assert driver.state_seen_by(0)["people"] == {"left": "here", "right": "here"}, "there is no page to read"
+    driver.go(1)
     assert driver.state_seen_by(0)["state"] == "break"
     driver.wait(16)
     taken = len(driver.taken)
@@ -396,6 +493,7 @@ def test_turn_by_turn_all_are_told_whose_turn_it_is():
     driver.say(0, action="right").take()
     assert [driver.state_seen_by(number)["turnOf"] for number in (0, 1)] == [["right"], ["right"]]
     assert driver.state_seen_by(1)["turnEndsIn"] == 20
+    assert "turnEndsIn" not in driver.state_seen_by(0)
     driver.say(0, command="pause")
     assert "turnOf" not in driver.state_seen_by(1), "while the game is held it is nobody's"
 
@@ -409,7 +507,62 @@ def test_turn_by_turn_a_policy_chooses_for_a_member_who_stays_away():
     assert driver.taken[-1].actions["right"].index == 2
 
 
+def test_turn_by_turn_the_choice_of_a_member_who_leaves_stands_and_a_policy_makes_the_next():
+    driver = SessionDriver(pace="turns", **POLICY).begin()
+    driver.say(0, action="up").go(0).wait(33.5)
+    assert driver.calls(AskPolicy) == [], "who has chosen is not asked again"
+    driver.say(1, action="right")
+    assert {name: action.name for name, action in driver.taken[-1].actions.items()} == {"left": "up", "right": "right"}
+    driver.take()
+    assert [ask.player for ask in driver.calls(AskPolicy)] == ["left"]
+
+
+def test_turn_by_turn_a_choice_says_when_it_was_made():
+    driver = SessionDriver(pace="turns").begin()
+    driver.now += 0.5
+    driver.say(0, action="up")
+    driver.now += 0.25
+    driver.say(1, action="right", held=True)
+    pressed = {name: action.pressed_at for name, action in driver.taken[-1].actions.items()}
+    assert pressed == {"left": 103_500_000_000, "right": 103_750_000_000}
+
+
+def test_turn_by_turn_the_game_waits_for_all_who_are_to_act():
+    driver = SessionDriver(pace="turns").begin()
+    assert driver.state_seen_by(0)["turnOf"] == ["left", "right"]
+    driver.say(0, action="up")
+    assert (driver.state_seen_by(1)["turnOf"], driver.state_seen_by(1)["toAct"]) == (["right"], True)
+    assert (driver.state_seen_by(0)["toAct"], driver.taken) == (False, [])
+    assert "turnEndsIn" not in driver.state_seen_by(0)
+
+
+# ---- a step that was played already
+
+
+def test_members_who_come_to_a_step_that_an_earlier_server_has_stored_are_sent_on_with_their_own_answer():
+    driver = SessionDriver()
+    trial = Trial(driver.settings, "3", trial_id="the-trial", new_seed=lambda: 7)
+    trial.already_played(
+        {
+            "P0": {"episodes": 2, "score": 5, "scores": {"left": 5, "right": 8}, "outcome": "finished"},
+            "P1": {"outcome": "failed"},
+        }
+    )
+    assert trial.connect("P0", "tab0", Window(), 100.0) == [SendDone("tab0", 2, 5, "finished")]
+    assert trial.connect("P1", "tab1", Window(), 100.0) == [SendDone("tab1", 0, 0, "failed", TRIAL_FAILED)]
+    assert trial.connect("P2", "tab2", Window(), 100.0) == [SendDone("tab2", 0, 0.0)], "there is none of theirs"
+
+
 # ---- round trips
+
+
+def test_coming_and_going_does_not_use_up_the_twenty_seconds():
+    driver = SessionDriver(maxPing=100, pingSamples=2, **POLICY).come(0).round_trip(0, 0.02).round_trip(0, 0.02)
+    for _ in range(5):
+        driver.come(1).go(1)
+    driver.come(1).wait(19.9)
+    assert driver.state_seen_by(0)["people"]["right"] == "awaited"
+    assert driver.wait(0.1).state_seen_by(0)["people"]["right"] == "policy"
 
 
 def test_a_member_with_too_long_a_round_trip_is_refused_before_the_game():
@@ -428,6 +581,7 @@ def test_with_a_substitute_a_refused_member_goes_on_at_once_and_the_others_play(
     driver = SessionDriver(maxPing=100, pingSamples=1, **POLICY).come(0, 1).round_trip(0, 0.02).round_trip(1, 0.2)
     assert driver.answers == [("P1", {**dict(driver.answers)["P1"], "outcome": "ping", "player": "right"})]
     assert (driver.errors(1), driver.errors(0)) == ([PING], [])
+    assert [one.later for one in driver.calls(SaveMember)] == [{"outcome": "ping", "player": "right"}]
     assert driver.done(1) is None
     driver.event("member_saved", "P1", driver.now)
     assert driver.done(1).outcome == "ping"
@@ -452,6 +606,7 @@ def test_a_member_goes_on_when_their_own_answer_is_stored_and_hears_so_once():
     told = driver.count(SendDone)
     driver.event("answer_saved", driver.now)
     assert driver.trial.finished
+    driver.event("member_saved", "P1", driver.now)
     assert driver.count(SendDone) == told
 
 
@@ -665,6 +820,12 @@ def test_the_next_server_waits_for_all_members_again_without_the_instructions():
     second.come(1)
     assert second.state_seen_by(1)["beginsIn"] == 3
     assert second.wait(3.1).taken[0].fields["step"] == first.steps + 1
+
+
+def test_a_policy_that_replaces_a_member_on_the_next_server_has_the_seed_of_the_episode():
+    first = SessionDriver(**POLICY).begin().wait(1)
+    second = SessionDriver(recorded=recorded_of(first, ended=False), **POLICY).begin().go(1).wait(30)
+    assert second.lines("presence")[-1]["seed"] == policy_seed(7, "right")
 
 
 def test_a_game_that_had_not_begun_begins_on_the_next_server_as_on_the_first():

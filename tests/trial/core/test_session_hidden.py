@@ -60,6 +60,13 @@ def test_in_the_game_a_hidden_member_is_away_and_lets_go_of_their_keys() -> None
     assert driver.taken[-1].actions["left"].name == "noop"
 
 
+def test_a_key_that_a_hidden_page_holds_does_not_act_after_a_policy_has_played() -> None:
+    driver = SessionDriver(absent=10, **ON).begin().say(1, hidden=True).say(1, action="up", held=True).wait(15)
+    assert people(driver, 0)["right"] == "policy"
+    driver.say(1, hidden=False).wait(1)
+    assert driver.taken[-1].actions["right"].name == "noop"
+
+
 def test_a_hidden_page_stays_hidden_until_it_says_that_it_is_seen_again() -> None:
     driver = SessionDriver().come(0).come(1).say(1, hidden=True)
     driver.say(1, command="requestUI").say(1, hidden=True).wait(5)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from testing.exploration import examples
-from tests.trial.core.test_decisions import FRAME, sent
+from tests.trial.core.test_decisions import FRAME, Driver, sent
 from trial.core import messages
 from trial.core.effects import (
     Begun,
@@ -19,10 +19,12 @@ from trial.core.effects import (
     FeedbackCall,
     OpenRecording,
     RecordLine,
+    ReplayCall,
     Replayed,
     ResetCall,
     ResetPolicy,
     SaveAnswer,
+    SendDone,
     SendMessage,
     SendState,
     StepCall,
@@ -31,8 +33,9 @@ from trial.core.effects import (
 )
 from trial.core.flow_control import Window
 from trial.core.messages import CommandRefused
-from trial.core.players import Player, PlayersError, View, who_plays
-from trial.core.policies import AskPolicy
+from trial.core.players import PLAYER, Player, PlayersError, View, alone, who_plays
+from trial.core.policies import AskPolicy, Observed
+from trial.core.seeds import policy_seed
 from trial.core.trial import Phase, Trial
 from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.settings import TrialSettings, trial_section
@@ -231,6 +234,19 @@ def test_a_pause_stops_the_clock_of_the_turn() -> None:
     assert game.actions == {"me": (0, "none")}
 
 
+def test_the_clock_of_a_turn_does_not_run_while_the_first_picture_is_shown() -> None:
+    game = game_in_turns(turnSeconds=5, resetFreeze=2).playing(view_for("me"))
+    assert game.trial.wake_at == pytest.approx(102)
+    game.say(action="up")
+    game.wait(2.1)
+    assert game.open_call is None, "a press before does nothing"
+    assert game.states[-1]["turnEndsIn"] == pytest.approx(5)
+    game.wait(4.8)
+    assert game.open_call is None
+    game.wait(0.2)
+    assert game.actions == {"me": (0, "none")}
+
+
 def test_the_clock_of_a_turn_does_not_run_while_a_policy_thinks() -> None:
     game = game_in_turns(turnSeconds=5, policySeconds=60).playing(view_for("it"))
     game.wait(30)
@@ -284,7 +300,175 @@ def test_a_step_in_which_no_player_acts_is_taken_at_the_frame_rate() -> None:
     assert game.actions == {}
 
 
+def test_alone_each_press_is_a_turn() -> None:
+    driver = Driver(pace="turns").playing()
+    assert driver.trial.wake_at is None
+    for action in ("up", "right"):
+        driver.say(action=action)
+        assert isinstance(driver.call, StepCall)
+        assert driver.call.actions[PLAYER].name == action
+        driver.step()
+        driver.wait(0.1)
+        assert driver.trial.wake_at is None
+
+
+def test_the_game_asks_to_be_woken_when_the_first_time_is_over() -> None:
+    for section, until in (
+        ({"policySeconds": 2, "turnSeconds": 5, "episodeSeconds": 9}, 102.0),
+        ({"policySeconds": 9, "turnSeconds": 2, "episodeSeconds": 5}, 102.0),
+        ({"policySeconds": 9, "turnSeconds": 5, "episodeSeconds": 2}, 102.0),
+    ):
+        assert game_in_turns(**section).playing(view_for("me", "it")).trial.wake_at == pytest.approx(until)
+    assert game_in_turns(turnSeconds=5, policySeconds=9).playing(view_for("it")).trial.wake_at == pytest.approx(109.0)
+
+
+def test_an_episode_whose_time_is_over_in_a_turn_ends_without_a_step() -> None:
+    game = game_in_turns(episodeSeconds=2, maxEpisodes=1).playing(view_for("me"))
+    game.wait(1.9)
+    assert not game.trial.progress.over
+    game.wait(0.1)
+    (end,) = [one.fields for one in game.all if isinstance(one, RecordLine) and one.kind == "end"]
+    assert (end["why"], end["limit"], end["steps"]) == ("truncated", "episodeSeconds", 0)
+    assert game.trial.progress.outcome == "finished"
+
+
+@pytest.mark.parametrize(
+    ("mask", "expected"), [([True, True, False], (0, "none")), ([False, False, True], (2, "none"))]
+)
+def test_illegal_advice_does_not_count_and_an_illegal_idle_action_is_not_taken(
+    mask: list[bool], expected: tuple[int, str]
+) -> None:
+    game = game_in_turns(turnSeconds=5, gym="advise").playing(view_for("me", masks={"me": mask}))
+    game.event("advise", mask.index(False), None, game.now)
+    game.wait(5)
+    assert game.actions == {"me": expected}
+
+
+def chance(seed: int) -> list[int]:
+    """Return the random actions of twenty turns in which the human does not choose."""
+    game = game_in_turns(turnSeconds=1, turnEnds="random", seed=seed).playing(view_for("me"))
+    chosen = []
+    for _ in range(20):
+        game.wait(1.1)
+        chosen.append(game.actions["me"][0])
+        game.stepped(view_for("me"))
+    return chosen
+
+
+def test_random_actions_differ_from_turn_to_turn_and_follow_from_the_episodes_seed() -> None:
+    assert set(chance(1)) == {0, 1, 2}
+    assert chance(1) == chance(1) != chance(2)
+
+
+def test_a_program_that_plays_a_player_chooses_in_its_turn_and_has_policy_seconds() -> None:
+    game = Game(plays={"me": "human", "it": "gym://learner"}, gym="advise", pace="turns", policySeconds=4)
+    game.playing(view_for("it"))
+    game.wait(3.9)
+    assert game.open_call is None
+    game.event("advise", 2, None, game.now)
+    assert game.actions == {"it": (2, "advice")}
+    game.stepped(view_for("it"))
+    game.wait(3.9)
+    assert game.open_call is None
+    game.wait(0.2)
+    assert game.actions == {"it": (0, "late")}
+
+
+def test_an_unknown_action_is_refused_and_ignored_from_hippos_page() -> None:
+    game = game_in_turns().playing(view_for("me"))
+    assert sent(game.say(action="jump"), SendMessage) == [{"error": "that action is not in this game's actionSpace"}]
+    said = messages.Message(action="jump", lasts=True)
+    assert sent(game.event("receive", "tab", said, game.now), SendMessage) == []
+    game.event("receive", "tab", messages.Message(action="up", lasts=True), game.now)
+    assert game.actions == {"me": (1, "human")}
+
+
 # ---- in real time
+
+
+def test_in_real_time_an_action_that_the_mask_forbids_is_replaced_by_the_idle_or_first_legal_one() -> None:
+    for mask, expected in (
+        ([True, False, True], (0, "none")),
+        ([False, False, True], (2, "none")),
+        ([True, True, False], (1, "human")),
+    ):
+        game = Game().playing(view_for("me", masks={"me": mask}))
+        game.say(action="up", held=True)
+        game.stepped(view_for("me", masks={"me": mask}))
+        game.wait(0.1)
+        assert game.actions == {"me": expected}
+
+
+def test_in_real_time_advice_counts_for_one_step_if_it_is_legal_and_no_key_acts() -> None:
+    game = Game(gym="advise").playing(view_for("me", "it"))
+    view = view_for("me", masks={"me": [True, True, False]})
+
+    def next_action(*advice: int, view: View = view) -> tuple[int, str]:
+        game.stepped(view)
+        for action in advice:
+            assert game.event("advise", action, None, game.now) == [], "it waits for the step"
+        game.wait(0.1)
+        return game.actions["me"]
+
+    assert next_action(1) == (1, "advice")
+    assert next_action() == (0, "none")
+    assert next_action(2) == (0, "none"), "it is illegal"
+    assert next_action(1, 0) == (0, "advice"), "the last advice counts"
+    game.say(action="up", held=True)
+    assert next_action(0) == (1, "human")
+    game.say(action="up", held=False)
+    assert next_action() == (0, "none"), "the advice was for the step before"
+    assert next_action(2, view=view_for("me")) == (2, "advice")
+
+
+def test_advice_for_the_episode_before_does_not_count() -> None:
+    game = Game(gym="advise").playing(view_for("me"))
+    game.stepped(view_for(), over=True)
+    game.event("advise", 2, None, game.now)
+    game.returns(Begun(b"reset", FRAME, view_for("me")))
+    game.wait(0.1)
+    assert game.actions == {"me": (0, "none")}
+
+
+def test_advice_that_is_not_possible_is_refused_with_the_reason() -> None:
+    game = Game(gym="advise")
+    with pytest.raises(CommandRefused, match="no game is going on"):
+        game.trial.advise(0, None, game.now)
+    game.playing(view_for("me", "it"))
+    for action, player, words in (
+        (3, None, "there is no action 3; there are 0 to 2"),
+        (-1, "me", "there is no action -1; there are 0 to 2"),
+        (0, "it", "it is played by agent:Partner, not by a program"),
+        (0, "she", "there is no such player; there are me, it"),
+    ):
+        with pytest.raises(CommandRefused) as refused:
+            game.trial.advise(action, player, game.now)
+        assert str(refused.value) == words
+    assert game.trial.progress.choices.action_space_of(None) == SPACE
+
+
+def test_a_name_that_is_no_action_ends_the_action_of_hippos_page() -> None:
+    driver = Driver().playing()
+
+    def next_action(name: str) -> tuple[str, list[Any]]:
+        said = driver.event("receive", "tab", messages.Message(action=name, lasts=True), driver.now)
+        driver.step()
+        driver.wait(0.1)
+        assert isinstance(driver.call, StepCall)
+        return driver.call.actions[PLAYER].name, [one["error"] for one in sent(said)]
+
+    assert next_action("up") == ("up", [])
+    assert next_action("jump") == ("noop", ["that action is not in this game's actionSpace"])
+    assert next_action("right") == ("right", [])
+    assert next_action("noop") == ("noop", [])
+
+
+def test_hippos_page_may_send_noop_where_no_action_has_this_name() -> None:
+    driver = Driver()
+    driver.event("start", alone(("left", "right")), None, driver.now)
+    driver.reset()
+    driver.connect()
+    assert sent(driver.event("receive", "tab", messages.Message(action="noop", lasts=True), driver.now)) == []
 
 
 def test_a_late_action_of_a_policy_is_taken_at_the_next_step() -> None:
@@ -436,9 +620,106 @@ def test_a_policy_idles_for_the_episode_after_three_failures_in_a_row() -> None:
     assert len(game.asks) == asked == 3
     told = [one.text for one in game.all if isinstance(one, WriteLog)]
     assert sum("no idea" in text for text in told) == 1
+    assert "the policy of it failed 3 times in a row: it idles until the episode is over" in told
     game.stepped(view_for(), over=True)
     game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
     assert len(game.asks) == 4, "it is asked again in the next episode"
+
+
+def test_the_policies_that_are_asked_begin_the_episode_with_the_environment_and_programs_do_not() -> None:
+    for plays, asked in (("agent:Partner", {"it"}), ("gym://learner", set())):
+        game = Game(plays={"me": "human", "it": plays}, gym="advise").playing(view_for("me", "it"))
+        (call,) = [one for one in game.all if isinstance(one, ResetCall)]
+        assert call.asked == asked
+        assert {one.player for one in game.all if isinstance(one, ResetPolicy)} == asked
+
+
+def test_an_episode_is_repeated_with_the_idle_actions_of_all_players() -> None:
+    game = Game(idleAction={"it": "right"}, seed=3)
+    steps = [RecordedStep(None, 0, 1.0, players={"me": RecordedAction(0, 1.0), "it": RecordedAction(1, 2.0, 0)})]
+    recorded = RecordedTrial(unfinished=UnfinishedEpisode(1, 7, steps))
+    game.event("start", who_plays(game.settings.trial, dict.fromkeys(PLAYS, SPACE), None), recorded, game.now)
+    assert isinstance(game.open_call, ReplayCall)
+    assert game.open_call.default_actions == {"me": 0, "it": 2}
+    looked_at = Observed("o", {}, None)
+    game.returns(Replayed(FRAME, view_for("me", "it"), {"it": [looked_at]}))
+    (reset,) = [one for one in game.all if isinstance(one, ResetPolicy)]
+    assert (reset.seed, reset.observed) == (policy_seed(7, "it"), [looked_at]), "the seed of the episode"
+    assert game.trial.progress.scores == {"me": 1.0, "it": 2.0}
+
+
+def test_an_answer_of_a_policy_that_is_no_action_is_recorded_and_a_second_time_only_counted() -> None:
+    game = Game().playing(view_for("me", "it"))
+    for _ in range(2):
+        game.acts(7)
+        game.stepped(view_for("me", "it"))
+        game.wait(0.1)
+        assert game.actions["it"] == (0, "none")
+    game.acts("up")
+    lines = [one.fields for one in game.all if isinstance(one, RecordLine) and one.kind == "error"]
+    wrong, failed = "the policy of it (agent:Partner) failed: ", "the policy of it failed 3 times in a row: "
+    assert lines == [
+        {"episode": 1, "step": 0, "player": "it", "error": wrong + "it chose action 7, but the actions are 0 to 2"},
+        {
+            "episode": 1,
+            "step": 2,
+            "player": "it",
+            "error": wrong + "its action is of the type str, not a whole number",
+        },
+        {"episode": 1, "step": 2, "player": "it", "error": failed + "it idles until the episode is over"},
+    ]
+    assert [one.text for one in game.all if isinstance(one, WriteLog)] == [line["error"] for line in lines]
+
+
+def test_a_trial_reports_at_most_twenty_different_failures_of_policies() -> None:
+    game = Game(maxEpisodes=100).playing(view_for("me", "it"))
+    for number in range(30):
+        game.event("policy_failed", "it", game.asks[-1].ask_id, ValueError(str(number)), game.now)
+        game.stepped(view_for(), over=True)
+        game.returns(Begun(b"reset", FRAME, view_for("me", "it")))
+        game.wait(0.1)
+    lines = [one for one in game.all if isinstance(one, RecordLine) and one.kind == "error"]
+    assert len(lines) == 20
+
+
+def test_an_action_of_a_policy_waits_in_real_time_and_a_failure_is_recorded_at_once() -> None:
+    game = Game().playing(view_for("me", "it"))
+    game.stepped(view_for("me", "it"))
+    game.now += 1.0
+    assert game.acts(1) == []
+    assert game.open_call is None
+    game = game_in_turns().playing(view_for("it"))
+    assert isinstance(game.acts(1)[-1], StepCall), "turn by turn the game goes on with it"
+
+
+def test_the_answer_and_the_lines_that_end_have_the_scores_of_all_players() -> None:
+    game = Game(maxEpisodes=1).playing(view_for("me", "it"))
+    game.stepped(view_for(), over=True)
+    (end,) = [one.fields for one in game.all if isinstance(one, RecordLine) and one.kind == "end"]
+    assert (end["score"], end["scores"]) == (1, {"me": 1, "it": 2})
+    (saved,) = [one.answers for one in game.all if isinstance(one, SaveAnswer)]
+    assert (saved["score"], saved["scores"], saved["frames"]) == (1, {"me": 1, "it": 2}, 1)
+    again = Game()
+    again.event("already_played", saved)
+    assert again.event("connect", "P1", "tab", Window(), again.now) == [SendDone("tab", 1, 1)]
+    game = Game().playing(view_for("me", "it"))
+    game.stepped(view_for("me", "it"))
+    game.event("close", game.now)
+    (end,) = [one.fields for one in game.all if isinstance(one, RecordLine) and one.kind == "end"]
+    assert (end["episode"], end["score"], end["scores"]) == (1, 1, {"me": 1, "it": 2})
+
+
+def test_a_recording_of_several_players_begins_with_all_of_them() -> None:
+    game = Game().playing(view_for("me", "it"))
+    (opened,) = [one for one in game.all if isinstance(one, OpenRecording)]
+    assert [(one.name, one.plays) for one in opened.players] == list(PLAYS.items())
+    assert (opened.action_space, opened.frame_rate, opened.seed) == (SPACE, 10, 7)
+
+
+def test_clients_are_told_the_players_and_which_one_is_theirs() -> None:
+    game = Game().playing(view_for("me", "it"))
+    told = sent(game.all, SendMessage)[0]
+    assert (told["player"], told["players"]) == ("me", ["me", "it"])
 
 
 def test_a_policys_seed_follows_from_the_episodes_seed() -> None:

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import math
 import struct
 import zlib
 
@@ -14,6 +15,7 @@ from trial.core import commands, messages
 from trial.core.controls import Controls
 from trial.pictures import frames
 from trial.server.watchdog import Watchdog
+from trial.settings import trial_section
 
 # ---- what a client says
 
@@ -168,6 +170,132 @@ def test_the_servers_messages_are_json_with_the_names_of_docs_wire(next_in):
     failed = {"done": True, "episodes": 2, "score": 7, "error": "It failed."}
     assert json.loads(messages.done(2, 7.0, words="It failed.")) == failed
     assert json.loads(messages.error("no")) == {"error": "no"}
+
+
+# ---- fields that are there only sometimes
+
+ALWAYS: dict = {
+    "ui": (),
+    "frame_rate": 30,
+    "min_frame_rate": 1,
+    "max_frame_rate": 90,
+    "frame_rate_step_size": 5,
+    "allow_frame_rate_change": True,
+    "action_space": ("noop",),
+    "state": "playing",
+    "episode": 1,
+    "max_episodes": 3,
+    "score": 0.0,
+    "episode_score": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"words": ("wellDone",)}, {"words": ["wellDone"]}),
+        ({"player": "a", "players": ("a",)}, {}),
+        ({"player": "a", "players": ("a", "b")}, {"player": "a", "players": ["a", "b"]}),
+        ({"to_act": False}, {"pace": "turns", "toAct": False}),
+        ({"to_act": True, "turn_ends_in": 1.5}, {"pace": "turns", "toAct": True, "turnEndsIn": 1.5}),
+        ({"starts_in": 0.0, "time_left": 2.0004}, {"startsIn": 0.0, "timeLeft": 2.0}),
+        ({"next_in": math.inf}, {}),
+        ({"scene": {"scene": {"width": 3}, "assets": []}}, {"scene": {"width": 3}, "assets": []}),
+        ({"input_of_project": {"input": "single"}}, {"input": "single"}),
+        ({"session": {"you": "a"}}, {"you": "a"}),
+    ],
+)
+def test_the_message_about_the_controls_has_a_further_field_only_if_there_is_something_to_tell(given, told):
+    plain = json.loads(messages.controls(**ALWAYS))
+    assert json.loads(messages.controls(**ALWAYS, **given)) == plain | told
+    assert plain.keys().isdisjoint(told)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"to_act": False}, {"toAct": False}),
+        ({"to_act": True, "turn_ends_in": 1.5}, {"toAct": True, "turnEndsIn": 1.5}),
+        ({"starts_in": 0.0, "time_left": 2.0004}, {"startsIn": 0.0, "timeLeft": 2.0}),
+        ({"next_in": math.inf}, {}),
+        ({"session": {"you": "a"}}, {"you": "a"}),
+    ],
+)
+def test_the_message_with_the_state_has_a_further_field_only_if_there_is_something_to_tell(given, told):
+    plain = {"state": "playing", "episode": 1, "frameRate": 30, "score": 2, "episodeScore": 1}
+    assert json.loads(messages.state("playing", 1, 2.0, 30, episode_score=1.0, **given)) == plain | told
+
+
+def test_the_last_message_says_how_the_trial_of_a_session_has_ended():
+    assert json.loads(messages.done(2, 1.5, "stopped")) == {
+        "done": True,
+        "episodes": 2,
+        "score": 1.5,
+        "outcome": "stopped",
+    }
+
+
+def test_a_hello_names_its_project_also_if_the_name_is_no_text():
+    hello = messages.parse_hello(json.dumps({"projectId": 3}))
+    assert (hello.names_project, hello.project_id) == (True, None)
+    hello = messages.parse_hello(json.dumps({"step": 0}))
+    assert (hello.names_project, hello.project_id, hello.step) == (False, None, "0")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message", "recorded"),
+    [
+        ({"key": "x" * 32}, {"key": "x" * 32}, {"key": "x" * 32}),
+        ({"key": "x", "held": False}, {"key": "x", "held": False}, {"key": "x", "held": False}),
+        ({"asset": "a"}, {"asset": "a"}, {}),
+        ({"asset": "a" * 200}, {"asset": "a" * 200}, {}),
+        ({"hidden": True}, {"hidden": True}, {}),
+        ({"hidden": False}, {"hidden": False}, {}),
+        ({"changeFrameRate": 2e6}, {"frame_rate": 2e6}, {"changeFrameRate": 2e6}),
+        ({"command": "wellDone"}, {"command": "wellDone"}, {"command": "wellDone"}),
+    ],
+)
+def test_a_key_an_image_a_hidden_page_and_a_word_of_the_project_are_read(fields, message, recorded):
+    found = messages.parse(json.dumps(fields), ("wellDone",))
+    assert found == messages.Message(**message)
+    assert found.record() == recorded
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"key": "x", "action": "up"}, "key must be the name of a key, and come without an action"),
+        ({"key": "x" * 33}, "key must be the name of a key, and come without an action"),
+        ({"hidden": 1}, "hidden must be true or false"),
+        ({"hidden": None}, "hidden must be true or false"),
+        ({"command": "welldone"}, "unknown command 'welldone'"),
+        ({"changeFrameRate": math.nan}, "changeFrameRate must be 'faster', 'slower' or a number"),
+    ],
+)
+def test_a_wrong_key_or_word_is_refused_with_the_reason(fields, words):
+    with pytest.raises(messages.BadMessage) as refused:
+        messages.parse(json.dumps(fields), ("wellDone",))
+    assert str(refused.value) == words
+
+
+def test_the_recording_has_what_it_knows_of_unknown_fields():
+    assert messages.Message(fields={"x": 1}).record() == {"fields": {"x": 1}}
+    assert messages.Message(fields_dropped=2).record() == {"fieldsDropped": 2}
+
+
+def test_the_words_of_a_project_are_its_controls_that_name_no_action():
+    buttons = ("jump", "Fire", "leftUp", "rightUp", "leftDown", "rightDown", "wait")
+    section = trial_section({"game": "g", "actionSpace": ["noop", "Jump"], "ui": dict.fromkeys(buttons, True)})
+    assert messages.words_of(section) == ("wait",)
+    assert [messages.is_feedback(name) for name in ("wait", "good", "start", None)] == [True, True, False, False]
+
+
+def test_a_connection_is_closed_with_a_code_and_words():
+    closed = messages.CloseConnection(4400, "that is not JSON")
+    assert (closed.code, closed.words, str(closed)) == (4400, "that is not JSON", "that is not JSON")
+
+
+# ---- what ui offers
 
 
 @pytest.mark.parametrize(
@@ -351,6 +479,33 @@ def test_pixels_are_packed_unless_that_takes_more_bytes_than_allowed():
     assert zlib.decompress(chunked, wbits=-15) == np.bitwise_xor(noise, base).tobytes()
 
 
+def test_a_large_picture_is_packed_in_parts_if_its_size_is_limited():
+    noise = np.random.default_rng(1).integers(0, 256, (2000, 100, 3), dtype=np.uint8)
+    for base in (None, np.roll(noise, 1)):
+        plain = noise if base is None else np.bitwise_xor(noise, base)
+        data = frames.packed(noise, base, limit=1e9)
+        assert data is not None
+        assert zlib.decompress(data, wbits=-15) == plain.tobytes()
+        assert frames.packed(noise, base, limit=len(data)) == data
+        assert frames.packed(noise, base, limit=len(data) - 1) is None
+    assert zlib.decompress(frames.packed(noise[:1], limit=1e9), wbits=-15) == noise[:1].tobytes()
+
+
+def test_jpegs_have_quality_80_and_those_for_hippos_page_75():
+    picture = np.random.default_rng(1).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+
+    def tables(data):
+        return Image.open(io.BytesIO(data)).quantization
+
+    def of_quality(quality):
+        out = io.BytesIO()
+        Image.fromarray(picture).save(out, "JPEG", quality=quality)
+        return tables(out.getvalue())
+
+    assert tables(frames.jpeg(picture)) == of_quality(80)
+    assert tables(base64.b64decode(json.loads(frames.jpeg_message(picture, 1))["frame"])) == of_quality(75)
+
+
 def test_a_frame_of_the_wrong_length_is_refused():
     def key(pixels, more=b""):
         return struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(pixels, wbits=-15) + more
@@ -378,6 +533,54 @@ def test_a_picture_becomes_exact_by_rows_in_their_order():
         frames.Decoder().decode(rows(0, b"a" * 6))
     with pytest.raises(frames.FrameError, match="rows of no picture"):
         decoder.decode(rows(0, b"")[: frames.HEADER.size + 1])
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        decoder.decode(rows(0, b"")[: frames.HEADER.size + 2])
+
+
+def test_rows_begin_with_the_first_one_after_a_whole_picture():
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+    with pytest.raises(frames.FrameError, match="rows are missing"):
+        decoder.decode(rows(1, b"a" * 6))
+
+
+@pytest.mark.parametrize("more", [bytes(18), bytes(13), b""])
+def test_rows_that_do_not_fit_the_rest_of_a_picture_are_refused(more):
+    decoder = frames.Decoder()
+    decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+    decoder.decode(rows(0, b"a" * 6))
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        decoder.decode(rows(1, more))
+
+
+def test_a_difference_may_follow_rows_only_when_all_of_them_have_come():
+    difference = struct.pack("!BIHHB", 1, 2, 2, 3, 3) + zlib.compress(bytes([1]) * 18, wbits=-15)
+    for parts in ((b"a" * 18,), (b"a" * 6, b"a" * 12), (b"a" * 12,)):
+        decoder, first = frames.Decoder(), 0
+        decoder.decode(struct.pack("!BIHHB", 0, 1, 2, 3, 3) + zlib.compress(bytes(18), wbits=-15))
+        for part in parts:
+            _, shown = decoder.decode(rows(first, part))
+            first += len(part) // 6
+        if first == 3:
+            assert decoder.decode(difference)[1].tobytes() == b"`" * 18
+            assert shown.tobytes() == b"a" * 18, "a picture that was given away stays as it was"
+        else:
+            with pytest.raises(frames.FrameError, match="a difference to a frame that was not sent"):
+                decoder.decode(difference)
+
+
+def test_the_largest_frame_is_read():
+    head = struct.pack("!BIHHB", 0, 1, 4096, 4096, 1)
+    assert frames.Decoder().decode(head + zlib.compress(bytes(4096 * 4096), 1, -15))[1].shape == (4096, 4096, 1)
+    with pytest.raises(frames.FrameError, match="wrong length"):
+        frames.Decoder().decode(head)
+
+
+def test_a_jpeg_may_have_as_long_a_side_as_libjpeg_allows():
+    long = frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE, 1), np.uint8))
+    assert Image.open(io.BytesIO(long)).size == (frames.MAX_JPEG_SIDE, 1)
+    with pytest.raises((OSError, SystemError)):
+        frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE + 1, 1), np.uint8))
 
 
 @pytest.mark.parametrize(
@@ -386,6 +589,23 @@ def test_a_picture_becomes_exact_by_rows_in_their_order():
 def test_a_frame_of_an_impossible_size_is_refused(head):
     with pytest.raises(frames.FrameError, match="no such picture"):
         frames.Decoder().decode(struct.pack("!BIHHB", *head))
+
+
+def test_a_jpeg_with_as_many_pixels_in_another_form_and_a_picture_that_is_no_jpeg_are_refused():
+    whole = frames.jpeg(np.full((16, 16, 3), 99, np.uint8))
+    with pytest.raises(frames.FrameError, match="not a JPEG of this size"):
+        frames.Decoder().decode(frames.HEADER.pack(2, 1, 8, 32, 3) + whole)
+    png = io.BytesIO()
+    Image.fromarray(np.full((16, 16, 3), 99, np.uint8)).save(png, "PNG")
+    with pytest.raises(frames.FrameError, match="not a JPEG of this size"):
+        frames.Decoder().decode(frames.HEADER.pack(2, 1, 16, 16, 3) + png.getvalue())
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_jpeg_is_shown_with_as_many_channels_as_the_picture_has(channels):
+    whole = frames.jpeg(np.full((8, 16, channels), 99, np.uint8))
+    _, shown = frames.Decoder().decode(frames.HEADER.pack(2, 1, 16, 8, channels) + whole)
+    assert shown.shape == (8, 16, channels)
 
 
 def test_a_jpeg_of_another_size_or_cut_off_is_refused():

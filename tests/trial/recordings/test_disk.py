@@ -103,10 +103,10 @@ def test_a_recording_never_takes_the_name_of_a_finished_one(tmp_path: Path, keep
 
 
 def test_an_open_recording_is_synced_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: list[int] = []
+    synced: list[tuple[float, int]] = []
     clock = [0.0]
     fsync = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda handle: (synced.append(os.fstat(handle).st_ino), fsync(handle)))
+    monkeypatch.setattr(os, "fsync", lambda handle: (synced.append((clock[0], os.fstat(handle).st_ino)), fsync(handle)))
     monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     kept = Recording(tmp_path / "r.part", "r")
     file, folder = (tmp_path / "r.part").stat().st_ino, tmp_path.stat().st_ino
@@ -115,9 +115,13 @@ def test_an_open_recording_is_synced_every_few_seconds(tmp_path: Path, monkeypat
         clock[0] = half_seconds / 2
         kept.add(line("step", step=half_seconds))
         kept.flush()
-    assert synced == [file, folder, file], "twice in twelve seconds, and once its name"
+    assert synced == [(5.0, file), (5.0, folder), (10.0, file)], "twice in twelve seconds, and once its name"
     kept.close()
-    assert synced[-1] == file
+    assert synced[3:] == [(12.0, file)]
+    clock[0] = 20.0
+    kept.flush()
+    kept.close()
+    assert len(synced) == 4, "what is closed is on the disk"
 
 
 def test_bytes_are_synced_before_they_get_their_name_and_the_name_before_it_is_promised(

@@ -2,13 +2,18 @@
 
 import gzip
 import json
+import platform
+from collections import UserDict
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from trial.core.ended import Episode
 from trial.core.message_log import Word
-from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from trial.recordings import recording
 from trial.recordings.resume import add_lines, load_recorded
 
@@ -129,6 +134,51 @@ def test_a_stop_in_the_break_after_an_episode_ends_the_trial():
     assert after_a_break("stop") == "stopped"
     assert after_a_break("over") == after_a_break("stop", number=2) == "terminated"
     assert recorded_trial({"kind": "break", "episode": 1, "why": "stop"}).ended == []
+
+
+@pytest.mark.parametrize(
+    ("by", "advice", "asked"),
+    [(None, 1, 1), ("agent", 1, 1), ("agent", None, None), ("none", None, 2), ("advice", 1, 2), ("human", 1, 2)],
+)
+def test_without_a_key_the_agent_was_asked_to_take_the_advice_or_the_action_that_was_taken(by, advice, asked):
+    line = step(**{key: value for key, value in {"by": by, "advice": advice}.items() if value is not None})
+    assert recorded_trial(reset(), line).unfinished.steps == [
+        RecordedStep(None, 2, 1.0, advice=asked if by else advice)
+    ]
+
+
+def test_the_actions_of_several_players_are_remembered_with_their_scores():
+    policy = {"action": 1, "reward": 2, "observed": 3, "by": "policy"}
+    watches = {"action": None, "reward": None}
+    past = recorded_trial(reset(), step(players={"a": policy, "b": watches}), step(players={"a": policy}))
+    first, second = past.unfinished.steps
+    assert first.players == {"a": RecordedAction(1, 2.0, 3, "policy"), "b": RecordedAction(None, 0.0)}
+    assert second.players == {"a": RecordedAction(1, 2.0, 3, "policy")}
+    assert past.unfinished.scores == {"a": 4.0, "b": 0.0}
+    assert recorded_trial(end(), past=past).ended == [Episode(1, 2, 2.0, "terminated", {"a": 4.0, "b": 0.0})]
+
+
+def test_it_is_remembered_for_which_members_of_a_session_the_trial_is_over():
+    refused = {"kind": "presence", "episode": 1, "player": "c", "what": "refused"}
+    came = {**refused, "player": "d", "what": "joined"}
+    assert recorded_trial(reset(), refused, came).outcomes == {"c": "ping"}
+    past = recorded_trial(reset(), refused, end("partnerLeft", outcomes={"a": "left", "b": "partnerLeft"}))
+    assert past.outcomes == {"a": "left", "b": "partnerLeft", "c": "ping"}
+    over = {"kind": "break", "episode": 1, "why": "partnerLeft", "outcomes": {"a": "left"}}
+    past = recorded_trial(reset(), step(), end(), over)
+    assert (past.outcomes, past.ended[0].why) == ({"a": "left"}, "partnerLeft")
+    for line in (end(outcomes=["a"]), step(outcomes={"a": "left"}), {**over, "outcomes": None}):
+        assert recorded_trial(reset(), line).outcomes == {}
+
+
+def test_a_step_that_is_the_last_for_two_reasons_has_terminated():
+    assert recorded_trial(reset(), step(terminated=True, truncated=True)).ended == [Episode(1, 1, 1.0, "terminated")]
+
+
+def test_feedback_names_the_player_who_gave_it():
+    said = [{"command": "good", "player": "b"}, {"command": "bad"}]
+    past = recorded_trial(reset(), step(messages=said))
+    assert past.unfinished.steps[0].feedback == (Word("good", "b"), Word("bad"))
 
 
 class MemoryStore:
@@ -310,6 +360,73 @@ def test_a_line_is_short_and_ends_where_the_next_begins():
     assert recording.line("step", a=float("nan"), b=1) == b'{"kind":"step","a":null,"b":1}\n'
 
 
+def test_the_time_of_a_line_is_written_in_utc():
+    time = datetime(2026, 11, 21, 14, 46, 40, 123456, UTC)
+    assert recording.line("step", time=time) == b'{"kind":"step","time":"2026-11-21T14:46:40.123456Z"}\n'
+    assert recording.line("step", time="now") == b'{"kind":"step","time":"now"}\n'
+
+
+SETTLED = [
+    {},
+    {"lives": 3, "level": 0.5, "over": False, "who": None, "name": "x" * 1_000},
+    {2**63: -(2**63)},
+    dict.fromkeys(range(100)),
+]
+UNSETTLED = [
+    {"a": []},
+    {"a": {}},
+    {"a": np.float32(1)},
+    {"a": "x" * 1_001},
+    {"x" * 1_001: 1},
+    {"a": 2**63 + 1},
+    {"a": -(2**63) - 1},
+    {(1, 2): 1},
+    dict.fromkeys(range(101)),
+    UserDict(a=1),
+]
+
+
+def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written():
+    assert all(recording.is_settled(info) for info in SETTLED)
+    assert not any(recording.is_settled(info) for info in UNSETTLED)
+    for info in SETTLED:
+        fields = {"step": 1, "info": info, "reward": float("nan")}
+        line = recording.line("step", **fields)
+        assert recording.text_of_line(recording.LaterLine("step", fields)) == recording.text_of_line(line) == line
+
+
+def test_an_info_may_have_a_million_bytes_of_json():
+    room = 1_000_000 - len('{"a":""}')
+    assert not recording.is_too_large({"a": "x" * room})
+    assert recording.is_too_large({"a": "x" * (room + 1)})
+    assert recording.is_too_large({"a": "x" * 1_000_001})
+    assert recording.is_too_large({"a": np.broadcast_to(np.uint8(0), (1 << 40,))}), "it is not even looked at"
+
+
+def test_the_values_of_a_step_share_a_million_bytes_of_json_in_their_order():
+    values = {"a": "x" * 999_994, "b": [1, 2], "c": 1, "d": 1234, "e": 123, "f": 1}
+    kept, too_large = recording.bounded_extra(values)
+    assert too_large == {"b": 5, "d": 4, "f": 1}
+    assert kept == values | {name: {"tooLarge": size} for name, size in too_large.items()}
+    assert recording.bounded_extra({"a": [1, 2]}, 5) == ({"a": [1, 2]}, {})
+    assert recording.bounded_extra({"a": [1, 2]}, 4) == ({"a": {"tooLarge": 5}}, {"a": 5})
+
+
+def test_after_a_hundred_values_that_are_too_large_the_rest_is_counted():
+    def left_out(values):
+        kept, too_large = recording.bounded_extra({str(number): "x" * 9 for number in range(values)}, 10)
+        assert len(too_large) == min(values, 100)
+        return kept.get("<cut off>")
+
+    assert [left_out(values) for values in (99, 100, 101, 103)] == [None, None, 1, 3]
+
+
+def test_a_name_for_which_there_is_no_room_is_cut_off():
+    kept, too_large = recording.bounded_extra({"n" * 2000: 1, "m" * 2001: 2}, 2001)
+    assert list(kept) == ["n" * 2000, "m" * 1000]
+    assert too_large == {}
+
+
 def test_an_observation_is_kept_with_its_shape():
     array = np.arange(6, dtype=np.int16).reshape(2, 3).T
     kept = recording.observation({"a": [array, "x"], "b": (np.array(["y"]),)})
@@ -333,8 +450,23 @@ def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_t
     assert recording.packages(tmp_path / "image") == names
 
 
+def test_a_recording_names_at_most_a_hundred_packages_whatever_is_written_in_the_file(tmp_path):
+    (tmp_path / "requirements.txt").write_text("\ufeff" + "\n".join(f"game{number}" for number in range(120)))
+    assert recording.packages(tmp_path) == tuple(f"game{number}" for number in range(100))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/requirements.txt").write_bytes(b"pillow\n\xff\n")
+    assert recording.packages(tmp_path / "other") == ()
+    assert Path(__file__).parents[3] / "requirements/project.txt" == recording.REQUIRED
+
+
 def test_the_versions_include_the_trial_python_and_its_packages():
-    assert {"trial", "python", "gymnasium", "numpy", "websockets"} <= recording.versions().keys()
+    found = recording.versions()
+    assert {"trial", "python", "gymnasium", "ale-py", "numpy", "websockets"} == found.keys()
+    assert (found["trial"], found["python"]) == ("1.0", platform.python_version())
+    assert recording.SCHEMA == 1, "as long as programs that read recordings may stay as they are"
+    assert "pillow" in recording.versions(("no-such-package-there-is", "pillow"))
+    installed = {name for name in ("pettingzoo", "onnxruntime") if find_spec(name)}
+    assert recording.versions(recording.OF_SEVERAL).keys() - found.keys() == installed
 
 
 def test_a_recording_is_dirty_until_it_is_flushed_and_closed_once(tmp_path):

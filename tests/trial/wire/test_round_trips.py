@@ -98,6 +98,10 @@ async def test_measuring_ends_with_the_connection(answers):
     assert len(reports) - known <= 1
 
 
+def test_a_ping_without_an_answer_counts_as_ten_seconds_as_docs_security_says():
+    assert (round_trips.MAX_SECONDS, round_trips.EVERY_SECONDS) == (10, 5)
+
+
 def test_a_ping_costs_sixteen_bytes():
     """As round_trips.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
     from websockets.frames import Frame
