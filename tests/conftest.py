@@ -51,6 +51,15 @@ WAITING = (
 
 They run beside tests that compute, and beside each other: a machine is best used by all kinds at once.
 """
+WEIGHTS = {
+    "tests/deploy/": 8,
+    "tests/simulation/": 8,
+    "tests/stateful/": 20,
+    "tests/export/": 5,
+    "tests/examples/": 5,
+    "tests/e2e/": 2,
+}
+"""How many times as long as the other tests of its kind a test takes here, roughly: of those that compute, its processor time."""
 _PLACES = sorted(
     ((place, number) for number, places in enumerate(ONE_AFTER_ANOTHER) for place in places),
     key=lambda entry: -len(entry[0]),
@@ -84,15 +93,20 @@ def _turn(item: pytest.Item) -> int:
 
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
     """Groups first; then files of all kinds, `WAITING` or not. The last tests are none that wait while the machine has no more to do."""
-    others = Counter(sorted(_file(item) for item in items if _group(item.nodeid) is None))
+    tests = Counter(sorted(_file(item) for item in items if _group(item.nodeid) is None))
+    work = {file: number * _weight(file) for file, number in tests.items()}
     places = {
-        file: place * (1 if _waiting(file) is None else 0.85) for file, place in interleaved(others, _waiting).items()
+        file: place * (1 if _waiting(file) is None else 0.85) for file, place in interleaved(work, _waiting).items()
     }
     return sorted(items, key=lambda item: (_turn(item), places.get(_file(item), 0), item.path))
 
 
 def _waiting(file: str) -> int | None:
     return next((kind for kind, places in enumerate(WAITING) if file.startswith(places)), None)
+
+
+def _weight(file: str) -> int:
+    return next((weight for place, weight in WEIGHTS.items() if file.startswith(place)), 1)
 
 
 def _file(item: pytest.Item) -> str:

@@ -41,17 +41,17 @@ def _size(left: int, workers: int) -> int:
 
 
 def interleaved(files: Mapping[str, int], kind: Callable[[str], object]) -> dict[str, float]:
-    """The place of each file, from 0 to 1, when files of all kinds take turns: the share of the tests of its kind that come before it.
+    """The place of each file, from 0 to 1, when files of all kinds take turns: the share of the work of its kind that comes before it.
 
-    `files` are the numbers of their tests.
+    `files` says how much work each file is.
     """
     of_kind, before = Counter[object](), Counter[object]()
-    for file, tests in files.items():
-        of_kind[kind(file)] += tests
+    for file, work in files.items():
+        of_kind[kind(file)] += work
     found = {}
-    for file, tests in files.items():
+    for file, work in files.items():
         found[file] = before[kind(file)] / of_kind[kind(file)]
-        before[kind(file)] += tests
+        before[kind(file)] += work
     return found
 
 

@@ -7,7 +7,7 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from tests.conftest import ONE_AFTER_ANOTHER, TESTS, _group
+from tests.conftest import ONE_AFTER_ANOTHER, TESTS, WEIGHTS, _group
 from tests.scheduling import MOST, TURNS, InUnits, interleaved, units
 
 WORKERS = 3
@@ -66,8 +66,8 @@ def test_the_longer_of_two_matching_places_decides_the_worker() -> None:
     assert _group("tests/trial/test_match.py::test_it") is None
 
 
-def test_every_place_of_one_after_another_exists() -> None:
-    places = [place for places in ONE_AFTER_ANOTHER for place in places]
+def test_every_place_that_the_order_names_exists() -> None:
+    places = [*WEIGHTS, *(place for places in ONE_AFTER_ANOTHER for place in places)]
     assert [place for place in places if not (TESTS.parent / place).exists()] == []
 
 
@@ -95,7 +95,7 @@ def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
     assert alone.done[:100] == NAMES[:100]
 
 
-def test_files_of_two_kinds_take_turns_by_their_numbers_of_tests() -> None:
+def test_files_of_two_kinds_take_turns_by_their_work() -> None:
     files = {"a/1": 10, "a/2": 30, "b/1": 1, "b/2": 2, "b/3": 1}
     found = interleaved(files, lambda file: file[0])
     assert found == {"a/1": 0, "a/2": 0.25, "b/1": 0, "b/2": 0.25, "b/3": 0.75}
