@@ -48,11 +48,6 @@ class Server:
         self.shell = spawn(
             PYTHON_TRIAL, self.notes, self.log, mark=self.mark, folder=folder / "agent", environment=environment
         )
-        shell = psutil.Process(self.shell.pid)
-        # `Popen` returns before the system has finished the start of the program: for a moment it shows no words.
-        until(shell.cmdline, 60)
-        self.seen = [word for word in shell.cmdline() if word.strip()]
-        self.is_shell = processes.is_shell(shell)
 
     def process(self) -> psutil.Process:
         """Return the server's process, once the server listens."""
@@ -80,8 +75,12 @@ def test_the_system_shows_the_server_and_the_shell_that_waits_for_it(spawn: Any,
     finally:
         os.umask(before)
     command = [PYTHON_TRIAL[0], "-X", server.mark, *PYTHON_TRIAL[1:]]
-    assert server.seen == ["/bin/sh", "-c", processes.SHELL, str(server.notes), *command]
-    assert server.is_shell
+    shell = psutil.Process(server.shell.pid)
+    # `Popen` returns before the system has finished the start of the program: for a moment it shows no words.
+    until(shell.cmdline, 60)
+    seen = [word for word in shell.cmdline() if word.strip()]
+    assert seen == ["/bin/sh", "-c", processes.SHELL, str(server.notes), *command]
+    assert processes.is_shell(shell)
     process = server.process()
     assert [word for word in process.cmdline() if word.strip()] == command
     assert not processes.is_shell(process)
