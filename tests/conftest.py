@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from _pytest.runner import runtestprotocol
 from _pytest.unraisableexception import gc_collect_iterations_key
 from werkzeug.serving import BaseWSGIServer
 
@@ -25,7 +24,6 @@ from tests.scheduling import interleaved
 
 TESTS = Path(__file__).resolve().parent
 HUNT_TIMEOUT = 900  # seconds of a test that takes all its cases, where `make test` takes one of twelve
-NOTED = 0.01  # seconds that a fixture takes before `--durations` should list it
 _STUDIES = ("examples", "german_study", "gridworld_browser", "teaching")
 ONE_AFTER_ANOTHER = (
     ("tests/browser/test_together_browser.py",),
@@ -182,16 +180,6 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_sessionfinish() -> None:
     """Python itself looks for garbage twice at its end, which takes each worker seconds. It need not look through what is left."""
     gc.freeze()
-
-
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """A worker only sends the reports that say something: six messages of each of 10,000 tests took 15 s of processor time."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        return None
-    for report in runtestprotocol(item, log=False, nextitem=nextitem):
-        if report.when == "call" or not report.passed or report.duration >= NOTED:
-            item.ihook.pytest_runtest_logreport(report=report)
-    return True
 
 
 _BEGUN = time.monotonic()
