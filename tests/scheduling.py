@@ -14,7 +14,7 @@ from xdist.scheduler import LoadGroupScheduling
 from xdist.workermanage import WorkerController
 
 MOST = 8
-"""So many tests of a file are one unit while many are left."""
+"""So many tests of a file are one unit while many are left, however long they take."""
 
 TURNS = 100
 """Of what is left, each worker gets at least this many units, so that none has much to do when the others have finished."""

@@ -142,7 +142,6 @@ def test_the_tests_of_every_module_exist() -> None:
 
 
 def test_each_change_that_changes_nothing_is_listed_for_code_that_is_there() -> None:
-    for module, was, becomes in equivalent():
-        lines = {line.strip() for line in ast.unparse(ast.parse((ROOT / module).read_text())).splitlines()}
-        assert was in lines
-        assert becomes not in lines
+    for module, was, _ in equivalent():
+        lines = [line.strip() for line in ast.unparse(ast.parse((ROOT / module).read_text())).splitlines()]
+        assert lines.count(was) == 1, "a second one may mean something else"

@@ -126,6 +126,8 @@ def _size(value: object) -> int:
             if isinstance(one, list | tuple | set | frozenset):
                 rest.append(iter(one))
                 break
+            if size > MAX_MADE:  # a long list without others in it
+                break
         else:
             rest.pop()
     return size

@@ -1,7 +1,7 @@
 """The mutants of a module: its source with one small change each, made on the syntax tree.
 
-Annotations, decorators, docstrings, log calls, f-strings and strings of several words stay as they are: no test should
-judge wording.
+Annotations, decorators, docstrings, log calls (`failure` is one), f-strings and strings of several words stay as they
+are: no test should judge wording.
 
 No package does this well. mutmut 3.8 leaves out every property, and all code outside of functions (tables, regular
 expressions). cosmic-ray 8.7 never leaves a statement out, changes the sources in their own folder, and a fifth of its

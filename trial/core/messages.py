@@ -157,7 +157,8 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
     if "command" in value and not known:
         raise BadMessage(f"unknown command {_short(command)}")
     action = value.get("action")
-    if "action" in value and (not isinstance(action, str) or not 0 < len(action) <= 64):
+    # In the controls, a zero byte begins the names of keys, which have rules of their own.
+    if "action" in value and (not isinstance(action, str) or not 0 < len(action) <= 64 or "\0" in action):
         raise BadMessage("action must be the name of an action")
     held = value.get("held")
     key = value.get("key")

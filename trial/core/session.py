@@ -377,7 +377,10 @@ class TrialSession:
     # ---- what clients are told
 
     def wake_at(self, now: float) -> float | None:
-        """Return when to call `attend` again if nothing happens before; None if there is no need."""
+        """Return when to call `attend` again if nothing happens before; None if there is no need.
+
+        Do not call it once the trial is over: nobody attends then.
+        """
         if self.settled:
             return None
         wake_at = self.presence.wake_at(now, on_break=self._progress.on_break)

@@ -40,6 +40,7 @@ def test_data_that_are_no_json_object_are_refused(data):
         ({"action": ""}, "action must be the name of an action"),
         ({"action": "x" * 65}, "action must be the name of an action"),
         ({"action": None}, "action must be the name of an action"),
+        ({"action": "\0up"}, "action must be the name of an action"),
         ({"held": True}, "held must be true or false and come with an action or a key"),
         ({"action": "up", "held": 1}, "held must be true or false and come with an action or a key"),
         ({"changeFrameRate": "fast"}, "changeFrameRate must be 'faster', 'slower' or a number"),
@@ -579,8 +580,6 @@ def test_the_largest_frame_is_read():
 def test_a_jpeg_may_have_as_long_a_side_as_libjpeg_allows():
     long = frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE, 1), np.uint8))
     assert Image.open(io.BytesIO(long)).size == (frames.MAX_JPEG_SIDE, 1)
-    with pytest.raises((OSError, SystemError)):
-        frames.jpeg(np.zeros((1, frames.MAX_JPEG_SIDE + 1, 1), np.uint8))
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ async def test_measuring_ends_with_the_connection(answers):
     assert len(reports) - known <= 1
 
 
-def test_a_ping_without_an_answer_counts_as_ten_seconds_as_docs_security_says():
+def test_the_seconds_of_pings_are_those_of_the_documents():
     assert (round_trips.MAX_SECONDS, round_trips.EVERY_SECONDS) == (10, 5)
 
 
