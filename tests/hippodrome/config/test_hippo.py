@@ -418,7 +418,7 @@ def paths(document: dict[str, Any]) -> list[str]:
         (Plain(1.5, "1.5"), "1-5"),
         (Plain(12, "12"), Plain(12, "12")),
         (Plain(True, "yes"), Plain(True, "yes")),
-        ("X study", "X-study"),
+        ("X study", "X-study"),  # no letter at the beginning is taken away
         ("", ""),
         (None, None),
         (["a"], ["a"]),
