@@ -24,6 +24,7 @@ SESSIONS = (
 )
 TRIALS = (
     "trial/core/test_decisions",
+    "trial/core/test_ends",
     "trial/core/test_turns",
     "trial/core/test_keys",
     "trial/core/test_flow_control",

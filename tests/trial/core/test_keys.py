@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.trial.core.test_decisions import Driver
+from tests.trial.core.trial_driver import Driver
 from trial.core import messages
 from trial.core.controls import KEY, Controls
 from trial.core.effects import RecordLine, SendMessage, SendState, StepCall

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from tests.trial.core.test_decisions import Driver
+from tests.trial.core.trial_driver import Driver
 from tests.trial.session_driver import SessionDriver
 from trial.core.effects import SendMessage
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from testing.exploration import examples
-from tests.trial.core.test_decisions import FRAME, Driver, sent
+from tests.trial.core.trial_driver import FRAME, Driver, sent
 from trial.core import messages
 from trial.core.effects import (
     Begun,
