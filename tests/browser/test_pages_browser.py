@@ -283,8 +283,10 @@ def test_the_start_button_appears_with_the_first_picture(world: World, tab: Any)
     """A button that appeared earlier would move with the first picture, and a tap on it would be lost."""
     pictures = threading.Event()
     world.before_pictures = lambda: pictures.wait(PATIENCE / 1000)
-    pause = "if (event.animationName === 'unseen') event.target.getAnimations()[0].pause();"
-    tab.add_init_script(f"addEventListener('animationstart', (event) => {{ {pause} }})")
+    tab.add_init_script(
+        "const sheet = new CSSStyleSheet(); sheet.replaceSync('* { animation-play-state: paused !important }');"
+        "document.adoptedStyleSheets = [sheet];"
+    )
     world.step = 2
     world.ready()
     tab.goto(world.url)
