@@ -31,6 +31,7 @@ from typing import Any, Self
 import botocore.handlers
 import pytest
 from botocore.awsrequest import AWSResponse
+from moto.ecs.models import EC2ContainerServiceBackend
 
 from bots.addresses import OneSite
 from deploy.operate.doctor.play import play as whole
@@ -83,8 +84,10 @@ class RunningInstallation(Installed):
         self.troubles: list[str] = []
 
     def __enter__(self) -> Self:
+        all_tasks = EC2ContainerServiceBackend.list_tasks
         super().__enter__()
         try:
+            self._stop_slowly(all_tasks)
             self._begin()
         except BaseException:
             self.__exit__(*sys.exc_info())
@@ -233,6 +236,7 @@ class RunningInstallation(Installed):
         self._ended.add(arn)
         self._servers.pop(arn, None)
         task = self.task(arn)
+        task.last_status = "STOPPED"
         task.execution_stopped_at = task.stopped_at = datetime.now(UTC)
         reason = task.stopped_reason
         code = "UserInitiated" if reason else "EssentialContainerExited"
@@ -244,6 +248,27 @@ class RunningInstallation(Installed):
         self.client("sqs").send_message(QueueUrl=self.ids["task_queue"], MessageBody=body)
 
     # -- what moto lacks
+
+    def _stop_slowly(self, all_tasks: Callable[..., Any]) -> None:
+        """Gap: a task of moto is STOPPED at once; on AWS it is stopping, and may store data, until its process has ended.
+
+        https://docs.aws.amazon.com/AmazonECS/latest/developerguide/task-lifecycle-explanation.html
+        """
+        stop_task, list_tasks = EC2ContainerServiceBackend.stop_task, EC2ContainerServiceBackend.list_tasks
+
+        def stop(backend: Any, *args: Any, **more: Any) -> Any:
+            task = stop_task(backend, *args, **more)
+            if task.task_arn in self._processes and task.task_arn not in self._ended:
+                task.last_status = "STOPPING"
+            return task
+
+        def listed(backend: Any, *args: Any, **more: Any) -> Any:
+            if "STOPPED" not in (*args, *more.values()):
+                return list_tasks(backend, *args, **more)
+            return [task for task in all_tasks(backend, *args, **more) if task.last_status == "STOPPING"]
+
+        self._patch(EC2ContainerServiceBackend, "stop_task", stop)
+        self._patch(EC2ContainerServiceBackend, "list_tasks", listed)
 
     def _before_call(self, model: Any, params: Any, context: dict[str, Any], **_: Any) -> Any:
         action = f"{model.service_model.service_name}:{model.name}"
