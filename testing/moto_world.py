@@ -249,10 +249,11 @@ class MotoWorld:
         # Gap: ListTasks gives tasks in any state; on ECS only those not told to stop, unless it is asked for the others.
         list_tasks = EC2ContainerServiceBackend.list_tasks
 
-        def list_living(backend: Any, *args: Any, **kwargs: Any) -> Any:
-            return [task for task in list_tasks(backend, *args, **kwargs) if task.desired_status == "RUNNING"]
+        def list_asked(backend: Any, *args: Any, **kwargs: Any) -> Any:
+            asked = "STOPPED" if "STOPPED" in (*args, *kwargs.values()) else "RUNNING"
+            return [task for task in list_tasks(backend, *args, **kwargs) if task.desired_status == asked]
 
-        self._patch(EC2ContainerServiceBackend, "list_tasks", list_living)
+        self._patch(EC2ContainerServiceBackend, "list_tasks", list_asked)
 
         # Gap: a cluster with tasks can be deleted; ECS says ClusterContainsTasksException.
         delete_cluster = EC2ContainerServiceBackend.delete_cluster

@@ -84,10 +84,9 @@ class RunningInstallation(Installed):
         self.troubles: list[str] = []
 
     def __enter__(self) -> Self:
-        all_tasks = EC2ContainerServiceBackend.list_tasks
         super().__enter__()
         try:
-            self._stop_slowly(all_tasks)
+            self._stop_slowly()
             self._begin()
         except BaseException:
             self.__exit__(*sys.exc_info())
@@ -249,12 +248,12 @@ class RunningInstallation(Installed):
 
     # -- what moto lacks
 
-    def _stop_slowly(self, all_tasks: Callable[..., Any]) -> None:
+    def _stop_slowly(self) -> None:
         """Gap: a task of moto is STOPPED at once; on AWS it is stopping, and may store data, until its process has ended.
 
         https://docs.aws.amazon.com/AmazonECS/latest/developerguide/task-lifecycle-explanation.html
         """
-        stop_task, list_tasks = EC2ContainerServiceBackend.stop_task, EC2ContainerServiceBackend.list_tasks
+        stop_task = EC2ContainerServiceBackend.stop_task
 
         def stop(backend: Any, *args: Any, **more: Any) -> Any:
             task = stop_task(backend, *args, **more)
@@ -262,13 +261,7 @@ class RunningInstallation(Installed):
                 task.last_status = "STOPPING"
             return task
 
-        def listed(backend: Any, *args: Any, **more: Any) -> Any:
-            if "STOPPED" not in (*args, *more.values()):
-                return list_tasks(backend, *args, **more)
-            return [task for task in all_tasks(backend, *args, **more) if task.last_status == "STOPPING"]
-
         self._patch(EC2ContainerServiceBackend, "stop_task", stop)
-        self._patch(EC2ContainerServiceBackend, "list_tasks", listed)
 
     def _before_call(self, model: Any, params: Any, context: dict[str, Any], **_: Any) -> Any:
         action = f"{model.service_model.service_name}:{model.name}"

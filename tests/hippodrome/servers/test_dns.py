@@ -22,13 +22,19 @@ from testing.servers import Servers
 PEOPLE = ("alice", "bob")
 
 
+def installation() -> FakePlatform:
+    """Return an installation with a study of one game."""
+    platform = FakePlatform()
+    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
+    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    return platform
+
+
 @pytest.fixture
 def platform() -> FakePlatform:
     """An installation with the running servers of two participants, each with a pending DNS change of its own."""
-    platform = FakePlatform()
+    platform = installation()
     platform.dns.slow = True
-    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
-    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
     servers = Servers(platform)
     for number, user in enumerate(PEOPLE):
         servers.start(StartServer("maze", user))
@@ -66,16 +72,11 @@ def test_a_server_is_ready_when_its_change_is_in_sync_and_other_changes_are_chec
 
 
 def test_a_server_that_becomes_ready_in_the_process_that_named_it_is_read_once() -> None:
-    platform = FakePlatform()
-    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
-    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    platform = installation()
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
-    (task,) = platform.tasks.running
     platform.documents.calls.clear()
-    assert (
-        servers.tasks_changed([TaskChanged(task, "hippodrome", name("alice"), "RUNNING", "eni", None, "", None)]) == []
-    )
+    assert servers.tasks_changed([running(platform, "alice", "eni")]) == []
     assert from_json(platform.documents.kept[server.key(ids.server_label("maze", "alice"))][0], Server).ready
     assert platform.documents.calls.count("get") == 1
 
@@ -266,9 +267,7 @@ def running(platform: FakePlatform, user: str, interface: str) -> TaskChanged:
 
 
 def test_an_unknown_address_is_asked_for_a_limited_number_of_times() -> None:
-    platform = FakePlatform()
-    project = Project(id="maze", steps=[Step(key="1", page="game"), Step(key="2", page="end")], live=True, secret="0")
-    platform.documents.put(MASTER_LIST, to_json(MasterList(projects=[project])))
+    platform = installation()
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
     asked = running(platform, "alice", "eni-bare")

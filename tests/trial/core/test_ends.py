@@ -283,7 +283,9 @@ def test_an_agent_that_hangs_ends_the_trial_and_is_called_no_more():
     assert "cannot go on" in sent(effects)[0]["error"]
     assert not driver.of(Call), "not even for the feedback"
     assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
-    assert sent(driver.connect("tab again"))[1] == sent(effects)[0], "whoever comes now is told as well"
+    assert sent(driver.connect("tab again"))[1] == sent(effects)[0], (
+        "a client that connects after the failure gets the same message"
+    )
     done = driver.event("answer_saved", driver.now)[-1]
     assert done == SendDone("tab again", 0, 0, words=TRIAL_FAILED), "the end says so as well"
 
