@@ -46,13 +46,14 @@ def erase(world: Installed) -> None:
         ),
         (
             stop,
-            {"ListTasks": 4, "DescribeTasks": 1, "ListClusters": 4, "ListResourceRecordSets": 2}
+            # Each look after the first describes what was stopped: ECS lists stopped tasks for an hour or longer.
+            {"ListTasks": 4, "DescribeTasks": 2, "ListClusters": 4, "ListResourceRecordSets": 2}
             | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 7}
             | {"StopTask": 2, "ChangeResourceRecordSets": 2, "DeleteSchedule": 2, "PutObject": 1},
         ),
         (
             erase,
-            {"ListTasks": 6, "DescribeTasks": 3, "ListClusters": 6, "ListResourceRecordSets": 2}
+            {"ListTasks": 6, "DescribeTasks": 5, "ListClusters": 6, "ListResourceRecordSets": 2}
             | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 2, "DescribeStacks": 1, "GetCallerIdentity": 1}
             | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1}
             # their documents, their sessions' documents, and their entries in the lobby
