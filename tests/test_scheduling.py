@@ -7,12 +7,14 @@ from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
-from tests.conftest import ONE_AFTER_ANOTHER, TESTS, WEIGHTS, _group
-from tests.scheduling import MOST, TURNS, InUnits, interleaved, units
+from tests.conftest import ONE_AFTER_ANOTHER, TESTS, WAITING, _group
+from tests.scheduling import MOST, TURNS, InUnits, units
 
 WORKERS = 3
+PROCESSORS = 2
 FILES = [f"tests/test_{number}.py" for number in range(30)]
 SHARED = FILES[0]
+WAIT = FILES[1:6]
 NAMES = [f"{file}::test_it[{number}]" for file in FILES for number in range(100)]
 
 
@@ -20,7 +22,11 @@ def group(name: str) -> int | None:
     return 0 if name.startswith(SHARED) else None
 
 
-FOUND = units(NAMES, group, WORKERS)
+def computes(name: str) -> bool:
+    return name.split("::", maxsplit=1)[0] not in WAIT
+
+
+FOUND = units(NAMES, group, computes, WORKERS)
 
 
 def test_each_unit_is_a_group_or_a_few_tests_of_one_file_that_follow_each_other() -> None:
@@ -38,6 +44,11 @@ def test_units_are_smaller_the_less_is_left() -> None:
         left = len(NAMES) - place
         assert group(name) is not None or sizes[FOUND[name]] <= max(1, (left + MOST) // (TURNS * WORKERS))
     assert {sizes[FOUND[name]] for name in NAMES[-TURNS * WORKERS :]} == {1}
+
+
+def test_a_test_that_waits_is_a_unit() -> None:
+    sizes = Counter(FOUND.values())
+    assert {sizes[FOUND[name]] for name in NAMES if not computes(name)} == {1}
 
 
 class Gateway:
@@ -67,26 +78,40 @@ def test_the_longer_of_two_matching_places_decides_the_worker() -> None:
 
 
 def test_every_place_that_the_order_names_exists() -> None:
-    places = [*WEIGHTS, *(place for places in ONE_AFTER_ANOTHER for place in places)]
+    places = [place for places in ONE_AFTER_ANOTHER for place in places]
     assert [place for place in places if not (TESTS.parent / place).exists()] == []
+    assert [place for place in WAITING if not list(TESTS.parent.glob(f"{place}*"))] == []
 
 
-def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
-    config: Any = SimpleNamespace(getvalue=lambda _: ["3*popen"], option=SimpleNamespace(loadscopereorder=True))
-    scheduler, workers = InUnits(config, None, group), [Worker(NAMES) for _ in range(WORKERS)]
+def scheduled() -> tuple[InUnits, list[Worker], Any]:
+    config: Any = SimpleNamespace(
+        getvalue=lambda _: [f"{WORKERS}*popen"], option=SimpleNamespace(loadscopereorder=True)
+    )
+    scheduler = InUnits(config, None, group, computes, PROCESSORS)
+    workers = [Worker(NAMES) for _ in range(WORKERS)]
     for worker in workers:
         scheduler.add_node(worker)
         scheduler.add_node_collection(worker, NAMES)
     scheduler.schedule()
+    return scheduler, workers, config
+
+
+def work(scheduler: InUnits, worker: Worker) -> None:
+    """Do one test."""
+    place = worker.left.pop(0)
+    worker.done.append(NAMES[place])
+    for _ in range(2):  # with subtests a test reports more than once
+        scheduler.mark_test_complete(worker, place)
+
+
+def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
+    scheduler, workers, config = scheduled()
     while any(worker.left for worker in workers):
         for worker in workers:
             assert len(worker.left) > 1 or not scheduler.workqueue, "a worker runs a test once it knows the next"
             if worker.left:
-                place = worker.left.pop(0)
-                worker.done.append(NAMES[place])
-                for _ in range(2):  # with subtests a test reports more than once
-                    scheduler.mark_test_complete(worker, place)
-            assert len(scheduler.assigned_work[worker]) <= 3  # of each a test is left
+                work(scheduler, worker)
+            assert len(scheduler.assigned_work[worker]) <= 4  # of each a test is left
     assert sorted(name for worker in workers for name in worker.done) == sorted(NAMES)
     assert all(worker.shutting_down for worker in workers)
     assert not scheduler.has_pending
@@ -95,7 +120,17 @@ def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
     assert alone.done[:100] == NAMES[:100]
 
 
-def test_files_of_two_kinds_take_turns_by_their_work() -> None:
-    files = {"a/1": 10, "a/2": 30, "b/1": 1, "b/2": 2, "b/3": 1}
-    found = interleaved(files, lambda file: file[0])
-    assert found == {"a/1": 0, "a/2": 0.25, "b/1": 0, "b/2": 0.25, "b/3": 0.75}
+def test_as_many_workers_compute_as_there_are_processors_while_the_others_wait() -> None:
+    scheduler, workers, _ = scheduled()
+    for worker in workers:
+        while not all(name.startswith(tuple(FILES[1:])) for name in [NAMES[place] for place in worker.left]):
+            work(scheduler, worker)
+    for _ in range(50):
+        for worker in workers:
+            work(scheduler, worker)
+        assert sum(computes(NAMES[worker.left[-1]]) for worker in workers) == PROCESSORS
+    while any(worker.left for worker in workers):
+        for worker in workers:
+            if worker.left:
+                work(scheduler, worker)
+    assert sum(len(worker.done) for worker in workers) == len(NAMES)
