@@ -47,8 +47,9 @@ from moto.moto_api._internal.moto_random import MotoRandom
 from werkzeug.exceptions import HTTPException
 
 
+@functools.cache
 def keep() -> None:
-    """Keep results from now on, in this process and in the processes that are forked from it."""
+    """Keep results from now on, in this process and in the processes that are forked from it. Once is enough."""
     # moto makes thousands of machine images for each region in which EC2 is called; no test needs one.
     os.environ["MOTO_EC2_LOAD_DEFAULT_AMIS"] = "false"
     # Nor does a test ask which types of instances there are: a million values in each process, 80 MB.

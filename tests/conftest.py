@@ -9,7 +9,6 @@ import shutil
 import signal
 import socketserver
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,8 @@ import pytest
 from _pytest.unraisableexception import gc_collect_iterations_key
 from werkzeug.serving import BaseWSGIServer
 
-from testing import exploration, memoized_aws
+from testing import exploration
 from tests import files_in_memory, forked_workers
-from tests.scheduling import interleaved
 
 TESTS = Path(__file__).resolve().parent
 HUNT_TIMEOUT = 900  # seconds of a test that takes all its cases, where `make test` takes one of twelve
@@ -44,22 +42,18 @@ ONE_AFTER_ANOTHER = (
 Of two places that fit a test, the longer one counts.
 """
 WAITING = (
-    ("tests/e2e/", "tests/trial/test_", "tests/trial/wire/"),
-    ("tests/examples/", "tests/local/", "tests/trial/interactive_gym/"),
+    "tests/browser/",
+    "tests/ministack/",
+    "tests/trial/gym/",
+    "tests/certificate/",
+    "tests/trial/test_",
+    "tests/trial/wire/",
+    "tests/e2e/",
+    "tests/examples/",
+    "tests/trial/interactive_gym/",
+    "tests/local/",
 )
-"""Two kinds of tests that wait for processes: nearly all the time, and mostly.
-
-They run beside tests that compute, and beside each other: a machine is best used by all kinds at once.
-"""
-WEIGHTS = {
-    "tests/deploy/": 8,
-    "tests/simulation/": 8,
-    "tests/stateful/": 20,
-    "tests/export/": 5,
-    "tests/examples/": 5,
-    "tests/e2e/": 2,
-}
-"""How many times as long as the other tests of its kind a test takes here, roughly: of those that compute, its processor time."""
+"""Tests that wait for processes most of the time, in the order in which they begin. They run beside the others, which compute."""
 _PLACES = sorted(
     ((place, number) for number, places in enumerate(ONE_AFTER_ANOTHER) for place in places),
     key=lambda entry: -len(entry[0]),
@@ -74,7 +68,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 for _name in ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "PYTHON", "PYTHONPATH"):
     os.environ.pop(_name, None)
-memoized_aws.keep()
 exploration.load_profile()
 # A server of http.server or Werkzeug that is shut down sees that when it looks next: by default twice a second.
 for _server in (socketserver.BaseServer, BaseWSGIServer):
@@ -92,25 +85,16 @@ def _turn(item: pytest.Item) -> int:
 
 
 def _in_order(items: Sequence[pytest.Item]) -> list[pytest.Item]:
-    """Groups first; then files of all kinds, `WAITING` or not. The last tests are none that wait while the machine has no more to do."""
-    tests = Counter(sorted(_file(item) for item in items if _group(item.nodeid) is None))
-    work = {file: number * _weight(file) for file, number in tests.items()}
-    places = {
-        file: place * (1 if _waiting(file) is None else 0.85) for file, place in interleaved(work, _waiting).items()
-    }
-    return sorted(items, key=lambda item: (_turn(item), places.get(_file(item), 0), item.path))
+    """Groups first, then tests that wait: they are not the last ones, when the machine has no more to do beside them."""
+    return sorted(items, key=lambda item: (_turn(item), _waiting(item.nodeid), item.path))
 
 
-def _waiting(file: str) -> int | None:
-    return next((kind for kind, places in enumerate(WAITING) if file.startswith(places)), None)
+def _waiting(nodeid: str) -> int:
+    return next((number for number, place in enumerate(WAITING) if nodeid.startswith(place)), len(WAITING))
 
 
-def _weight(file: str) -> int:
-    return next((weight for place, weight in WEIGHTS.items() if file.startswith(place)), 1)
-
-
-def _file(item: pytest.Item) -> str:
-    return item.nodeid.split("::")[0]
+def _computes(nodeid: str) -> bool:
+    return not nodeid.startswith(WAITING)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -150,7 +134,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         return None
     from tests.scheduling import InUnits
 
-    return InUnits(config, log, _group)
+    return InUnits(config, log, _group, _computes)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -172,8 +156,15 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Do not look for garbage when all is over: pytest would five times, and nobody reads what it finds then."""
+    """Prepare a process that runs tests; not the one that gives them to workers, which does without botocore and moto.
+
+    Nor look for garbage when all is over: pytest would five times, and nobody reads what it finds then.
+    """
     config.stash[gc_collect_iterations_key] = 0
+    if hasattr(config, "workerinput") or config.getoption("dist", "no") == "no":
+        from testing import memoized_aws
+
+        memoized_aws.keep()
 
 
 @pytest.hookimpl(trylast=True)
