@@ -27,6 +27,8 @@ HERE = Path(__file__).parent
 LOOK_EVERY = 50
 """ms between two looks of `Page.wait_for_function`. By default it looks 60 times a second, and has the page draw as often."""
 WHOLE_STUDIES = ("test_study.py", "test_two_participants.py")
+ONE_PROCESS = "--renderer-process-limit=1"
+"""All pages of a context share a process of the browser, which takes as long to start as a page to load."""
 
 
 class SharedBrowser:
@@ -52,7 +54,7 @@ class SharedBrowser:
                 self._playwright = self._open.enter_context(sync_playwright())
             if self._browser is not None:
                 self._browser.close()
-            self._browser = self._playwright.chromium.launch(executable_path=path, args=list(ARGUMENTS))
+            self._browser = self._playwright.chromium.launch(executable_path=path, args=[*ARGUMENTS, ONE_PROCESS])
             self._path = path
         return self._browser
 
