@@ -13,11 +13,11 @@ from testing.simulation.world import SimulatedWorld
 def assert_no_fault_does_harm(journey: SimulatedJourney, seed: int, tried: int | None = None) -> None:
     """Run the journey with each kind of fault at one of `tried` calls: each run must end well.
 
-    Without a number, at one of 150 calls, and of more than 600 calls at four.
+    Without a number, at one of 300 calls, and of more than 600 calls at two.
     """
     points = faults.points(journey, seed)
     assert len(points) > 100
-    tried = tried or max(150, len(points) // len(faults.FAULTS) // 4)
+    tried = tried or max(300, len(points) // len(faults.FAULTS) // 2)
     outcomes = [
         faults.run(journey, seed, point)[1] for point in sample_of_each(points, tried, lambda point: point.fault)
     ]

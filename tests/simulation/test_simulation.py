@@ -53,7 +53,7 @@ def test_a_journey_without_faults_ends_as_expected(journey):
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("journey", faults.JOURNEYS, ids=lambda journey: journey.name)
 def test_a_fault_at_any_call_strands_no_participant_and_leaves_nothing(journey):
-    assert_no_fault_does_harm(journey, SEED, tried=48)
+    assert_no_fault_does_harm(journey, SEED, tried=96)
 
 
 def test_without_the_sweep_and_with_one_delivery_faults_leave_something_behind(monkeypatch):

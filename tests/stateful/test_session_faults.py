@@ -184,7 +184,7 @@ def test_each_journey_without_faults_ends_well(name: str) -> None:
 @pytest.mark.parametrize("name", JOURNEYS)
 def test_a_fault_at_any_call_strands_no_participant_and_leaves_nothing(name: str) -> None:
     wrong: list[str] = []
-    for number, fault in sample_of_each(places(name), 24, lambda place: place[1].fault, seed=len(name)):
+    for number, fault in sample_of_each(places(name), 48, lambda place: place[1].fault, seed=len(name)):
         world: SessionWorld | None = None
         try:
             world, _ = begin(name, (number, fault))

@@ -179,7 +179,7 @@ def test_each_zip_runs_with_nothing_but_the_runtime(
     for_here: dict[str, build.Function], runtime: Path, tmp_path: Path
 ) -> None:
     tree = build._Tree(packages.ROOT)
-    for name, function in sample(for_here.items(), 4):
+    for name, function in sample(for_here.items(), 8):
         place = tmp_path / name
         zipfile.ZipFile(io.BytesIO(function.pack())).extractall(place)
         closure = build._closure([f"lambdas.{name}"], tree.sources, build.OURS)
@@ -224,7 +224,7 @@ def test_the_same_input_gives_the_same_bytes(
     finally:
         os.chdir(before)
     assert {name: again[name].key for name in built} == {name: function.key for name, function in built.items()}
-    for name, function in sample(built.items(), 4):
+    for name, function in sample(built.items(), 8):
         packed = again[name].pack()
         bytecode._made.clear()  # then it is compiled again
         assert hashlib.sha256(packed).digest() == hashlib.sha256(function.pack()).digest()

@@ -485,7 +485,7 @@ class CtrlC:
 
 @pytest.mark.explores
 @pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
-@pytest.mark.parametrize("at", sample(range(1, 181, 4), 20))
+@pytest.mark.parametrize("at", sample(range(1, 181, 4), 40))
 def test_interrupted_at_any_call_the_next_run_ends_clean(
     stack: RealStack, monkeypatch: pytest.MonkeyPatch, at: int, before: bool
 ) -> None:

@@ -105,12 +105,12 @@ def assert_whole(world: World) -> None:
 def check_every_interruption(
     world: World, ctrl_c: CtrlC, deploy_study: Callable[[], int], afterwards: bool, before: Callable[[], None]
 ) -> None:
-    """Interrupt the command at its n-th call and run it again, for every n (in `make test` one of six)."""
+    """Interrupt the command at its n-th call and run it again, for every n (in `make test` one of twelve)."""
     before()
     assert deploy_study() == Exit.DONE
     assert_whole(world)
     assert len(ctrl_c.calls) > 30
-    for n in sample(range(len(ctrl_c.calls)), 6):
+    for n in sample(range(len(ctrl_c.calls)), 12):
         empty_account(world)
         before()
         ctrl_c.at, ctrl_c.afterwards = n, afterwards

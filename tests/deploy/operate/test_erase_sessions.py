@@ -234,7 +234,7 @@ def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_
 
     calls = check(0)
     assert calls >= 8
-    for at in sample(range(1, calls + 1), 3, seed=after):
+    for at in sample(range(1, calls + 1), 6, seed=after):
         check(at)
 
 
