@@ -273,7 +273,7 @@ def test_fresh_moves_the_data_aside(local: Make) -> None:
     walker.until("ready")
     here.kill()
     here.run("--fresh")
-    assert here.servers() == []
+    _gone(here)
     here.wait_for_text("Earlier data are in .hippodrome/earlier/data-")
     [moved] = (here.place / ".hippodrome" / "earlier").rglob("answers/1.json")
     assert "one" in moved.read_text()
