@@ -50,8 +50,8 @@ def _size(left: int, workers: int) -> int:
 class InUnits(LoadGroupScheduling):
     """Gives workers these units, and forgets what they have done.
 
-    As many workers as the machine has processors do tests that compute, as long as there are any; the others do tests that
-    wait for processes. So the machine has always something to do.
+    As many workers as the machine has processors, but at most half of them, do tests that compute, as long as there are any; the
+    others do tests that wait for processes. So the machine has always something to do.
     """
 
     def __init__(
@@ -60,12 +60,10 @@ class InUnits(LoadGroupScheduling):
         log: Any,
         group: Callable[[str], int | None],
         computes: Callable[[str], bool],
-        processors: int | None = None,
     ) -> None:
         super().__init__(config, log)
         self._group = group
         self._computes = computes
-        self._processors = processors or os.cpu_count() or 1
         self._units: Mapping[str, str] = {}
         self._places: Mapping[str, int] = {}
         self._computing: Set[str] = frozenset()
@@ -106,7 +104,8 @@ class InUnits(LoadGroupScheduling):
         if self._group(next(iter(self.workqueue[first]))) is not None:
             return first
         last = [next(reversed(work)) for other, work in self.assigned_work.items() if work and other is not node]
-        wanted = sum(unit in self._computing for unit in last) < self._processors
+        most = min(os.cpu_count() or 1, len(self.assigned_work) // 2)
+        wanted = sum(unit in self._computing for unit in last) < most
         return next((unit for unit in self._left[wanted] if unit in self.workqueue), first)
 
     def _split_scope(self, nodeid: str) -> str:

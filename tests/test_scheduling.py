@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from itertools import groupby
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from tests.conftest import ONE_AFTER_ANOTHER, TESTS, WAITING, _group
 from tests.scheduling import MOST, TURNS, InUnits, units
 
 WORKERS = 3
-PROCESSORS = 2
 FILES = [f"tests/test_{number}.py" for number in range(30)]
 SHARED = FILES[0]
 WAIT = FILES[1:6]
@@ -83,12 +85,10 @@ def test_every_place_that_the_order_names_exists() -> None:
     assert [place for place in WAITING if not list(TESTS.parent.glob(f"{place}*"))] == []
 
 
-def scheduled() -> tuple[InUnits, list[Worker], Any]:
-    config: Any = SimpleNamespace(
-        getvalue=lambda _: [f"{WORKERS}*popen"], option=SimpleNamespace(loadscopereorder=True)
-    )
-    scheduler = InUnits(config, None, group, computes, PROCESSORS)
-    workers = [Worker(NAMES) for _ in range(WORKERS)]
+def scheduled(number: int = WORKERS) -> tuple[InUnits, list[Worker], Any]:
+    config: Any = SimpleNamespace(getvalue=lambda _: [f"{number}*popen"], option=SimpleNamespace(loadscopereorder=True))
+    scheduler = InUnits(config, None, group, computes)
+    workers = [Worker(NAMES) for _ in range(number)]
     for worker in workers:
         scheduler.add_node(worker)
         scheduler.add_node_collection(worker, NAMES)
@@ -120,15 +120,19 @@ def test_all_tests_are_done_once_and_what_is_done_is_forgotten() -> None:
     assert alone.done[:100] == NAMES[:100]
 
 
-def test_as_many_workers_compute_as_there_are_processors_while_the_others_wait() -> None:
-    scheduler, workers, _ = scheduled()
+@pytest.mark.parametrize(("processors", "compute"), [(2, 2), (64, 3), (None, 1)])
+def test_as_many_workers_compute_as_there_are_processors_but_at_most_half_while_the_others_wait(
+    processors: int | None, compute: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: processors)
+    scheduler, workers, _ = scheduled(6)
     for worker in workers:
         while not all(name.startswith(tuple(FILES[1:])) for name in [NAMES[place] for place in worker.left]):
             work(scheduler, worker)
     for _ in range(50):
         for worker in workers:
             work(scheduler, worker)
-        assert sum(computes(NAMES[worker.left[-1]]) for worker in workers) == PROCESSORS
+        assert sum(computes(NAMES[worker.left[-1]]) for worker in workers) == compute
     while any(worker.left for worker in workers):
         for worker in workers:
             if worker.left:
