@@ -99,7 +99,7 @@ QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippo
 	$(addprefix --ignore ,tests/hippodrome/aws tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py)
 
 .PHONY: test
-test: AT_ONCE := 8
+test: AT_ONCE := 10
 test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 	@$(PYTEST)
 
