@@ -165,6 +165,13 @@ class TrialSection:
         },
     )
     frame_skip: int = keyed.whole(1, 1000, 1, "In real time, the steps from one choice of a policy to its next.")
+    policy_actions: str | None = keyed.key(
+        values.one_of("held", "single"),
+        None,
+        "In real time, whether a policy's action goes on until its next choice, or is one action for one step. "
+        "Default: as input.",
+        {"enum": ["held", "single"]},
+    )
     policy_seconds: float = keyed.seconds(
         600,
         10,
@@ -241,6 +248,11 @@ class TrialSection:
     def between_seconds(self) -> float:
         """The seconds of a break; infinity if the participant ends the break."""
         return math.inf if isinstance(self.between_episodes, str) else self.between_episodes
+
+    @property
+    def policies_hold(self) -> bool:
+        """Whether, in real time, a policy's action goes on at steps for which the policy has chosen none."""
+        return (self.policy_actions or self.input) == "held"
 
     @property
     def most_steps(self) -> float:

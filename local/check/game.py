@@ -155,8 +155,8 @@ class CheckedGame:
         return self._pressed - 1 if self._pressed - 1 in allowed else self._random.choice(allowed)
 
     def _between(self, player: Player) -> int:
-        """The action of a policy's player between two choices: the last one, or with `input: single` the idle one."""
-        return player.idle if self._config.input == "single" else self._last.get(player.name, player.idle)
+        """The action of a policy's player between two choices: the last one, or the idle one (`policyActions`)."""
+        return self._last.get(player.name, player.idle) if self._config.policies_hold else player.idle
 
     def _due(self, step: int) -> bool:
         return self._config.pace == "turns" or step % self._config.frame_skip == 0

@@ -52,7 +52,7 @@ class Choices:
             (player for player in players.values() if not player.human),
             frame_skip=config.frame_skip,
             seconds=config.policy_seconds if turns else None,
-            repeats_last=config.input != "single",
+            repeats_last=config.policies_hold,
         )
         self._advice: dict[str, int] = {}
         # By player and action number: the action as nobody's choice, and as the human's. Most steps take one of these,

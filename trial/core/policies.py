@@ -1,7 +1,8 @@
 """The policies: what each was asked, and which action its player takes. Pure; the clock is passed in.
 
 In real time a policy is asked every `frameSkip` steps, if it is to act, and should answer before the next step. If it
-is late, its player takes the last action again, and a late answer counts at the following step. Turn by turn a policy
+is late, its player takes the last action again (`policyActions: single`: the idle action), and a late answer counts at
+the following step. Turn by turn a policy
 has `policySeconds`; after them, its player takes the idle action. The player of a policy that fails takes the idle
 action in that step; after `FAILURES` failures in a row, in all steps until the episode is over.
 """
@@ -73,7 +74,7 @@ class Policies:
         """`players` are the players that policies play.
 
         `seconds`: turn by turn, how long a policy may take; None: real time.
-        `repeats_last`: at steps for which `frame_skip` asks for no action, the last action is taken again.
+        `repeats_last`: at steps for which a policy has chosen no action, its last action is taken again.
         """
         self._places = {player.name: _Place(player) for player in players}
         self._frame_skip = frame_skip

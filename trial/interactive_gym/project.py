@@ -131,12 +131,15 @@ def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[st
         trial["idleAction"] = names[int(config.default_action)]
     if config.action_mapping:
         trial["keys"] = {_keys(key): names[int(action)] for key, action in config.action_mapping.items()}
+    previous = config.action_population_method == ActionSettings.PreviousSubmittedAction
     if config.input_mode == InputModes.SingleKeystroke:
         trial["input"] = "single"
-        if config.action_population_method == ActionSettings.PreviousSubmittedAction:
+        if previous and not config.run_through_pyodide:
             trial["actionBufferLifespan"] = MAX_BUFFER
     if look.several:
-        trial["frameSkip"] = config.frame_skip
+        # Interactive Gym's server ignores action_population_method for policies; its games in the browser do for humans
+        holds = previous and config.run_through_pyodide
+        trial |= {"frameSkip": config.frame_skip, "policyActions": "held" if holds else "single"}
     if config.reset_freeze_s:
         trial["resetFreeze"] = config.reset_freeze_s
     if "seed" in config.given:

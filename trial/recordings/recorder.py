@@ -236,6 +236,7 @@ def rules(config: TrialSection, players: Sequence[Player]) -> dict[str, Any]:
         "pace": config.pace,
         "input": config.input,
         "frameSkip": config.frame_skip,
+        "policyActions": "held" if config.policies_hold else "single",
         "idleActions": {player.name: player.idle for player in players},
     }
 

@@ -151,6 +151,7 @@ def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
             "scene": None,
             "players": {},
             "frameSkip": 1,
+            "policyActions": None,
             "policySeconds": 10,
             "seed": None,
             "pace": "realtime",

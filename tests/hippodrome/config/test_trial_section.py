@@ -38,7 +38,7 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     "instructions": st.sampled_from(["rules", "rules.html", "a/b", "game", "é", 3]),
     "keys": st.dictionaries(st.sampled_from(["a", "A", "Space", "a+b", "Left", "Tab", "p"]), NAMES.map(str) | ACTIONS),
     "labels": st.dictionaries(st.sampled_from(["up", "Up", "left", ""]), st.sampled_from(["Go", "", 3, "x" * 65])),
-    "input": st.sampled_from(["held", "single", "both"]),
+    **dict.fromkeys(("input", "policyActions"), st.sampled_from(["held", "single", "both"])),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
     **dict.fromkeys(
         (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS

@@ -105,12 +105,12 @@ def test_one_end_for_all_players_is_written_as_a_map(folder: Path) -> None:
     assert line.endswith('its terminations are bool, and {"__all__": False} is for all players')
 
 
-@pytest.mark.parametrize(("input", "between"), [("held", 2), ("single", 0)])
-def test_between_two_choices_a_policy_does_what_it_does_on_a_server(folder: Path, input: str, between: int) -> None:
+@pytest.mark.parametrize(("key", "between"), [("input: held", 2), ("input: single", 0), ("policyActions: single", 0)])
+def test_between_two_choices_a_policy_does_what_it_does_on_a_server(folder: Path, key: str, between: int) -> None:
     agent = folder / "agent.py"
     takes = f'assert actions["right"] == (2 if self.n % 4 == 0 else {between}), actions\n        self.n += 1'
     agent.write_text(agent.read_text().replace("self.n += 1", takes))
-    assert tried(folder, "agent:Partner", "maxEpisodes", f"frameSkip: 4\n  input: {input}\n  maxEpisodes") == []
+    assert tried(folder, "agent:Partner", "maxEpisodes", f"frameSkip: 4\n  {key}\n  maxEpisodes") == []
 
 
 def test_unknown_players_are_reported_with_those_of_the_environment(folder: Path) -> None:

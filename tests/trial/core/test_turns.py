@@ -485,9 +485,15 @@ def test_a_late_action_of_a_policy_is_taken_at_the_next_step() -> None:
     assert len(game.asks) == 2
 
 
-def test_between_two_choices_a_policys_action_is_held_or_single_as_input_says() -> None:
-    for how, expected in (("held", (2, "policy")), ("single", (0, "none"))):
-        game = Game(frameSkip=2, input=how)
+def test_between_two_choices_a_policys_action_is_held_or_single_as_policyActions_or_else_input_says() -> None:
+    held, single = (2, "policy"), (0, "none")
+    for section, expected in (
+        ({"input": "held"}, held),
+        ({"input": "single"}, single),
+        ({"input": "held", "policyActions": "single"}, single),
+        ({"input": "single", "policyActions": "held"}, held),
+    ):
+        game = Game(frameSkip=2, **section)
         spaces = dict.fromkeys(PLAYS, SPACE)
         game.event("start", who_plays(game.settings.trial, spaces, None), None, game.now)
         game.returns(Begun(b"reset", FRAME, view_for("me", "it")))

@@ -92,6 +92,23 @@ async def test_a_policy_plays_the_other_player(tmp_path: Path, launch: Any, open
     ]
 
 
+async def test_by_interactive_gyms_defaults_a_policy_acts_in_one_step_of_four(
+    tmp_path: Path, launch: Any, open_client: Any
+) -> None:
+    """In the other steps, its player takes `default_action`, as in Interactive Gym."""
+    single = ",\n              input_mode=configuration_constants.InputModes.SingleKeystroke"
+    source = (
+        TOGETHER.replace("        frame_skip=1,\n", "").replace(single, "").replace("max_steps = 10", "max_steps = 40")
+    )
+    made = make_project(tmp_path / "mine", source)
+    trial = yaml.safe_load((made / "config.yml").read_text())["trial"]
+    assert (trial["frameSkip"], trial["idleAction"], trial.get("input", "held")) == (4, "0", "held")
+    server = await play_project(launch, open_client, made, trial)
+    (found,) = server.recordings().values()
+    taken = [line["value"][1]["1"] for line in found if line["kind"] == "callback"]
+    assert (taken.count(2), taken.count(0)) == (10, 30)
+
+
 async def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_client: Any) -> None:
     made = make_project(tmp_path / "mine", PEOPLE)
     told = yaml.safe_load((made / "config.yml").read_text())["trial"]

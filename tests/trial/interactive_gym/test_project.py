@@ -163,6 +163,25 @@ def test_players_and_their_policies_become_keys_of_the_study(tmp_path: Path) -> 
     read_project(project)
 
 
+def test_what_players_do_between_two_choices_follows_interactive_gyms_server_or_its_games_in_the_browser(
+    tmp_path: Path,
+) -> None:
+    """Its server repeats the actions of humans alone by `PreviousSubmittedAction`, its browsers those of policies."""
+    before = "default_action=0, "
+    previous = f"{before}action_population_method=configuration_constants.ActionSettings.PreviousSubmittedAction, "
+    pyodide = "config.pyodide(run_through_pyodide=True)\n"
+    for name, source, expected in (
+        ("server", TOGETHER.replace(before, previous), ("single", 10_000)),
+        ("browser", TOGETHER.replace(before, previous) + pyodide, ("held", None)),
+        ("default", TOGETHER + pyodide, ("single", None)),
+    ):
+        folder = tmp_path / name
+        (folder / "brains").mkdir(parents=True)
+        (folder / "brains/two.txt").write_text("2")
+        trial = config_of(project_of(folder, source)[0])["trial"]
+        assert (trial["policyActions"], trial.get("actionBufferLifespan")) == expected, name
+
+
 THREE = (
     TOGETHER.replace('1: "brains/two.txt"', '1: "left/two.txt", 2: "right/two.txt"')
     .replace("(0, 1)", "(0, 1, 2)")
