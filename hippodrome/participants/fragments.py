@@ -1,9 +1,10 @@
 """Prepares a researcher's step page for the frame, and fills values into it (`sandbox.py`).
 
-The researcher's text stays unchanged, byte for byte, except for a few tags. Tags of a whole document (`<html>`,
-`<body>`, `<form>` …) are dropped. Relative addresses, of pictures for example, become addresses of the project's
-files. Scripts get the nonce without which no browser runs them. All of this happens before values are filled in, so a
-tag in a value gets neither a nonce nor another address.
+The researcher's text stays unchanged, byte for byte, except for a few tags. Before values are filled in, relative
+addresses, of pictures for example, become addresses of the project's files, and scripts get the nonce without which no
+browser runs them: so a tag in a value gets neither. All else depends on which branches of a template are shown, and
+happens afterwards: tags of a whole document (`<html>`, `<body>`, `<form>` …) are dropped, what is left open is closed,
+and the page's own button and heading are noted.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from __future__ import annotations
 import html
 import re
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from hippodrome.participants import sandbox
 
@@ -42,6 +43,8 @@ _NAMES_HOST = re.compile(r"//|https?:", re.IGNORECASE)
 _ORIGIN = re.compile(r"https?://[^/\s?#]+", re.IGNORECASE)
 
 _RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # hold no tags
+_UNSEEN = frozenset({"template", "noscript"})  # browsers that run scripts show nothing in them
+_NO_SUBMIT = ("button", "reset")  # types of <button> that send no form
 _DROPPED = frozenset({"html", "head", "body", "form", "meta", "base"})
 ADDRESSES = {
     "img": ("src", "srcset"),
@@ -56,25 +59,35 @@ ADDRESSES = {
 """The attributes that hold addresses, by tag."""
 
 
-@dataclass(frozen=True)
-class Fragment:
-    """A prepared step page, and the facts about it that the frame needs."""
+class Content(NamedTuple):
+    """A step page with its values filled in, and the facts about it that the frame needs."""
 
-    text: str
+    html: str
     has_fields: bool  # whether it has inputs with names, whose values are sent
-    has_submit: bool  # whether it has a submit button of its own
+    has_submit: bool  # whether it has a submit button of its own, even one that is hidden or disabled
     has_heading: bool  # whether it has an <h1>
     title: str
     lang: str
 
-    def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
+
+@dataclass(frozen=True)
+class Fragment:
+    """A prepared step page."""
+
+    text: str
+
+    def fill(self, values: Mapping[str, Any], nonce: str = "") -> Content:
         """Return the page with these values, and with the nonce of the response in its scripts.
 
         Raises FragmentError.
         """
         text = sandbox.render(self.text, values) if sandbox.uses_jinja(self.text) else self.text
         mark = _MARK if nonce else f' nonce="{_MARK}"'
-        return text.replace(mark, nonce)
+        return _Filled().read(text.replace(mark, nonce))
+
+    def render(self, values: Mapping[str, Any], nonce: str = "") -> str:
+        """Return the HTML of `fill`. Raises FragmentError."""
+        return self.fill(values, nonce).html
 
 
 @lru_cache(maxsize=64)
@@ -94,33 +107,12 @@ class _Preparation:
         self._source = self._set_aside(source.replace("\0", "\ufffd"))
         self._base = base
         self._hosts = frozenset(host.lower() for host in hosts)
-        self._out: list[str] = []
-        self._seen: set[str] = set()  # those of "field", "submit" and "h1" that the page has
-        self._title = self._lang = ""
-        self._drawings = 0  # open <svg> elements, whose <title> is their own
 
     def run(self) -> Fragment:
-        at = 0
-        while found := _TOKEN.search(self._source, at):
-            self._out.append(self._source[at : found.start()])
-            at = found.end()
-            if found["start"] is not None:
-                at = self._start(found)
-            elif found["end"] is not None:
-                self._end(found)
-            elif found["declaration"] is not None:
-                self._drop(found[0])
-            else:
-                self._out.append(found[0] if found[0].endswith(">") else found[0] + "-->")
-        self._out.append(self._source[at:])
-        return Fragment(
-            text=self._restore("".join(self._out)),
-            has_fields="field" in self._seen,
-            has_submit="submit" in self._seen,
-            has_heading="h1" in self._seen,
-            title=self._title,
-            lang=self._lang,
-        )
+        out: list[str] = []
+        for before, token, inside, end in _tokens(self._source):
+            out += [before, self._tag(token) if token["closed"] else token[0], inside, end] if token else [before]
+        return Fragment(self._restore("".join(out)))
 
     def _set_aside(self, source: str) -> str:
         """The source with a placeholder for each expression of Jinja, and for text that looks like a placeholder."""
@@ -142,73 +134,14 @@ class _Preparation:
     def _restore(self, text: str) -> str:
         return _PLACEHOLDER.sub(lambda held: self._aside[int(held[1])], text)
 
-    def _drop(self, text: str) -> None:
-        """Drop `text` but keep its line ends, so that Jinja counts lines as the researcher does."""
-        self._out.append("\n" * self._restore(text).count("\n"))
-
-    def _end(self, found: re.Match[str]) -> None:
-        self._drawings -= found["end"].lower() == "svg"
-        if found["end"].lower() in _DROPPED:
-            self._drop(found[0])
-        elif found[0].endswith(">"):
-            self._out.append(found[0])
-        else:
-            self._out.append(found[0].replace("<", "&lt;"))
-
-    def _start(self, found: re.Match[str]) -> int:
-        """Copy a start tag; for a script and other elements in `_RAW`, all up to the end tag. Return where to go on."""
-        name = found["start"].lower()
-        if not found["closed"]:  # a tag that never ends would swallow what follows in the frame
-            self._out.append(found[0].replace("<", "&lt;"))
-            return found.end()
-        given = _attributes(found["attributes"])
-        self._note(name, given)
-        self._drawings += name == "svg" and not found["attributes"].endswith("/")
-        if name in _DROPPED:
-            self._drop(found[0])
-            return found.end()
-        if name not in _RAW:
-            self._out.append(self._tag(found, name))
-            return found.end()
-        inside, end = self._inside(name, found.end())
-        if name == "title" and self._drawings <= 0:
-            self._title = " ".join(html.unescape(_PLACEHOLDER.sub("", inside)).split())[:200]
-            self._drop(found[0] + inside)
-        else:
-            self._out += [self._tag(found, name, given), inside, end or f"</{name}>"]
-        return found.end() + len(inside) + len(end)
-
-    def _inside(self, name: str, at: int) -> tuple[str, str]:
-        """The content from `at` on of an element in `_RAW`, and its end tag, which is empty if the element never ends.
-
-        Only the first end tag counts: if no ">" follows it, none follows a later one either.
-        """
-        end = re.compile(rf"</{name}(?=[\s/>])", re.IGNORECASE).search(self._source, at)
-        if end is None or (close := self._source.find(">", end.end())) == -1:
-            return self._source[at:], ""
-        return self._source[at : end.start()], self._source[end.start() : close + 1]
-
-    def _note(self, name: str, given: Mapping[str, str]) -> None:
-        """Note the facts about this tag that the frame needs."""
-        kind = given.get("type", "").strip().lower()
-        if name in ("input", "select", "textarea", "button") and given.get("name", "").strip():
-            self._seen.add("field")
-        if name == "input" and kind in ("submit", "image"):
-            self._seen.add("submit")
-        if name == "button" and kind not in ("button", "reset"):
-            self._seen.add("submit")
-        if name == "h1":
-            self._seen.add("h1")
-        if name == "html" and not self._lang and re.fullmatch(r"[A-Za-z0-9-]{2,35}", given.get("lang", "")):
-            self._lang = given["lang"]
-
-    def _tag(self, found: re.Match[str], name: str, given: Mapping[str, str] | None = None) -> str:
-        attributes = found["attributes"]
+    def _tag(self, token: re.Match[str]) -> str:
+        name, attributes = token["start"].lower(), token["attributes"]
+        address = _attributes(attributes).get("src", "") if name == "script" else ""
         if name in ADDRESSES and self._base:
             attributes = _ATTRIBUTE.sub(lambda each: self._address(name, each), attributes)
-        if name == "script" and self._may_run((given or {}).get("src", "")):
+        if name == "script" and self._may_run(address):
             attributes = f' nonce="{_MARK}"{attributes}'
-        return f"<{found['start']}{attributes}>"
+        return f"<{token['start']}{attributes}>"
 
     def _may_run(self, address: str) -> bool:
         """Whether a script is the researcher's: in the page, among the project's files, or on a host in `hosts`."""
@@ -233,6 +166,102 @@ class _Preparation:
     def _relocate(self, address: str) -> str:
         bare = address.strip()
         return address if _ABSOLUTE.match(bare) else self._base + bare.removeprefix("./")
+
+
+class _Filled:
+    """One pass over a page with its values: so each fact is about what this participant sees."""
+
+    def __init__(self) -> None:
+        self._out: list[str] = []
+        self._seen: set[str] = set()  # those of "field", "submit" and "h1" that the page has
+        self._title = self._lang = ""
+        self._drawings = 0  # open <svg> elements, whose <title> is their own
+        self._unseen = ""  # the open element whose content browsers do not show
+
+    def read(self, page: str) -> Content:
+        for before, token, inside, end in _tokens(page):
+            self._out.append(before)
+            if token is None:
+                break
+            if token["start"] is not None:
+                self._start(token, inside, end)
+            elif token["end"] is not None:
+                self._end(token)
+            elif token["declaration"] is None:
+                self._out.append(token[0] if token[0].endswith(">") else token[0] + "-->")
+        return Content(
+            html="".join(self._out),
+            has_fields="field" in self._seen,
+            has_submit="submit" in self._seen,
+            has_heading="h1" in self._seen,
+            title=self._title,
+            lang=self._lang,
+        )
+
+    def _start(self, token: re.Match[str], inside: str, end: str) -> None:
+        """Copy a start tag; for a script and other elements in `_RAW`, all up to the end tag."""
+        name = token["start"].lower()
+        if not token["closed"]:  # a tag that never ends would swallow what follows in the frame
+            self._out.append(token[0].replace("<", "&lt;"))
+            return
+        self._note(name, _attributes(token["attributes"]))
+        self._drawings += name == "svg" and not token["attributes"].endswith("/")
+        if name in _UNSEEN and not self._unseen:
+            self._unseen = name
+        if name == "title" and self._drawings <= 0:
+            self._title = " ".join(html.unescape(inside).split())[:200]
+        elif name in _RAW:
+            self._out += [token[0], inside, end or f"</{name}>"]
+        elif name not in _DROPPED:
+            self._out.append(token[0])
+
+    def _end(self, token: re.Match[str]) -> None:
+        name = token["end"].lower()
+        self._drawings -= name == "svg"
+        if name == self._unseen:
+            self._unseen = ""
+        if name not in _DROPPED:
+            self._out.append(token[0] if token[0].endswith(">") else token[0].replace("<", "&lt;"))
+
+    def _note(self, name: str, attributes: Mapping[str, str]) -> None:
+        """Note the facts about this tag that the frame needs."""
+        kind = attributes.get("type", "").strip().lower()
+        if name in ("input", "select", "textarea", "button") and attributes.get("name", "").strip():
+            self._seen.add("field")
+        submits = kind in ("submit", "image") if name == "input" else name == "button" and kind not in _NO_SUBMIT
+        if submits and "form" not in attributes and not self._unseen:  # the page's form has no id to name it by
+            self._seen.add("submit")
+        if name == "h1":
+            self._seen.add("h1")
+        if name == "html" and not self._lang and re.fullmatch(r"[A-Za-z0-9-]{2,35}", attributes.get("lang", "")):
+            self._lang = attributes["lang"]
+
+
+def _tokens(text: str) -> Iterator[tuple[str, re.Match[str] | None, str, str]]:
+    """Yield each tag, comment and declaration: the text before it, and the token itself; last the text after them all.
+
+    For an element in `_RAW` its content and its end tag follow, which are empty for all others.
+    """
+    at = 0
+    while token := _TOKEN.search(text, at):
+        before, at = text[at : token.start()], token.end()
+        inside = end = ""
+        if token["closed"] and token["start"].lower() in _RAW:
+            inside, end = _content(text, token["start"].lower(), at)
+            at += len(inside) + len(end)
+        yield before, token, inside, end
+    yield text[at:], None, "", ""
+
+
+def _content(text: str, name: str, at: int) -> tuple[str, str]:
+    """The content from `at` on of an element in `_RAW`, and its end tag, which is empty if the element never ends.
+
+    Only the first end tag counts: if no ">" follows it, none follows a later one either.
+    """
+    end = re.compile(rf"</{name}(?=[\s/>])", re.IGNORECASE).search(text, at)
+    if end is None or (close := text.find(">", end.end())) == -1:
+        return text[at:], ""
+    return text[at : end.start()], text[end.start() : close + 1]
 
 
 def _attributes(text: str) -> dict[str, str]:

@@ -68,16 +68,16 @@ def step_page(view: StepView) -> Page:
     """Return a step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
-    prepared = _prepare(view.project, view.source, view.files)
-    content = Html(prepared.render(view.values, nonce))
-    is_asked = prepared.has_fields
+    filled = _prepare(view.project, view.source, view.files).fill(view.values, nonce)
+    content = Html(filled.html)
+    is_asked = filled.has_fields
     if not view.final or (is_asked and not view.answered):
         main = fill(
             "form",
             action=view.action,
             named=_step_fields(view),
             content=content,
-            button=Html() if prepared.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
+            button=Html() if filled.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
         )
     elif is_asked:
         main = fill("answered", texts, content=content)
@@ -90,9 +90,9 @@ def step_page(view: StepView) -> Page:
         nonce,
         main=main,
         script=script("step.js", nonce, texts=texts),
-        title=prepared.title,
-        lang=prepared.lang,
-        heading=not prepared.has_heading,
+        title=filled.title,
+        lang=filled.lang,
+        heading=not filled.has_heading,
         data=Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html(),
     )
     return Page(text, headers(view.project, nonce))

@@ -116,10 +116,13 @@ _PLAYED = {"episodes": 1, "score": 1.5, "frames": 100, "seconds": 3.5, "trial": 
 _PLAYED_TOGETHER = ("scores", "session", "player")  # what an answer holds in games of several players
 
 
+def every_branch(text: str) -> fragments.Content:
+    """Return a page with all branches of its template, and with `spans.MARK` in the place of each Jinja expression."""
+    return fragments.prepare(spans.replace(text, lambda _: spans.MARK, *spans.JINJA)).fill({})
+
+
 def _forms(text: str) -> list[forms.Form]:
-    """The forms of a page, with `spans.MARK` in the place of each Jinja expression."""
-    page = spans.replace(text, lambda _: spans.MARK, *spans.JINJA)
-    return forms.read(f"<form>{fragments.prepare(page).text}</form>")
+    return forms.read(f"<form>{every_branch(text).html}</form>")
 
 
 def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -9,10 +9,10 @@ from jinja2 import meta
 
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.step_files import StepFileError, open_folder
-from hippodrome.participants import fragments, sandbox
+from hippodrome.participants import sandbox
 from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
-from local.check.earlier_answers import EarlierAnswers, source_of
+from local.check.earlier_answers import EarlierAnswers, every_branch, source_of
 from local.check.structure import check_structure
 from local.check.tags import Tags
 from local.check.templates import check_template
@@ -50,7 +50,7 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
     found = [_unused(folder, unused)] if unused else []
     for file in dict.fromkeys(file for page in config.game_pages for file in page.files):
-        if fragments.prepare(source_of(file)).has_fields:
+        if every_branch(source_of(file)).has_fields:
             message = "its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
             found.append(Diagnostic(f"{folder.name}/{file.name}", None, "", message, remark=True))
     if config.project.use_aws:

@@ -14,7 +14,7 @@ from jinja2 import ChainableUndefined, Environment
 from markupsafe import Markup
 
 from hippodrome.participants.fragments import prepare
-from hippodrome.participants.sandbox import FragmentError, records_mentioned
+from hippodrome.participants.sandbox import FragmentError, records_mentioned, uses_jinja
 
 BASE = "/steps/demo/"
 
@@ -99,15 +99,15 @@ def test_tags_of_a_whole_document_are_left_out_and_their_contents_stay() -> None
         '<!DOCTYPE html><HTML lang="de"><head><meta charset=x><base href="/a"><title>Zu &amp; auf</title>'
         "<style>b{c:d}</style></head><body class=x><form action='http://evil.example' method=get\n>Text</FORM ></body></html>"
     )
-    prepared = prepare(source, BASE)
-    assert prepared.render({}) == "<style>b{c:d}</style>\nText"
-    assert (prepared.title, prepared.lang) == ("Zu & auf", "de")
+    filled = prepare(source, BASE).fill({})
+    assert filled.html == "<style>b{c:d}</style>Text"
+    assert (filled.title, filled.lang) == ("Zu & auf", "de")
 
 
 def test_a_drawing_keeps_its_title() -> None:
     source = "<svg><title>A horse</title></svg>"
-    assert prepare(source).render({}) == source
-    assert prepare(source).title == ""
+    assert prepare(source).fill({}).html == source
+    assert prepare(source).fill({}).title == ""
 
 
 def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
@@ -152,11 +152,39 @@ def test_unclosed_elements_and_comments_are_closed_or_become_text(source: str, e
         ("<input type=reset>", False, False),
         ("<!-- <button>Go</button> -->", False, False),
         ('<p title="<button>">', False, False),
+        ("<button form=other>No</button>", False, False),  # it sends another form
+        ("<input type=submit form=''>", False, False),
+        ("<template><button>No</button></template>", False, False),
+        ("<noscript><button>No</button></noscript>", False, False),
+        ("<noscript></noscript><button>Go</button>", False, True),
+        ("<textarea><button>No</button></textarea>", False, False),
+        ("<button hidden>Go</button>", False, True),  # the page's own script may show it
+        ("{% if no %}<input name=a><button>Go</button>{% endif %}", False, False),
+        ("{% if no %}{% else %}<input name=a><button>Go</button>{% endif %}", True, True),
+        ("{# <button>Go</button> #}", False, False),
+        ("{{ '<button>' }}", False, False),
+        ("{% macro go() %}<button>Go</button>{% endmacro %}", False, False),
+        ("{% macro go() %}<button>Go</button>{% endmacro %}{{ go() }}", False, True),
     ],
 )
-def test_fields_and_buttons_are_noted(source: str, fields: bool, submit: bool) -> None:
-    prepared = prepare(source)
-    assert (prepared.has_fields, prepared.has_submit) == (fields, submit)
+def test_fields_and_buttons_are_those_that_the_participant_sees(source: str, fields: bool, submit: bool) -> None:
+    filled = prepare(source).fill({})
+    assert (filled.has_fields, filled.has_submit) == (fields, submit)
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_heading_title_and_language_are_those_of_the_branch_that_is_shown(shown: bool) -> None:
+    source = (
+        "{% if x %}<html lang=de><title>Eins</title><h1>1</h1>{% else %}<html lang=fr><title>Deux</title>{% endif %}"
+    )
+    filled = prepare(source).fill({"x": shown})
+    assert (filled.lang, filled.title, filled.has_heading) == (("de", "Eins", True) if shown else ("fr", "Deux", False))
+
+
+@pytest.mark.parametrize("left", ["<textarea>", "<!-- ", "<script>", "<title>", "<p"])
+def test_what_one_branch_leaves_open_does_not_swallow_the_frame(left: str) -> None:
+    source = f"{{% if x %}}{left}{{% else %}}<p></textarea></script></title> -->{{% endif %}}"
+    assert {"id": "ours"} in Tags(prepare(source).render({"x": 1}) + '<button id="ours">').named("button")
 
 
 # Addresses
@@ -367,9 +395,9 @@ def test_the_content_of_a_raw_element_is_text_up_to_its_own_end_tag(name: str) -
 
 
 @pytest.mark.parametrize("name", ["html", "head", "body", "form", "meta", "base", "FORM"])
-def test_tags_of_a_whole_document_leave_their_line_ends(name: str) -> None:
-    assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "a\nb\nc"
-    assert prepare("a<!DOCTYPE\nhtml>b<?xml\n?>c").render({}) == "a\nb\nc"
+def test_each_tag_of_a_whole_document_is_left_out(name: str) -> None:
+    assert prepare(f"a<{name} x\n=1>b</{name}\n>c").render({}) == "abc"
+    assert prepare("a<!DOCTYPE\nhtml>b<?xml\n?>c").render({}) == "abc"
 
 
 @pytest.mark.parametrize(
@@ -399,10 +427,10 @@ def test_each_address_of_a_set_points_to_the_projects_files(name: str) -> None:
 
 def test_only_the_documents_own_title_is_taken_out() -> None:
     drawing = "<svg><title>circle</title></svg>"
-    page = prepare(f"{drawing}<svg/><title> The \n {{{{ x }}}} page &amp; more </title>{drawing}")
-    assert page.title == "The page & more"
-    assert page.render({}) == f"{drawing}<svg/>\n{drawing}"
-    assert prepare(f"<title>{'x' * 201}</title>").title == "x" * 200
+    page = prepare(f"{drawing}<svg/><title> The \n {{{{ x }}}} page &amp; more </title>{drawing}").fill({"x": "<1>"})
+    assert page.title == "The <1> page & more"
+    assert page.html == f"{drawing}<svg/>{drawing}"
+    assert prepare(f"<title>{'x' * 201}</title>").fill({}).title == "x" * 200
 
 
 @pytest.mark.parametrize(
@@ -410,13 +438,13 @@ def test_only_the_documents_own_title_is_taken_out() -> None:
     [("de", "de"), ("zh-Hant-TW", "zh-Hant-TW"), ("x", ""), ("d\"e'", ""), ("a" * 35, "a" * 35), ("a" * 36, "")],
 )
 def test_the_language_of_the_page_is_one_that_a_page_can_have(lang: str, kept: str) -> None:
-    assert prepare(f'<html lang="{lang}">').lang == kept
-    assert prepare(f'<html lang="en"><html lang="{lang}">').lang == "en"
+    assert prepare(f'<html lang="{lang}">').fill({}).lang == kept
+    assert prepare(f'<html lang="en"><html lang="{lang}">').fill({}).lang == "en"
 
 
-@pytest.mark.parametrize("source", ["a {{ x", "a {% if x", "a {# x #", "{# no end", "a }} b", "{# {% {{ '<form>' }}"])
-def test_an_expression_that_never_ends_is_text_and_so_are_tags_in_it(source: str) -> None:
-    assert prepare(f"{source}<form>").text == source
+@pytest.mark.parametrize("source", ["a {# x #", "{# no end", "a }} b"])
+def test_an_expression_that_never_ends_is_text(source: str) -> None:
+    assert prepare(f"{source}<form>").render({}) == source
 
 
 def test_a_zero_byte_is_shown_as_browsers_show_it() -> None:
@@ -608,11 +636,13 @@ def test_a_page_may_have_two_million_characters() -> None:
 
 
 def work(source: str) -> float:
-    """Return the processor seconds that preparing a page takes: the smaller of two measurements."""
+    """Return the processor seconds that preparing and filling a page takes: the smaller of two measurements."""
     times = []
     for _ in range(2):
         begun = time.process_time()
-        prepare.__wrapped__(source, "/steps/maze/", ())
+        page = prepare.__wrapped__(source, "/steps/maze/", ())
+        if not uses_jinja(source):  # Jinja's own work is not ours
+            page.fill({})
         times.append(time.process_time() - begun)
     return min(times)
 
