@@ -164,9 +164,13 @@ def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | Non
 
 
 def _headers(event: Mapping[str, Any]) -> dict[str, str]:
-    """The headers, with names in lower case. Several values of one header are joined by commas, as in format 2.0."""
+    """The headers, with names in lower case. Several values of one header are joined by commas, as in format 2.0.
+
+    Bytes that are not UTF-8 arrive from a web server as halves of surrogate pairs; here each becomes a question mark.
+    """
     several = {key: ",".join(map(str, values or ())) for key, values in (event.get("multiValueHeaders") or {}).items()}
-    return {str(key).lower(): str(value) for key, value in {**(event.get("headers") or {}), **several}.items()}
+    values = {**(event.get("headers") or {}), **several}
+    return {str(key).lower(): str(value).encode("utf-8", "replace").decode() for key, value in values.items()}
 
 
 def _body(event: Mapping[str, Any]) -> bytes | None:

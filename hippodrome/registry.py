@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -34,6 +35,8 @@ ALONE = (  # because functions look up a participant's session only in a project
     "project.players: the study is registered with players: {players}, and participants who play together would be "
     "separated; give a study for one participant another project.id"
 )
+
+NOT_UTF8 = "the registration cannot be written as JSON in UTF-8: a text holds half of a character, or it is too deep"
 
 
 class NotRegistered(Exception):
@@ -219,6 +222,15 @@ def _handle_hippo(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any
     return {"statusCode": 200, "body": "\n".join(remarks)}
 
 
+def _is_utf8(event: Mapping[str, Any]) -> bool:
+    """Whether UTF-8 can hold every text of the event: none has half of a surrogate pair."""
+    try:
+        json.dumps(event, ensure_ascii=False).encode()
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
 def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     """Handle one call of the function; return `{"registered": id, "live": …, "steps": n}` or `{"problems": […]}`.
 
@@ -229,6 +241,8 @@ def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
       gets `{"takenOver": n}`.
     * A payload of HIPPO's script is handled by `_handle_hippo`.
     """
+    if not _is_utf8(event):
+        return {"statusCode": 400, "body": NOT_UTF8, "problems": [NOT_UTF8]}
     if hippo_registration.is_payload(event):
         return _handle_hippo(platform, event)
     try:

@@ -27,6 +27,7 @@ _TEXT_TAGS = {_TAG + "str", _TAG + "timestamp", _TAG + "value", _TAG + "merge"}
 _KNOWN_TAGS = _TEXT_TAGS | {_TAG + name for name in ("null", "bool", "int", "float", "map", "seq")}
 _WHOLE = re.compile(r"[-+]?[0-9]{1,18}")
 _DECIMAL = re.compile(r"[-+]?([0-9]{1,18}\.[0-9]{0,18}|\.[0-9]{1,18})(e[-+][0-9]{1,2})?", re.IGNORECASE)
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _TRUE = {"true", "yes", "on", "y"}
 _WIDE_BOMS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)
 
@@ -97,7 +98,9 @@ def _compose(text: str) -> yaml.Node | None:
     try:
         loader = yaml.SafeLoader(text)
         try:
-            return loader.get_single_node()
+            root = loader.get_single_node()
+            _check_text(root)
+            return root
         finally:
             loader.dispose()
     except yaml.reader.ReaderError as error:
@@ -111,6 +114,24 @@ def _compose(text: str) -> yaml.Node | None:
         raise UnreadableConfig("the sections are nested too deeply") from None
     except (ValueError, OverflowError):  # an escape such as "\U99999999" or a %YAML line with a huge number
         raise UnreadableConfig("a number or an escape that YAML cannot read") from None
+
+
+def _check_text(root: yaml.Node | None) -> None:
+    """Raise UnreadableConfig for an escape such as "\\ud83d", half of a surrogate pair, which UTF-8 cannot hold."""
+    seen: set[int] = set()  # aliases stand for the same node
+    nodes = [root] if root else []
+    while nodes:
+        node = nodes.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.ScalarNode) and _SURROGATE.search(node.value):
+            message = "an escape of half a character; write the character itself instead, such as 😀"
+            raise UnreadableConfig(message, node.start_mark.line + 1)
+        if isinstance(node, yaml.SequenceNode):
+            nodes += node.value
+        elif isinstance(node, yaml.MappingNode):
+            nodes += [part for pair in node.value for part in pair]
 
 
 def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:

@@ -18,8 +18,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
-import msgspec
-
 from hippodrome.model import ids
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Entry
@@ -208,7 +206,7 @@ def read_body(body: bytes) -> WaitingDocument | None:
     """Read the content of the entry which says that a participant waits; None if it cannot be read."""
     try:
         found = from_json(body, WaitingDocument)
-    except (msgspec.DecodeError, RecursionError):
+    except (ValueError, RecursionError):
         return None
     return found if ids.is_user_id(found.user_id) else None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -119,17 +118,19 @@ class TaskChanged(NamedTuple):
 
 
 def body_of(record: Any) -> Any:
-    """Return the JSON message in a record of SQS or SNS; None if it is not JSON.
+    """Return the JSON message in a record of SQS or SNS; None if it is not JSON in UTF-8 (RFC 8259).
+
+    What UTF-8 cannot hold, half of a surrogate pair, is refused here: no document or name of ours could hold it.
 
     SNS puts a message into an envelope. In an SQS record the envelope is JSON text; in an event that SNS sends to a
     function it is an object: https://docs.aws.amazon.com/lambda/latest/dg/with-sns.html
     """
     try:
         if "Sns" in record:
-            return json.loads(record["Sns"]["Message"])
-        body = json.loads(record["body"])
+            return msgspec.json.decode(record["Sns"]["Message"])
+        body = msgspec.json.decode(record["body"])
         if isinstance(body, dict) and body.get("Type") == "Notification":
-            body = json.loads(body["Message"])
+            body = msgspec.json.decode(body["Message"])
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
     return body
@@ -229,7 +230,7 @@ def _read(body: Any, kind: type[R]) -> R | None:
     """Read a record of this kind; None if the body is no such record."""
     try:
         return from_data(body, kind)
-    except (msgspec.ValidationError, RecursionError):
+    except (ValueError, RecursionError):
         return None
 
 

@@ -32,8 +32,8 @@ def to_json(record: Record) -> bytes:
 def from_json(body: bytes, kind: type[T]) -> T:
     """Return the record in a document.
 
-    Raises `msgspec.DecodeError` (a ValueError) if the document holds no such record, or RecursionError if it is nested
-    too deep.
+    Raises ValueError if the document holds no such record: `msgspec.DecodeError`, or `UnicodeDecodeError` if it is not
+    UTF-8. Raises RecursionError if it is nested too deep.
     """
     return _decoder(kind).decode(body)
 
@@ -41,8 +41,8 @@ def from_json(body: bytes, kind: type[T]) -> T:
 def from_data(data: Any, kind: type[T]) -> T:
     """Return the record in plain JSON data.
 
-    Raises `msgspec.ValidationError` (a ValueError) if the data are no such record, or RecursionError if they are nested
-    too deep.
+    Raises ValueError if the data are no such record: `msgspec.ValidationError`, or `UnicodeEncodeError` for a text with
+    half of a surrogate pair. Raises RecursionError if they are nested too deep.
     """
     _decoder(kind)
     return msgspec.convert(data, kind)

@@ -69,6 +69,11 @@ def test_a_body_in_base64_is_decoded_or_marked_as_unreadable(body: str, decoded:
     assert Request.from_event({"body": body, "isBase64Encoded": True}).body == decoded
 
 
+def test_a_header_that_is_not_utf_8_can_be_stored() -> None:
+    """A web server of one machine hands such bytes on as halves of surrogate pairs."""
+    assert Request.from_event({"headers": {"User-Agent": "A\udcff"}}).headers == {"user-agent": "A?"}
+
+
 def test_half_of_a_surrogate_pair_in_a_body_becomes_bytes_that_are_no_text() -> None:
     assert Request.from_event({"body": "\ud800"}).body == b"\xed\xa0\x80"
 

@@ -438,6 +438,14 @@ def batch(*bodies: Any) -> dict[str, Any]:
     return aws_events.sqs_event(bodies, "arn:aws:sqs:us-east-1:123456789012:hippodrome-start", "us-east-1")
 
 
+HALF_A_CHARACTER = [
+    '{"projectId":"p","userId":"u","attempt":"\\ud800"}',
+    '{"projectId":"p","userId":"\\ud800"}',
+    '{"keepWarm":"\\udc00"}',
+    '{"change":"\\ud800","servers":[]}',
+    '{"userId":"u","\\ud800":1}',
+    '"\ud800"',
+]
 NOT_OURS = [
     SECRET,
     "",
@@ -454,6 +462,7 @@ NOT_OURS = [
     json.dumps({"source": "aws.ecs", "detail": SECRET}),
     "[" * 100_000,
     '{"a":' * 50_000,
+    *HALF_A_CHARACTER,
 ]
 
 
@@ -524,11 +533,13 @@ def test_answers_ids_and_tokens_are_never_logged(platform: FakePlatform, log: io
 
 # Arbitrary input
 
+ANY_TEXT = st.text(st.characters(), max_size=12)  # with halves of surrogate pairs
 JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=12), inner, max_size=4),
+    st.none() | st.booleans() | st.integers() | st.floats() | ANY_TEXT,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(ANY_TEXT, inner, max_size=4),
     max_leaves=12,
 )
+DEEP = st.sampled_from(["[", '{"projectId":', '{"servers":[', '{"detail":{"containers":['])
 KEYS = [
     "projectId", "userId", "attempt", "reason", "change", "servers", "label", "looked", "source", "detail", "startedBy",
     "attachments", "containers", "details", "lastStatus", "taskArn", "clusterArn", "stopCode", "stoppedReason", "type",
@@ -544,7 +555,12 @@ NEARLY = st.recursive(
     lambda inner: st.dictionaries(st.sampled_from(KEYS), inner, max_size=8) | st.lists(inner, max_size=3),
     max_leaves=25,
 )
-BODIES = st.text(max_size=60) | JSON.map(json.dumps) | NEARLY.map(json.dumps)
+BODIES = (
+    st.text(st.characters(), max_size=60)
+    | JSON.map(json.dumps)
+    | NEARLY.map(json.dumps)
+    | DEEP.map(lambda begin: begin * 20_000)
+)
 MESSAGES = st.fixed_dictionaries({"messageId": st.uuids().map(str), "body": BODIES})
 
 
@@ -568,6 +584,21 @@ def test_no_batch_raises_and_only_its_own_messages_come_again(records: list[dict
     assert {failure["itemIdentifier"] for failure in failed} <= {record["messageId"] for record in records}
     for key in platform.documents.kept:
         assert ".." not in key
+
+
+@pytest.mark.usefixtures("_put_back")
+@mostly(100)
+@given(bodies=st.lists(BODIES, min_size=1, max_size=3))
+def test_no_message_of_others_affects_ours(bodies: list[str]) -> None:
+    platform = new_platform()
+    ours = json.dumps({"projectId": PROJECT, "userId": "bob"})
+    name = ids.server_name(ids.server_label(PROJECT, "bob"), 1)
+    records = [{"messageId": str(n), "body": body} for n, body in enumerate([*bodies, ours])]
+    failed = start_server.handler({"Records": records}, None)["batchItemFailures"]
+    assert name in {task.name for task in platform.tasks.running.values()}
+    failed += stop_server.handler({"Records": records}, None)["batchItemFailures"]
+    assert name not in {task.name for task in platform.tasks.running.values()}
+    assert {"itemIdentifier": str(len(bodies))} not in failed
 
 
 ODD_RECORDS = st.dictionaries(st.sampled_from(["messageId", "body", "attributes"]), JSON, max_size=3)
@@ -625,13 +656,22 @@ def test_every_request_gets_an_answer(event: dict[str, Any], which: str) -> None
 
 @pytest.mark.usefixtures("_put_back")
 @mostly(100)
-@given(event=st.dictionaries(st.text(max_size=10), JSON, max_size=5), project=JSON | NEARLY)
+@given(event=st.dictionaries(ANY_TEXT, JSON, max_size=5), project=JSON | NEARLY)
 def test_any_registration_gets_an_answer(event: dict[str, Any], project: Any) -> None:
     platform = new_platform()
     before = dict(platform.documents.kept)
     for given_event in (event, {"project": project}, {**event, "project": {**event, "id": PROJECT}}):
         answer = update_project_master_list.handler(given_event, None)
         assert answer.get("problems")
+    assert platform.documents.kept == before
+
+
+@pytest.mark.parametrize("where", [{"name": "\ud800"}, {"texts": {"\ud800": "x"}}, {"trial": {"\udc00": {"a": 1}}}])
+def test_a_registration_with_half_a_character_is_refused(platform: FakePlatform, where: dict[str, Any]) -> None:
+    """Such a key once made the check of the values run for ever."""
+    before = dict(platform.documents.kept)
+    answer = update_project_master_list.handler({"project": {"id": PROJECT, **where}}, None)
+    assert "half of a character" in answer["problems"][0]
     assert platform.documents.kept == before
 
 

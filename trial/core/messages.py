@@ -102,8 +102,10 @@ def object_of(data: str | bytes) -> dict[str, Any]:
         raise NotAMessage("messages are JSON text, not bytes")
     try:
         value = json.loads(data)
+        if "\\u" in data:  # half of a surrogate pair, which UTF-8 cannot hold, comes only as an escape
+            json.dumps(value, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise NotAMessage("that is not JSON") from error
+        raise NotAMessage("that is not JSON in UTF-8") from error
     if not isinstance(value, dict):
         raise NotAMessage("a message is a JSON object")
     return value

@@ -44,6 +44,14 @@ from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, small
         ),
         (b"a:\n  b: {x} s\n", 'config.yml:2: the value ends before s; put a text that begins with { into "…"'),
         (b"a: " + b"[" * 5000, "config.yml: the sections are nested too deeply"),
+        (
+            b'project:\n  name: "a \\ud83d b"\n',
+            "config.yml:2: an escape of half a character; write the character itself instead, such as 😀",
+        ),
+        (
+            b'project:\n  texts:\n    "\\ud800": x\n',
+            "config.yml:3: an escape of half a character; write the character itself instead, such as 😀",
+        ),
         (b"a: " + b"{b: " * 30 + b"1" + b"}" * 30, "config.yml:1: the sections are nested too deeply"),
     ],
 )

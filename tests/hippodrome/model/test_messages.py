@@ -9,9 +9,10 @@ from hippodrome.model import ids, messages
 from hippodrome.model.messages import StartServer, StopServer, StopUser, to_message
 from protocol.keys import NAME
 
+texts = st.text(st.characters())  # with halves of surrogate pairs
 json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.text(),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    st.none() | st.booleans() | st.integers() | st.floats() | texts,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(texts, inner, max_size=4),
 )
 almost = st.fixed_dictionaries(
     {},
@@ -46,11 +47,18 @@ def test_no_body_makes_a_parser_fail(body: object) -> None:
         parse(body)
 
 
-@given(st.text() | json_values.map(json.dumps))
+@given(texts | json_values.map(json.dumps))
 def test_no_record_makes_the_envelope_fail(body: str) -> None:
     messages.body_of({"body": body})
     messages.body_of({"body": json.dumps({"Type": "Notification", "Message": body})})
     messages.body_of(body)
+
+
+@pytest.mark.parametrize("body", ['"\\ud800"', '"\ud800"', '{"\\udc00": 1}', "NaN", "[" * 100_000, "1" * 5000])
+def test_a_body_that_is_not_json_in_utf_8_is_no_message(body: str) -> None:
+    assert messages.body_of({"body": body}) is None
+    assert messages.body_of({"body": json.dumps({"Type": "Notification", "Message": body})}) is None
+    assert messages.body_of({"Sns": {"Message": body}}) is None
 
 
 def test_hippos_messages_without_an_attempt_are_understood() -> None:

@@ -20,7 +20,9 @@ from trial.settings import trial_section
 # ---- what a client says
 
 
-@pytest.mark.parametrize("data", [b'{"command": "start"}', "", "{", "[1]", "3", "null", '"start"'])
+@pytest.mark.parametrize(
+    "data", [b'{"command": "start"}', "", "{", "[1]", "3", "null", '"start"', r'{"command": "\ud800"}', "[" * 100_000]
+)
 def test_data_that_are_no_json_object_are_refused(data):
     for parse in (messages.parse, messages.parse_hello):
         with pytest.raises(messages.NotAMessage):
