@@ -13,7 +13,7 @@ from hippodrome.config.consistency import check
 from hippodrome.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
 from hippodrome.config.each_value import Checked
 from hippodrome.config.hippo import CLOSING_PAGE, Adapted, adapt
-from hippodrome.config.layout import Layout, find
+from hippodrome.config.layout import AGENT, Layout, find
 from hippodrome.config.project_keys import STEPS
 from hippodrome.config.step_files import CLOSING, StepFileError, open_folder
 from hippodrome.model.project import number_of_groups
@@ -21,7 +21,7 @@ from hippodrome.model.step_order import ordered, visited
 from hippodrome.model.step_types import type_of
 from protocol import players
 from protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
-from protocol.values import KeyPath, path_text
+from protocol.values import KeyPath, is_blank, path_text
 
 if TYPE_CHECKING:
     from hippodrome.config.yaml_file import ParsedFile
@@ -84,7 +84,7 @@ def read_project(folder: Path) -> Config:
         file_mistakes += sessions.mistakes_of_groups(checked, groups)
     found = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
     mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
-    agent = list(source.layout.problems()) if any(step.type.on_server for step in steps) else []
+    agent = list(_agent_problems(source)) if any(step.type.on_server for step in steps) else []
     mistakes += [problem for problem in agent if not problem.remark]
     if mistakes:
         raise ConfigErrors(in_order(mistakes))
@@ -94,6 +94,17 @@ def read_project(folder: Path) -> Config:
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
     return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
+
+
+def _agent_problems(source: ConfigSource) -> Iterator[Diagnostic]:
+    """The mistakes and remarks on agent.py; a mistake if there is neither an agent nor the name of an environment."""
+    problems = list(source.layout.problems())
+    yield from problems
+    refused = any(not problem.remark for problem in problems)
+    trial = source.parsed.values.get("trial")
+    if source.layout.agent is None and not refused and "game" in (trial or {}) and is_blank(trial["game"]):
+        message = f"is empty, and there is no {AGENT}: name an environment, or write an {AGENT}"
+        yield source.diagnostic(("trial", "game"), message)
 
 
 def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:

@@ -96,6 +96,7 @@ def adapt(document: Mapping[str, Any], name: str = "") -> Adapted:
         _controls,
         _actions,
         _frame_rates,
+        _instructions,
         _unknown,
     )
     for rule in rules:
@@ -339,6 +340,14 @@ def _frame_rates(adapted: Adapted) -> None:
     trial |= {"minFrameRate": min(defaults.min_frame_rate, start), "maxFrameRate": max(defaults.max_frame_rate, start)}
 
 
+def _instructions(adapted: Adapted) -> None:
+    """Give a list of instructions to the agent: HIPPO's key is a list of texts, ours the name of a page."""
+    trial, path = adapted.section(("trial",)), ("trial", "instructions")
+    if isinstance(trial.get("instructions"), list):
+        message = "a list is for the agent, as in HIPPO Gym; to show a page before the game, name a file of steps/"
+        _give_to_agent(adapted, path, trial.pop("instructions"), message)
+
+
 # Unknown keys
 
 
@@ -354,7 +363,8 @@ def _unknown(adapted: Adapted) -> None:
                 continue
             value = adapted.section(section).pop(key)
             if section == ("trial",):
-                _give_to_agent(adapted, path, value)
+                why = "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)"
+                _give_to_agent(adapted, path, value, why)
             else:
                 adapted.remark(path, "no effect: Hippodrome has no such key")
 
@@ -367,8 +377,8 @@ def _is_mistake(adapted: Adapted, path: KeyPath) -> bool:
     return meant is not None and (misplaced or len(meant) == 1 or is_blank(adapted.at(meant)))
 
 
-def _give_to_agent(adapted: Adapted, path: KeyPath, value: Any) -> None:
-    """Move an unknown key of `trial` to `trial.options`, for the agent."""
+def _give_to_agent(adapted: Adapted, path: KeyPath, value: Any, why: str) -> None:
+    """Put the value of a key of `trial` into `trial.options`, for the agent. `why` is the remark."""
     trial = adapted.section(("trial",))
     options = {} if is_blank(trial.get("options")) else trial["options"]
     if not isinstance(options, dict):
@@ -378,7 +388,7 @@ def _give_to_agent(adapted: Adapted, path: KeyPath, value: Any) -> None:
         return
     trial["options"] = options
     options[str(path[-1])] = value
-    adapted.remark(path, "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)")
+    adapted.remark(path, why)
 
 
 def _own_control(adapted: Adapted, path: KeyPath) -> None:

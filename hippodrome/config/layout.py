@@ -20,7 +20,8 @@ REQUIREMENTS = "requirements.txt"
 APPS = ("App", "src/hippogym_app")
 """The folders in which HIPPO Gym has agent.py."""
 
-_VERSION_2 = "src/hippogym"  # the package of HIPPO Gym's version 2, which has its own agent.py
+_VERSION_2 = "hippogym"  # the package of HIPPO Gym's version 2, in a clone or from pip
+_NEAR = ("*.py", "*/*.py", f"src/{_VERSION_2}/*.py")  # where a study of version 2 has its programs
 _TRIAL = "trial.py"
 _PROGRAMS = (_TRIAL, "communicator.py")  # HIPPO's own files beside agent.py
 
@@ -52,6 +53,14 @@ class Layout:
 
     def problems(self) -> Iterator[Diagnostic]:
         """Yield mistakes and remarks on the place of agent.py. It is a mistake if servers would not use the agent."""
+        program = self._program_of_version_2()
+        if program is not None:
+            message = (
+                "this is for HIPPO Gym's version 2, whose studies are programs and have no agent of our form; write an "
+                f"{AGENT} beside {self.config.name} (docs/hippo.md#version-2)"
+            )
+            yield Diagnostic(self.label(program), None, "", message)
+            return
         if self.agent is None:
             yield from self._missing_agent()
             return
@@ -76,14 +85,19 @@ class Layout:
             )
             yield Diagnostic(self.label(trial), None, "", message)
 
+    def _program_of_version_2(self) -> Path | None:
+        """The file that imports HIPPO Gym's version 2: agent.py, or without an agent.py the first program."""
+        near = (file for pattern in _NEAR for file in sorted(self.folder.glob(pattern)))
+        files = near if self.agent is None else iter((self.agent,))
+        return next((file for file in files if _VERSION_2 in _imported(file, whole=False)), None)
+
     def _missing_agent(self) -> Iterator[Diagnostic]:
-        if (self.folder / _VERSION_2 / AGENT).is_file():
-            message = (
-                "this is the package of HIPPO Gym's version 2, whose studies are programs and have no agent of this "
-                f"form; write an {AGENT} beside {self.config.name} (docs/hippo.md#version-2)"
-            )
-            yield Diagnostic(f"{_VERSION_2}/{AGENT}", None, "", message)
-            return
+        for file in sorted(self.folder.glob("*.py")):
+            if _has_agent(file):
+                message = (
+                    f"its class Agent does not play, since Hippodrome takes the agent from {AGENT}: rename the file"
+                )
+                yield Diagnostic(self.label(file), None, "", message, remark=True)
         for app in APPS:
             place = self.folder / app
             found = sorted(place.glob(f"*/{AGENT}")) if place.is_dir() else []
@@ -163,15 +177,25 @@ def _above(folder: Path) -> str:
     return ""
 
 
-def _imported(file: Path) -> set[str]:
-    """The names of the modules that a file imports, without their packages; empty if Python cannot read the file."""
+def _has_agent(file: Path) -> bool:
+    """Whether a file has a class `Agent`."""
+    return any(isinstance(part, ast.ClassDef) and part.name == "Agent" for part in _parsed(file).body)
+
+
+def _parsed(file: Path) -> ast.Module:
+    """The file as Python reads it; empty if Python cannot."""
     try:
-        tree = ast.parse(file.read_bytes())
+        return ast.parse(file.read_bytes())
     except (OSError, ValueError, SyntaxError, RecursionError):
-        return set()
+        return ast.Module([], [])
+
+
+def _imported(file: Path, *, whole: bool = True) -> set[str]:
+    """The names of the modules that a file imports, without their packages; or of the packages, if not `whole`."""
+    tree = _parsed(file)
     modules = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
     modules += [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    return {module.rpartition(".")[2] for module in modules}
+    return {module.rpartition(".")[2] if whole else module.partition(".")[0] for module in modules}
 
 
 def _places(folder: Path) -> list[Path]:

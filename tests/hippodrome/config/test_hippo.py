@@ -280,6 +280,19 @@ def test_unknown_keys_reach_the_agent_as_options(folder: Path) -> None:
     ]
 
 
+def test_a_list_of_instructions_reaches_the_agent_as_in_hippo(folder: Path) -> None:
+    """Ours is the name of a page."""
+    found = read(folder, game(trial="instructions:\n- Mark it\n- Click on it\n"))
+    assert (found.trial.options, found.trial.instructions) == ({"instructions": ["Mark it", "Click on it"]}, None)
+    assert remarks(found) == [
+        "trial.instructions: a list is for the agent, as in HIPPO Gym; to show a page before the game, name a file of "
+        "steps/"
+    ]
+    (folder / "steps/rules.html").write_text("<p>Go</p>")
+    found = read(folder, game(trial="instructions: rules\n"))
+    assert (found.trial.options, found.trial.instructions) == ({}, "rules")
+
+
 def test_an_option_overrides_a_key_of_its_name(folder: Path) -> None:
     found = read(folder, game(trial="level: 1\noptions: {level: 2}\n"))
     assert found.trial.options == {"level": 2}
@@ -305,6 +318,7 @@ def test_a_control_whose_name_is_similar_to_a_known_one_is_a_mistake(folder: Pat
 
 
 def test_an_agent_that_needs_no_game_is_given_none(folder: Path) -> None:
+    (folder / "agent.py").touch()
     found = read(folder, SMALL.replace("game: CartPole-v1", "game:"))
     assert (found.trial.game, remarks(found)) == (
         "none",

@@ -138,11 +138,39 @@ def test_an_app_folder_without_agent_is_refused(clone: Path, program: str) -> No
     )
 
 
-def test_version_2_is_refused(clone: Path) -> None:
-    put(clone / "src/hippogym/agent.py")
-    assert refused(clone).startswith(
-        "src/hippogym/agent.py: this is the package of HIPPO Gym's version 2, whose studies"
+@pytest.mark.parametrize("program", ["study.py", "examples/grid.py", "src/hippogym/trial.py", "agent.py"])
+@pytest.mark.parametrize("imports", ["from hippogym import HippoGym", "import hippogym.ui_elements"])
+def test_a_study_of_version_2_is_refused(clone: Path, program: str, imports: str) -> None:
+    put(clone / program, imports)
+    assert refused(clone) == (
+        f"{program}: this is for HIPPO Gym's version 2, whose studies are programs and have no agent of our form; "
+        "write an agent.py beside config.yml (docs/hippo.md#version-2)"
     )
+
+
+def test_an_agent_beside_programs_of_version_2_plays(clone: Path) -> None:
+    put(clone / "agent.py")
+    put(clone / "study.py", "import hippogym")
+    assert read_project(clone).remarks == ()
+
+
+def test_an_agent_in_a_file_of_another_name_gets_a_remark(clone: Path) -> None:
+    put(clone / "my_agent.py", "class Agent:\n    pass\n")
+    (remark,) = read_project(clone).remarks
+    assert str(remark) == (
+        "my_agent.py: remark: its class Agent does not play, since the agent is taken from agent.py: rename the file"
+    )
+
+
+def test_without_an_agent_and_without_a_game_nothing_could_be_played(clone: Path) -> None:
+    put(
+        clone / "config.yml", "project: {id: small, steps: {1: consent, 2: game, finalStep: thanks}}\ntrial:\n  game:\n"
+    )
+    assert refused(clone) == (
+        "config.yml:3: trial.game: is empty, and there is no agent.py: name an environment, or write an agent.py"
+    )
+    put(clone / "agent.py")
+    assert read_project(clone).trial.game == "none"
 
 
 def test_a_study_without_a_game_needs_no_agent(clone: Path) -> None:

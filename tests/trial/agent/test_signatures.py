@@ -89,11 +89,13 @@ def test_methods_are_called_with_or_without_the_environment(tmp_path: Path, old:
 
 def test_start_may_take_the_trial_section_in_hippos_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Some of HIPPO's agents read keys of their own there; here these keys stand under `options`."""
-    section = {"game": "maze", "maxEpisodes": 2, "ui": {"left": True, "up": False}, "options": {"rows": 6, "game": "x"}}
+    options = {"rows": 6, "game": "x", "instructions": ["Mark it"]}
+    section = {"game": "maze", "instructions": None, "ui": {"left": True, "up": False}, "options": options}
     monkeypatch.setenv("TRIAL", json.dumps(section))
     monkeypatch.setenv("PROJECT_ID", "my_study")
     player = started_agent(tmp_path, "start(self, game):", "start(self, config):\n        Env.config = config")
-    assert player.env.config == {"game": "maze", "maxEpisodes": 2, "ui": ["left"], "rows": 6, "projectId": "my_study"}
+    own = {"rows": 6, "instructions": ["Mark it"]}
+    assert player.env.config == {"game": "maze", "ui": ["left"], "projectId": "my_study", **own}
     monkeypatch.delenv("TRIAL")
     player = started_agent(
         tmp_path, "start(self, game):", "start(self, config: dict = None):\n        Env.config = config"
