@@ -122,7 +122,7 @@ def _executions(checked: AccountCheck) -> Iterator[Finding]:
         yield look(
             "Lambda",
             f"This account runs {free} functions at once: {pages} for participants' pages, {starts} to start servers. "
-            "That is enough to try it out, but slow with many people.",
+            "That is enough to try it out; of links that are opened in the same second, some show an error.",
             f"Ask for more, and then deploy again: {quotas.request(account, quotas.EXECUTIONS, 1000)}",
         )
 

@@ -11,7 +11,7 @@ from deploy.aws import resource_names
 from deploy.aws.account import Account, Installation
 from deploy.aws.resource_names import TAG
 from hippodrome.aws import errors
-from hippodrome.aws.tasks import CONTAINER
+from hippodrome.model.messages import CONTAINER
 from hippodrome.model.project import LEGACY_PORT
 from protocol import environment
 

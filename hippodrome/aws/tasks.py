@@ -29,10 +29,10 @@ from botocore.exceptions import ClientError
 
 from hippodrome.aws import errors
 from hippodrome.model import ids
+from hippodrome.model.messages import CONTAINER
 from hippodrome.ports import Address, NoCapacity, Refused, RunningTask, TaskRequest
 from protocol import environment
 
-CONTAINER = "trial"  # the name of the container in the task definition
 MAX_OVERRIDES = 8192  # the most characters of a task's overrides
 PROVIDERS = ["FARGATE", "FARGATE_SPOT"]
 NO_CONTAINER_INSIGHTS = [{"name": "containerInsights", "value": "disabled"}]

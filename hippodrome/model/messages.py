@@ -14,6 +14,8 @@ from hippodrome.ports import Message
 from protocol.session import is_session_id
 
 R = TypeVar("R", bound=Record)
+CONTAINER = "trial"
+"""The name of the container that runs the trial. AWS may put others into its task, such as GuardDuty's sidecar."""
 STOP_REASON_PREFIX = "hippodrome:"  # begins each stoppedReason that our functions give
 _WORDS_BEFORE_CODE = (  # patterns of stoppedReason that decide even if there is a stopCode
     ("SpotInterruption", re.compile(r"\bspot\b.{0,40}\binterrupt", re.IGNORECASE)),
@@ -171,8 +173,7 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
             return None
         interfaces = [a for a in detail.get("attachments", []) if a["type"] in ("eni", "ElasticNetworkInterface")]
         details = {d["name"]: d["value"] for a in interfaces for d in a["details"]}
-        containers = detail.get("containers", [])
-        exits = [c["exitCode"] for c in containers if c.get("exitCode") is not None]
+        container = _container(detail)
         return TaskChanged(
             task=str(detail["taskArn"]),
             cluster=str(detail["clusterArn"]).rsplit("/", 1)[-1],
@@ -181,15 +182,20 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
             interface=details.get("networkInterfaceId"),
             stop_code=_stop_code(detail),
             stopped_reason=str(detail.get("stoppedReason") or ""),
-            exit_code=exits[0] if exits else None,
-            container_reason=" ".join(str(c["reason"]) for c in containers if c.get("reason")),
+            exit_code=container.get("exitCode"),
+            container_reason=str(container.get("reason") or ""),
         )
     except (KeyError, TypeError, AttributeError):
         return None
 
 
+def _container(detail: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the event says of the trial's container; empty if it says nothing of it."""
+    return next((each for each in detail.get("containers", []) if each.get("name") == CONTAINER), {})
+
+
 def _status(detail: Mapping[str, Any]) -> str:
-    """`lastStatus`; STOPPING instead, if containers may still run or the event does not say how they ended."""
+    """`lastStatus`; STOPPING instead, if the trial may still run or the event does not say how they ended."""
     last = str(detail["lastStatus"])
     if last == "RUNNING" and detail.get("desiredStatus") == "STOPPED":
         return "STOPPING"
@@ -199,10 +205,10 @@ def _status(detail: Mapping[str, Any]) -> str:
 
 
 def _has_ended(detail: Mapping[str, Any]) -> bool:
-    """Whether all containers have stopped and the event says why: a trial that ended by itself needs an exit code."""
-    containers, code = detail.get("containers", []), _stop_code(detail)
-    exited = code != "EssentialContainerExited" or any(c.get("exitCode") is not None for c in containers)
-    return bool(code) and exited and all(c.get("lastStatus") == "STOPPED" for c in containers)
+    """Whether the trial has stopped and the event says why: a trial that ended by itself needs an exit code."""
+    container, code = _container(detail), _stop_code(detail)
+    exited = code != "EssentialContainerExited" or container.get("exitCode") is not None
+    return bool(code) and exited and container.get("lastStatus", "STOPPED") == "STOPPED"
 
 
 def _stop_code(detail: Mapping[str, Any]) -> str | None:

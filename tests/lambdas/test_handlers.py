@@ -329,6 +329,25 @@ def test_the_record_of_a_failed_server_holds_the_cause(platform: FakePlatform, p
     assert record.cause == cause
 
 
+@pytest.mark.parametrize(
+    ("payload", "sidecar", "reason"),
+    [("sqs_task_stopped_exit", 137, Reason.ENDED), ("sqs_task_stopped_crash", 0, Reason.LOST)],
+)
+def test_the_exit_code_of_a_sidecar_does_not_decide(
+    platform: FakePlatform, payload: str, sidecar: int, reason: Reason
+) -> None:
+    """GuardDuty puts a container of its own into tasks on Fargate, and may stop it after the trial's."""
+    event = aws_events.load(payload)
+    (record,) = event["Records"]
+    body = json.loads(record["body"])
+    agent = {"name": "aws-guardduty-agent-1a2b", "lastStatus": "STOPPED", "exitCode": sidecar}
+    body["detail"]["containers"].insert(0, agent)
+    record["body"] = json.dumps(body)
+    claimed(platform, event, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)
+    assert task_changed.handler(event, None) == NOTHING_FAILED
+    assert states(platform, event) == [(ServerState.CLOSED, reason)]
+
+
 def test_the_second_event_of_a_servers_end_changes_nothing(platform: FakePlatform) -> None:
     ended, gone = aws_events.load("sqs_task_deprovisioning_spot"), aws_events.load("sqs_task_stopped_spot")
     claimed(platform, ended, state=ServerState.READY, dns="a.example.org", host="203.0.113.9", port=5000)

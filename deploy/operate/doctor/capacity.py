@@ -60,8 +60,8 @@ def functions(context: CheckContext) -> Iterator[Finding]:
     if free >= need:
         yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted{whom}.")
     elif free > workers:
-        late = f"{free:,} executions at once; about {need:,} are wanted{whom}: pages may come late."
-        yield look("Lambda quota", late, more)
+        refused = "links that are opened in the same second may show an error"
+        yield look("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted{whom}: {refused}.", more)
     else:
         few = f"{free:,} executions at once, and about {need:,} are wanted{whom}: pages will fail."
         yield bad("Lambda quota", few, more)

@@ -11,8 +11,8 @@ from deploy.core.finding import Finding, bad, good, look
 from deploy.operate.doctor.check_context import CheckContext
 from deploy.study.definition import STOP_TIMEOUT, port
 from hippodrome.aws import errors
-from hippodrome.aws.tasks import CONTAINER
 from hippodrome.model import warm_pool
+from hippodrome.model.messages import CONTAINER
 from hippodrome.model.project import MIN_RUNTIME_MARGIN, Project
 
 OLD = 120  # days after which an image's packages probably need updates

@@ -105,7 +105,7 @@ def ended(stop_code: str | None = "SpotInterruption", **container: object) -> di
         "lastStatus": "DEPROVISIONING",
         "desiredStatus": "STOPPED",
         "stopCode": stop_code,
-        "containers": [{"lastStatus": "STOPPED", **container}],
+        "containers": [{"name": "trial", "lastStatus": "STOPPED", **container}],
     }
     return {"source": "aws.ecs", "detail": detail}
 
@@ -210,7 +210,7 @@ def test_all_fields_of_a_tasks_event_are_read() -> None:
         ],
         stopCode="EssentialContainerExited",
         stoppedReason="Essential container in task exited",
-        containers=[{"reason": "OutOfMemoryError", "exitCode": 137}, {"exitCode": 1}, {"reason": "second"}],
+        containers=[{"name": "trial", "reason": "OutOfMemoryError", "exitCode": 137}],
     )
     assert messages.parse_task_changed(event) == messages.TaskChanged(
         task="arn:task",
@@ -221,7 +221,7 @@ def test_all_fields_of_a_tasks_event_are_read() -> None:
         stop_code="EssentialContainerExited",
         stopped_reason="Essential container in task exited",
         exit_code=137,
-        container_reason="OutOfMemoryError second",
+        container_reason="OutOfMemoryError",
     )
     other = [{"type": "ElasticNetworkInterface", "details": details}]
     assert messages.parse_task_changed(task(attachments=other)).interface == "eni-1"  # type: ignore[union-attr]
@@ -231,7 +231,7 @@ def test_an_event_with_only_the_necessary_fields_is_read() -> None:
     assert messages.parse_task_changed(task()) == messages.TaskChanged(
         "arn:task", "own", NAME, "RUNNING", None, None, "", None
     )
-    zero = task(containers=[{"exitCode": None}, {"exitCode": 0}])
+    zero = task(containers=[{"name": "trial", "exitCode": 0}])
     assert messages.parse_task_changed(zero).exit_code == 0  # type: ignore[union-attr]
 
 
@@ -243,12 +243,31 @@ def test_an_event_without_a_necessary_field_is_not_parsed(without: str) -> None:
     assert messages.parse_task_changed({**task(), "source": "aws.ec2"}) is None
 
 
-def test_of_several_containers_all_must_have_ended() -> None:
-    event = ended(exitCode=0)
-    event["detail"]["containers"].append({"lastStatus": "RUNNING"})
+SIDECAR = {"name": "aws-guardduty-agent-1a2b", "lastStatus": "STOPPED"}
+
+
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize(("sidecar", "trial"), [(137, 0), (0, 1), (0, 3)])
+def test_a_sidecars_exit_code_and_reason_are_not_the_trials(place: int, sidecar: int, trial: int) -> None:
+    event = ended("EssentialContainerExited", exitCode=trial)
+    event["detail"]["containers"].insert(place, {**SIDECAR, "exitCode": sidecar, "reason": "OutOfMemoryError"})
+    changed = messages.parse_task_changed(event)
+    assert changed
+    assert (changed.exit_code, changed.container_reason) == (trial, "")
+    assert changed.status == "DEPROVISIONING"
+
+
+@pytest.mark.parametrize(("trial", "status"), [("RUNNING", "STOPPING"), ("STOPPED", "DEPROVISIONING")])
+def test_a_task_has_ended_when_the_trial_has(trial: str, status: str) -> None:
+    event = ended(lastStatus=trial, exitCode=0)
+    event["detail"]["containers"].insert(0, SIDECAR)
+    assert messages.parse_task_changed(event).status == status  # type: ignore[union-attr]
+
+
+def test_a_sidecars_exit_code_does_not_tell_how_the_trial_ended() -> None:
+    event = ended("EssentialContainerExited")
+    event["detail"]["containers"].insert(0, {**SIDECAR, "exitCode": 0})
     assert messages.parse_task_changed(event).status == "STOPPING"  # type: ignore[union-attr]
-    event["detail"]["containers"][1] = {"lastStatus": "STOPPED"}
-    assert messages.parse_task_changed(event).status == "DEPROVISIONING"  # type: ignore[union-attr]
 
 
 def test_only_envelopes_of_sns_are_opened() -> None:
