@@ -102,12 +102,18 @@ class Bot:
         return report
 
     async def do(self, page: VisitedPage) -> VisitedPage | None:
-        """Answer the page or play its game, and return the next page; None after the last. Raises Failed."""
+        """Answer the page or play its game, and return the next page. Raises Failed.
+
+        Return None after the last page, and after one that has no button to press: it may screen participants out.
+        """
         if page.game is not None:
             return await self.game(page)
         form = page.form
-        if form is not None:
+        if form is not None and form.can_be_sent:
             return await self.answer(page, form)
+        if form is not None:
+            self.report.ended, self.report.stage = page.step, "ended"
+            return None
         if not page.is_last:
             raise Failed(f"no page of a study: {_words(page.text)}")
         self.report.final_page, self.report.code = page.text, page.code

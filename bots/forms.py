@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from hippodrome.participants.page_parser import PageParser, attributes_of
+from hippodrome.participants.page_parser import VOID, PageParser, attributes_of
 
 PRESSED = ("submit", "image")
 """Types of the buttons that send a form."""
@@ -15,6 +16,22 @@ _TIMES = ("date", "time", "datetime-local", "month", "week")
 _TEXTS = ("text", "search", "password", "email", "url", "tel")
 _TYPES = {*_TEXTS, *_TIMES, *PRESSED, *_NEVER_SENT, "color", "number", "range", "hidden", "radio", "checkbox", "file"}
 """Types of inputs. A browser takes any other type for `text`."""
+_INERT = ("template", "noscript")
+"""Elements whose content browsers do not show, and whose fields they do not send."""
+_HIDING_STYLE = re.compile(r"(?:\A|;)\s*(?:display\s*:\s*none|visibility\s*:\s*(?:hidden|collapse))", re.IGNORECASE)
+_SHOWING_STYLE = re.compile("display|visibility", re.IGNORECASE)
+_BLOCKS = (
+    "address", "article", "aside", "blockquote", "details", "div", "dl", "fieldset", "figure", "footer", "form",
+    "h1", "h2", "h3", "h4", "h5", "h6", "header", "hr", "main", "nav", "ol", "p", "pre", "section", "table", "ul",
+)  # fmt: skip
+_ENDED_BY = {
+    "li": ("li",),
+    **dict.fromkeys(("dt", "dd"), ("dt", "dd")),
+    **dict.fromkeys(("td", "th"), ("td", "th")),
+    **dict.fromkeys(("tr", "tbody", "tfoot"), ("td", "th", "tr")),
+    **dict.fromkeys(_BLOCKS, ("p",)),
+}
+"""Elements without an end tag that end where an element of this name begins."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +51,7 @@ class Control:
     attributes: Mapping[str, str]
     options: list[SelectOption] = field(default_factory=list)  # the options of a select
     text: str = ""  # the text of a textarea
+    hidden: bool = False  # whether the page hides it
 
     @property
     def name(self) -> str:
@@ -55,10 +73,19 @@ class Form:
     action: str
     method: str
     controls: list[Control] = field(default_factory=list)
+    may_change: bool = False  # whether the page has scripts, or styles that may show what its tags hide
 
     @property
     def buttons(self) -> list[Control]:
-        return [control for control in self.controls if control.kind in PRESSED]
+        """The buttons that a participant can press. If none is shown and the page may change, all of them."""
+        buttons = [control for control in self.controls if control.kind in PRESSED]
+        shown = [button for button in buttons if not button.hidden]
+        return shown or (buttons if self.may_change else [])
+
+    @property
+    def can_be_sent(self) -> bool:
+        """Whether a participant may be able to send the form. A script could add a button, or enable one."""
+        return bool(self.buttons) or self.may_change
 
 
 def read(page: str) -> list[Form]:
@@ -94,9 +121,13 @@ class _Reader(PageParser):
         self._label: list[str] = []  # the text of the open option
         self._group_disabled = False
         self._textarea: Control | None = None
+        self._open: list[tuple[str, bool]] = []  # open elements, and whether each is hidden
 
     def handle_starttag(self, tag: str, attrs: Iterable[tuple[str, str | None]]) -> None:
         attributes = attributes_of(attrs)
+        while self._open and self._open[-1][0] in _ENDED_BY.get(tag, ()):
+            self._open.pop()
+        self._open.append((tag, _is_hidden(tag, attributes)))
         if tag == "form" and self._form is None:
             self._form = Form(attributes.get("action", ""), attributes.get("method", "get").lower())
             self.forms.append(self._form)
@@ -123,8 +154,15 @@ class _Reader(PageParser):
         elif tag == "option" and self._select is not None:
             self._end_option()
             self._option, self._label = attributes, []
+        elif tag in ("script", "link") and self._form is not None:
+            self._form.may_change = True
+        if tag in VOID:
+            self._open.pop()
 
     def handle_endtag(self, tag: str) -> None:
+        names = [name for name, _ in self._open]
+        if tag in names:
+            del self._open[len(names) - 1 - names[::-1].index(tag) :]
         if tag == "form":
             self._form = None
         elif tag == "fieldset" and self._fieldsets:
@@ -148,6 +186,8 @@ class _Reader(PageParser):
             self._textarea.text += data
         elif self._option is not None:
             self._label.append(data)
+        elif self._open and self._open[-1][0] == "style" and self._form is not None:
+            self._form.may_change |= _SHOWING_STYLE.search(data) is not None
 
     def close(self) -> None:
         super().close()
@@ -158,8 +198,9 @@ class _Reader(PageParser):
     def _add(self, control: Control) -> None:
         if "disabled" in control.attributes or any(fieldset.disables for fieldset in self._fieldsets):
             return
-        if control.kind in _NEVER_SENT:
+        if control.kind in _NEVER_SENT or any(name in _INERT for name, _ in self._open):
             return
+        control.hidden = any(hidden for _, hidden in self._open)
         if "form" in control.attributes:
             self._by_form_id.append((control.attributes["form"], control))
         elif self._form is not None:
@@ -172,6 +213,13 @@ class _Reader(PageParser):
             disabled = "disabled" in attributes or self._group_disabled
             self._select.options.append(SelectOption(attributes.get("value", text), "selected" in attributes, disabled))
         self._option = None
+
+
+def _is_hidden(tag: str, attributes: Mapping[str, str]) -> bool:
+    """Whether an element's own tag hides it, with all that is in it."""
+    closed = tag == "dialog" and "open" not in attributes
+    styled = _HIDING_STYLE.search(attributes.get("style", "")) is not None
+    return closed or styled or "hidden" in attributes or "inert" in attributes
 
 
 @dataclass

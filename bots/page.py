@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bots import forms
+from hippodrome.participants.page_parser import PageParser, attributes_of
 
 
 @dataclass(frozen=True)
@@ -45,3 +46,26 @@ class VisitedPage:
         """The text of the first element of class `code`: the completion code. None if there is no such element."""
         found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
         return html.unescape(found[1]).strip() if found else None
+
+
+def links(page: str) -> list[str]:
+    """Return the addresses of a page's links."""
+    reader = _Links()
+    reader.feed(page)
+    reader.close()
+    return reader.found
+
+
+class _Links(PageParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "a":
+            self.found.append(attributes_of(attrs).get("href", "").strip())
+
+
+def leads_elsewhere(address: str) -> bool:
+    """Return whether an address of a link is of another site."""
+    return address.lower().startswith(("https://", "http://"))

@@ -39,6 +39,7 @@ class BotReport:
     user_id: str
     stage: str = "waits for its turn"  # what the bot is doing now
     finished: bool = False  # the bot came to the study's last page
+    ended: str = ""  # the step on whose page the bot ended, since no button there can be pressed
     answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step: the fields that it has sent
     plays: list[PlayedStep] = field(default_factory=list)
     final_page: str = ""  # the HTML of the last page

@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from bots.page import leads_elsewhere, links
 from bots.report import BotReport, PlayedStep
 
 MAX_BYTES = 512 * 1024**2  # unpacked; a recording of a few seconds is only larger if the study's agent errs
@@ -84,6 +85,7 @@ class Verification:
     recordings: int = 0
     steps: int = 0  # the environments' steps, in the recordings
     codes: int = 0  # final pages that show the stored completion code
+    links: int = 0  # final pages without it that have a link to another site
     starts: list[float] = field(default_factory=list)  # seconds from request to ready
     sessions: dict[str, int] = field(default_factory=dict)  # by session id: how many of the bots played in it
     missing: list[str] = field(default_factory=list)
@@ -116,13 +118,16 @@ def verify(
             if path.is_file() and path.suffix != ".gz":
                 found.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
         code = membership.get("completionCode") or document(folder / "participant.json").get("completionCode")
-        found.codes += bool(code) and str(code) in report.final_page
+        if code and str(code) in report.final_page:
+            found.codes += 1
+        elif any(map(leads_elsewhere, links(report.final_page))):
+            found.links += 1
     owners = {report.user_id for report in reports} | found.sessions.keys()
     for path in sorted((data / "_servers").glob("*.json")):
         record = document(path)
         if record.get("ready") and record.get("userId") in owners:
             found.starts.append(_seconds(record["requested"], record["ready"]))
-    if 0 < found.codes < sum(report.finished for report in reports):
+    if 0 < found.codes < sum(report.finished for report in reports) - found.links:
         found.missing.append("some final pages lack their completion code, or show another")
     return found
 

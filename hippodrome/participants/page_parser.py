@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html.parser import HTMLParser
 
+VOID = frozenset(
+    ("area", "base", "br", "col", "embed", "frame", "hr", "img", "input", "link", "meta", "param", "source", "track")
+) | {"wbr"}
+"""Elements without an end tag."""
+
 
 class PageParser(HTMLParser):
     """An HTMLParser that reads `<![…]>` as a comment, as browsers do. Python's may raise AssertionError there."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import json
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, NamedTuple
 
 from bots import form_filling, forms
 from hippodrome.config import Config
@@ -14,6 +15,14 @@ from hippodrome.config.config import StepFiles
 from hippodrome.participants import fragments
 from local.check import spans
 from protocol.answer import UNMATCHED
+
+
+class Variant(NamedTuple):
+    """Answers by step. `field` and `words` say which one is special about them; "" if none is."""
+
+    answers: dict[str, dict[str, Any]]
+    field: str = ""
+    words: str = ""
 
 
 class EarlierAnswers:
@@ -106,6 +115,32 @@ class EarlierAnswers:
             most[step.key], least[step.key] = _answered(source_of(self._folder / file.name), person)
         return [most, least]
 
+    def variants(
+        self, group: int | None, constants: Collection[str | float], named: Container[object]
+    ) -> Iterator[Variant]:
+        """Yield sets of answers that differ in one answer, with the words for it.
+
+        `named` are the names that a page uses, and `constants` what it may compare answers with. So this answer is one
+        of the choices of a question, or a constant, or a number beside it.
+        """
+        most, least = self.answers(group)
+        yield Variant(most)
+        yield Variant(least, words="only the required answers")
+        numbers = [n + d for n in constants if not isinstance(n, str | bool) for d in (-1, 0, 1)]
+        texts = [text for text in constants if isinstance(text, str)]
+        for step in self._steps:
+            if step.type.on_server:
+                values: Mapping[str, Sequence[str | float]] = {"score": numbers, "outcome": texts}
+            elif step.files:
+                file = step.files[(group or 0) if step.variants else 0]
+                values = _possible(source_of(self._folder / file.name), numbers, texts)
+            else:
+                continue
+            for name, possible in values.items():
+                for value in dict.fromkeys(possible) if name in named else ():
+                    words = f"{name} = {json.dumps(value, ensure_ascii=False)} at step {step.key}"
+                    yield Variant({**most, step.key: {**most[step.key], name: value}}, f"{step.key}.{name}", words)
+
     def _texts(self) -> list[str]:
         """The texts of the earlier pages, in the versions of all groups."""
         return [source_of(file) for step in self._steps for file in step.files]
@@ -139,6 +174,31 @@ def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any
         name: (value if name in needed else "") for name, value in most.items() if name in needed or name not in boxes
     }
     return most, least
+
+
+def _possible(text: str, numbers: Sequence[float], texts: Sequence[str]) -> dict[str, list[str]]:
+    """By field of a page, answers that it can have: its choices, or those of the given answers that it takes."""
+    found: dict[str, list[str]] = {}
+    for control in _forms(text)[0].controls:
+        if control.kind in ("radio", "checkbox", *forms.PRESSED):
+            values = [control.attributes.get("value", "on")]
+        elif control.kind == "select":
+            values = [option.value for option in control.options if not option.disabled]
+        elif control.kind in ("number", "range"):
+            values = [f"{number:g}" for number in numbers if _is_within(control, number)]
+        else:
+            values = [*texts, *(f"{number:g}" for number in numbers)]
+        found.setdefault(control.name, []).extend(value for value in values if spans.MARK not in value)
+    return found
+
+
+def _is_within(control: forms.Control, number: float) -> bool:
+    """Whether a number lies within the limits of its field, as far as they are numbers."""
+    low, high = control.attributes.get("min", ""), control.attributes.get("max", "")
+    try:
+        return float(low or "-inf") <= number <= float(high or "inf")
+    except ValueError:
+        return True
 
 
 def _choices(controls: Sequence[forms.Control]) -> set[str] | None:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from jinja2 import meta
 
+from bots.page import leads_elsewhere, links
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import sandbox
-from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, every_branch, source_of
 from local.check.structure import check_structure
 from local.check.tags import Tags
-from local.check.templates import check_template
+from local.check.templates import Visitors, check_template
 from protocol.values import printable
 
 
@@ -35,8 +35,10 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
         except OSError:
             continue  # the check of the configuration reports it
         label = f"{steps.path.name}/{name}"
+        earlier = EarlierAnswers.before_page(steps.path, config, name)
+        send_it = config is not None and _is_sent(config, name, source)
         here = [
-            *check_template(label, source, config, groups, EarlierAnswers.before_page(steps.path, config, name)),
+            *check_template(label, source, config, Visitors(groups, earlier, send_it)),
             *Tags(label, steps.names, config).read(source),
             *check_structure(label, source),
         ]
@@ -57,6 +59,12 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
         found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
     return found
+
+
+def _is_sent(config: Config, name: str, source: str) -> bool:
+    """Whether participants have to send this page to go on: the last page only if it has fields."""
+    *others, last = [[file.name for file in step.files] for step in config.steps]
+    return any(name in files for files in others) or (name in last and every_branch(source).has_fields)
 
 
 def _unused(folder: Path, names: list[str]) -> Diagnostic:
@@ -81,20 +89,9 @@ def _leads_back(source: str) -> bool:
             return True
     except Exception:  # noqa: BLE001 - the check of the page reports what Jinja cannot read
         return True
-    links = _Links()
-    links.feed(spans.replace(source, lambda jinja: spans.MARK, *spans.JINJA))
-    links.close()
-    return links.elsewhere
-
-
-class _Links(PageParser):
-    """Finds out whether a page has a link to another site."""
-
-    elsewhere = False
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        address = attributes_of(attrs).get("href", "").strip().lower() if tag == "a" else ""
-        self.elsewhere = self.elsewhere or address.startswith(("https://", "http://", spans.MARK))
+    return any(
+        leads_elsewhere(address) or address.startswith(spans.MARK) for address in links(every_branch(source).html)
+    )
 
 
 def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | None]]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from hippodrome.config import Diagnostic
-from hippodrome.participants.page_parser import PageParser, attributes_of
+from hippodrome.participants.page_parser import VOID, PageParser, attributes_of
 from local.check import spans
 from local.check.tags import BUTTONS
 from protocol.values import printable
@@ -16,8 +16,6 @@ from protocol.values import printable
 _HARMLESS = re.compile(r"group|.*\|\s*(?:tojson|int|float|length|count)(?:\([^()]*\))?\s*", re.DOTALL)
 _STEP = "\ue001"  # stands for {% … %}
 
-_VOID = frozenset(("area", "base", "br", "col", "embed", "frame", "hr", "img", "input", "link", "meta", "param"))
-_VOID |= {"source", "track", "wbr"}
 _OPTIONAL = frozenset(("p", "li", "dt", "dd", "tr", "td", "th", "thead", "tbody", "tfoot", "option", "optgroup"))
 _OPTIONAL |= {"rt", "rp", "colgroup", "caption", "html", "head", "body", "form"}
 """Tags whose end tags may be left out, or that the frame removes."""
@@ -98,7 +96,7 @@ class _Reader(PageParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = attributes_of(attrs)
         self._blocks += sum((value or "").count(_STEP) + name.count(_STEP) for name, value in attrs)
-        if tag not in _VOID and tag not in _OPTIONAL:
+        if tag not in VOID and tag not in _OPTIONAL:
             self._open.append((tag, self.getpos()[0]))
         if tag == "fieldset":
             self._count += 1
@@ -120,7 +118,7 @@ class _Reader(PageParser):
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
-        if tag not in _VOID and tag not in _OPTIONAL:
+        if tag not in VOID and tag not in _OPTIONAL:
             self._open.pop()  # such as <path/> in an <svg>
 
     def handle_endtag(self, tag: str) -> None:
@@ -128,7 +126,7 @@ class _Reader(PageParser):
             self._fieldsets.pop()
         elif tag == "table":
             self._row += 1
-        if tag in _VOID or tag in _OPTIONAL:
+        if tag in VOID or tag in _OPTIONAL:
             return
         names = [name for name, _ in self._open]
         if tag in names:

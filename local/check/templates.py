@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from itertools import islice
+from typing import Any, NamedTuple
 
 from jinja2 import meta, nodes
 from jinja2.exceptions import SecurityError, TemplateRuntimeError, TemplateSyntaxError, UndefinedError
 
+from bots import forms
 from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments, sandbox
 from hippodrome.participants.sandbox import FragmentError
 from local.check.answers_named import check_answers_named
-from local.check.earlier_answers import EarlierAnswers
+from local.check.earlier_answers import EarlierAnswers, Variant
 from local.check.wording import short
 from protocol.answer import UNMATCHED
 from protocol.similar import did_you_mean
@@ -21,12 +23,24 @@ VALUES = ("answers", "completion_code", "group", "participant", "project")
 """The values that a page may use (docs/pages.md)."""
 
 
-def check_template(
-    label: str, source: str, config: Config | None, groups: list[int | None], earlier: EarlierAnswers
-) -> Iterator[Diagnostic]:
+MOST_SHOWN = 300
+"""How many sets of answers a page is shown with, for each group."""
+
+
+class Visitors(NamedTuple):
+    """Who sees a page: participants of these groups, with these answers."""
+
+    groups: list[int | None]
+    earlier: EarlierAnswers
+    send_it: bool  # whether they have to send the page to go on
+
+
+def check_template(label: str, source: str, config: Config | None, visitors: Visitors) -> Iterator[Diagnostic]:
     """Yield the problems of the page: in parsing it, and in showing it to participants with different answers."""
     page = fragments.prepare(source)
     if not sandbox.uses_jinja(page.text):
+        if visitors.send_it and _cannot_be_sent(page.fill({})):
+            yield Diagnostic(label, None, "", f"{_NO_BUTTON}, so nobody can go on{_HIDDEN}")
         return
     environment = sandbox.environment()
     try:
@@ -47,17 +61,53 @@ def check_template(
             undefined.remove(name.name)
             message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
-    yield from check_answers_named(label, parsed, earlier)
-    for group in groups:
-        for answers in earlier.answers(group):
+    yield from check_answers_named(label, parsed, visitors.earlier)
+    yield from _shown(label, page, parsed, config, visitors)
+
+
+def _shown(
+    label: str,
+    page: fragments.Fragment,
+    parsed: nodes.Template,
+    config: Config | None,
+    visitors: Visitors,
+) -> Iterator[Diagnostic]:
+    """Problems in showing the page to participants with different answers: it fails, or they cannot send it."""
+    constants = [node.value for node in parsed.find_all(nodes.Const) if isinstance(node.value, str | int | float)]
+    named = {*constants, *(node.attr for node in parsed.find_all(nodes.Getattr))}
+    stuck: list[Variant] = []
+    others: set[str] = set()  # the special answers of those who can go on
+    for group in visitors.groups:
+        for variant in islice(visitors.earlier.variants(group, constants, named), MOST_SHOWN):
             values = _values(config, group)
             if config:
-                values["participant"] |= _company(answers, config)
+                values["participant"] |= _company(variant.answers, config)
             try:
-                page.render({**values, "answers": answers})
+                content = page.fill({**values, "answers": variant.answers})
             except FragmentError as error:
-                yield _failing(label, error, may_depend=bool(sandbox.records_mentioned(page.text)))
+                yield _failing(label, error, variant, may_depend=bool(sandbox.records_mentioned(page.text)))
                 return
+            if visitors.send_it and _cannot_be_sent(content):
+                stuck.append(variant)
+            else:
+                others.add(variant.field)
+    if stuck and others:
+        special = max(stuck, key=lambda variant: (bool(variant.field), variant.field in others, bool(variant.words)))
+        words = special.words or "some answers"
+        message = f"with {short(words)} {_NO_BUTTON}, so these participants end here"
+        yield Diagnostic(label, None, "", message, remark=True)
+    elif stuck:
+        yield Diagnostic(label, None, "", f"{_NO_BUTTON}, so nobody can go on{_HIDDEN}")
+
+
+_NO_BUTTON = "the page has no button that can be pressed"
+_HIDDEN = "; show its button, or take it out: then the page has the button Continue"
+
+
+def _cannot_be_sent(content: fragments.Content) -> bool:
+    """Whether the page in its frame, which adds a button to a page without one, has none that can be pressed."""
+    button = "" if content.has_submit else "<button>Continue</button>"
+    return not forms.read(f"<form>{content.html}{button}</form>")[0].can_be_sent
 
 
 def _unread(error: TemplateSyntaxError) -> str:
@@ -105,7 +155,7 @@ def _company(answers: Mapping[str, Mapping[str, Any]], config: Config) -> dict[s
     return {"unmatched": alone, "members": 0 if alone else config.project.players}
 
 
-def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
+def _failing(label: str, error: FragmentError, variant: Variant, *, may_depend: bool) -> Diagnostic:
     """The mistake of a page that cannot be shown; a remark if that may depend on the participant's answers."""
     cause, why = error.__cause__, short(error.message)
     if isinstance(cause, TypeError) and "no loader" in str(cause):
@@ -113,7 +163,10 @@ def _failing(label: str, error: FragmentError, may_depend: bool) -> Diagnostic:
     elif isinstance(cause, TemplateSyntaxError):
         why = _unread(cause)
     elif may_depend and cause is not None and not _certain(cause):
-        why = f"a participant without the answer gets an error page here ({why}); |default(…) helps"
+        who, helps = "without the answer", "; |default(…) helps"
+        if variant.field:
+            who, helps = f"with {short(variant.words)}", ""
+        why = f"a participant {who} gets an error page here ({why}){helps}"
         return Diagnostic(label, error.line, "", why, remark=True)
     else:
         why = f"the page cannot be shown: {why}"

@@ -83,7 +83,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
 
         def watch(reports: Sequence[BotReport]) -> None:
             stages = [re.sub(r"step \S+", "pages", bot.stage) for bot in reports]
-            over = sum(stage in ("finished", "failed") for stage in stages)
+            over = sum(stage in ("finished", "ended", "failed") for stage in stages)
             doing = [
                 f"{stages.count(stage)} {words}"
                 for stage, words in (
@@ -91,6 +91,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
                     ("waits for others", "in the lobby"),
                     ("waits for its server", "waiting"),
                     ("plays", "playing"),
+                    ("ended", "ended before the last page"),
                     ("failed", "failed"),
                 )
                 if stage in stages

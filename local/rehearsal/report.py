@@ -53,6 +53,8 @@ def report(
     troubles = [f"{bot.user_id}: {trouble}" for bot in reports for trouble in bot.troubles]
     if troubles:
         table.add_row("troubles got over", str(len(troubles)))
+    if not any(bot.finished for bot in reports) and not errors:
+        errors = ["no bot came to the last page"]
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
     failures = [crash.words() for crash in crashes]
     table.add_row("errors", escape("\n".join([*([str(len(bad))] if bad else []), *failures])) or "none")
@@ -64,7 +66,7 @@ def report(
     if warnings:
         console.print("  Local mode said:")
     _print(console, warnings, "red" if bad else "yellow")
-    return all(bot.finished for bot in reports) and not bad and not crashes
+    return not bad and not crashes
 
 
 Rows = list[tuple[str, str]]
@@ -78,6 +80,8 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
     """The rows of what the bots have seen."""
     plays = [each for bot in reports for each in bot.plays]
     rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
+    for step, count in sorted(Counter(bot.ended for bot in reports if bot.ended).items()):
+        rows.append(("ended before", f"{count} at step {step}, whose page had no button for them to press"))
     rows += _together(reports)
     games = _games(reports)
     if stopped := sum(any(each.stopped for each in game) for game in games):
@@ -143,7 +147,7 @@ def _found(reports: Sequence[BotReport], found: Verification | None, *, recorded
         ("answers found", _of(found.answers, found.answers_sent)),
         ("games found", _of(found.games, found.games_played)),
         ("recordings", recordings if recorded or found.recordings else unrecorded),
-        ("completion codes shown", _of(found.codes, finished) if live else closed),
+        ("codes or links back shown", _of(found.codes + found.links, finished) if live else closed),
     ]
 
 

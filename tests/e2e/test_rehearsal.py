@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import csv
 import ctypes
+import json
 import os
 import platform
 import re
@@ -65,6 +66,30 @@ def test_bots_walk_through_the_example_project(tmp_path: Path) -> None:
     assert [path.name for path in made if path.stat().st_mode & 0o077] == [], "they are their owner's alone"
 
 
+def test_bots_end_at_a_page_without_a_button_and_the_report_tells_it(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    (folder / "steps").mkdir(parents=True)
+    (folder / "config.yml").write_text("project: {id: screen, steps: {1: about, 2: screen, finalStep: end}}")
+    pages = {
+        "about": '<select name="colour" required><option>blue<option>red</select>',
+        "screen": "{% if answers['1'].colour == 'red' %}<button hidden>x</button>{% else %}<h1>You are in</h1>{% endif %}",
+        "end": '<a href="https://app.prolific.com/submissions/complete?cc=ABC">Back to Prolific</a>',
+    }
+    for name, text in pages.items():
+        (folder / "steps" / f"{name}.html").write_text(text)
+    process = rehearsal(folder, "--bots", "12", "--ramp", "0", "--data", tmp_path / "data")
+    text = said(process)
+    assert process.returncode == 0, text
+    rows = {row[1].strip(): row[2].strip() for row in (line.split("│") for line in text.splitlines()) if len(row) == 4}
+    users = tmp_path / "data" / "screen" / "users"
+    colours = [json.loads(path.read_text())["answers"]["colour"] for path in users.glob("*/answers/1.json")]
+    passed = colours.count("blue")
+    assert 0 < passed < 12, "a chance of 1 in 2048"
+    assert rows["bots finished"] == f"{passed} of 12"
+    assert rows["ended before"].startswith(f"{12 - passed} at step 2, whose page had no button for them to press")
+    assert rows["codes or links back shown"] == f"{passed} of {passed}"
+
+
 def test_bots_play_in_pairs_and_one_of_an_odd_number_finds_no_other(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     shutil.copytree(ROOT / "examples" / "two-players", folder, ignore=LEFT_OUT)
@@ -78,7 +103,7 @@ def test_bots_play_in_pairs_and_one_of_an_odd_number_finds_no_other(tmp_path: Pa
     assert rows["games stopped early"].startswith("1 of 1: "), "one of the two stops the game for both"
     assert re.fullmatch(r"1: bot-[0-9a-f]{6}-\d", rows["unmatched"])
     assert re.fullmatch(r"p50 \d+\.\d s, .*max 1[0-9]\.\d s", rows["wait in the lobby"])
-    assert [rows[name] for name in ("bots finished", "games found", "completion codes shown")] == ["3 of 3"] * 3
+    assert [rows[name] for name in ("bots finished", "games found", "codes or links back shown")] == ["3 of 3"] * 3
     assert rows["recordings"].startswith("1, with ")
     assert (rows["servers left over"], rows["errors"]) == ("0", "none")
 

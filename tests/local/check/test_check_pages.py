@@ -327,6 +327,81 @@ def test_no_page_makes_the_check_crash(folder: Path, text: str) -> None:
     looked(folder)
 
 
+# --- a button to go on with ----------------------------------------------------------------------------
+
+NOBODY = (
+    "steps/hello.html: the page has no button that can be pressed, so nobody can go on; show its button, or take it "
+    "out: then the page has the button Continue"
+)
+SCREENS = (
+    '<select name="pet"><option>cat<option>dog</select><input type="radio" name="ok" value="no"><input name="word">'
+    '<input type="number" name="age" min="1">'
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<button hidden>Go</button>",
+        "<div style='display:none'><input type=submit></div>",
+        "{% if group is none %}<button disabled>Go</button>{% endif %}",
+        "{% if group is none %}<fieldset disabled>{% endif %}",
+    ],
+)
+def test_a_page_that_nobody_can_send_is_a_mistake(folder: Path, text: str) -> None:
+    page(folder, text)
+    assert NOBODY in looked(folder)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<button hidden>Go</button><script>setTimeout(show, 1000)</script>",
+        "{% if group %}<button>Go</button>{% endif %}",
+        "<button hidden>Go</button><button>Go</button>",
+        "<button type=button hidden>Play</button>",
+    ],
+)
+def test_a_page_with_a_button_or_a_script_that_may_show_it_gets_no_finding(folder: Path, text: str) -> None:
+    page(folder, text)
+    assert looked(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("condition", "said"),
+    [
+        ("answers['1'].pet == 'dog'", 'pet = "dog" at step 1'),
+        ("answers['1'].pet != 'dog'", 'pet = "cat" at step 1'),
+        ("answers['1'].ok == 'no'", 'ok = "no" at step 1'),
+        ("answers['1']['word']|lower == 'blue'", 'word = "blue" at step 1'),
+        ("answers['1'].age|int < 18", 'age = "17" at step 1'),
+        ("answers['2'].score > 100", "score = 101 at step 2"),
+        ("answers['2'].outcome == 'failed'", 'outcome = "failed" at step 2'),
+    ],
+)
+def test_answers_after_which_nobody_can_go_on_are_remarked(folder: Path, condition: str, said: str) -> None:
+    page(folder, SCREENS)
+    page(folder, f"{{% if {condition} %}}<button hidden>x</button>{{% else %}}<h1>You are in</h1>{{% endif %}}", "bye")
+    assert looked(folder) == [
+        f"steps/bye.html: remark: with {said} the page has no button that can be pressed, so these participants end here"
+    ]
+
+
+def test_the_last_page_needs_a_button_only_if_it_asks_something(folder: Path) -> None:
+    page(folder, "<button hidden>x</button>", "end")
+    assert looked(folder) == []
+    page(folder, "<input name=a><button hidden>x</button>", "end")
+    assert [line.partition(":")[2] for line in looked(folder)] == [NOBODY.partition(":")[2]]
+
+
+def test_an_answer_with_which_a_page_fails_is_named(folder: Path) -> None:
+    page(folder, SCREENS)
+    page(folder, "{% if answers['1'].pet == 'cat' %}{{ 1 // 0 }}{% else %}{{ 1 }}{% endif %}", "bye")
+    (line,) = looked(folder)
+    assert line.startswith("steps/bye.html:1: remark: a participant ")
+    assert "ZeroDivisionError" in line
+
+
 # --- the code that recruiters ask for -----------------------------------------------------------------
 
 NO_CODE = (

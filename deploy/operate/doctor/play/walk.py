@@ -147,7 +147,9 @@ class Walk:
         if finished == len(reports):
             self._scene.transcript.good("pages", f"{finished} of {finished} bots finished, with {sent} forms answered.")
             return
-        why = "; ".join(dict.fromkeys(error for one in reports for error in one.errors)) or "they did not finish"
+        reasons = [error for one in reports for error in one.errors]
+        reasons += [f"step {one.ended} has no button to press" for one in reports if one.ended]
+        why = "; ".join(dict.fromkeys(reasons)) or "they did not finish"
         self._scene.transcript.bad("pages", f"{finished} of {len(reports)} bots finished: {why}.", LOGS)
 
     def servers(self) -> None:
