@@ -9,6 +9,7 @@ PROJECT ?= .
 # Installs the study's own packages (requirements.txt).
 PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
+USER_ID ?=
 DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
 TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# TLS=1 and NAMES= count only on the command line
 NAMES_GIVEN = $(if $(filter command,$(origin NAMES)),$(NAMES))
@@ -29,7 +30,7 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
-KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
+KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
@@ -73,22 +74,24 @@ plan: $(VENV)/deploy ## show what `make deploy` would change in the installation
 register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new version
 	@$(DEPLOY) register "$(PROJECT)" $(ARGS) $(FOUND)
 
-# With PROJECT= for one study; without it, `data` and `cost` take the study in this folder, the others all studies.
-.PHONY: certificate doctor status cost data logs stop destroy
+# With PROJECT= for one study; without it, `data`, `erase` and `cost` take the study in this folder, the others all studies.
+.PHONY: certificate doctor status cost data erase logs stop destroy
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
 doctor: $(VENV)/deploy ## check that everything is in order on AWS, and say what to do if not
 status: $(VENV)/deploy ## show participants' steps and servers (ARGS=--watch)
 cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (what it has cost: ARGS="--project ID")
 data: $(VENV)/deploy ## convert answers and recordings of PROJECT=. (DATA=) to CSV and Parquet, from here or AWS
+erase: $(VENV)/deploy ## erase one participant, USER_ID=, from the data of PROJECT=. or DATA=, on this machine or AWS
 logs: $(VENV)/deploy ## show the logs of functions and servers (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
 certificate destroy: STUDY =
 cost: STUDY = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
-doctor status data logs stop: STUDY = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
-data: STUDY += $(if $(DATA_GIVEN),--from "$(DATA)")
-certificate doctor status cost data logs stop destroy:
-	@$(DEPLOY) $@ $(STUDY) $(ARGS) $(FOUND)
+doctor status data erase logs stop: STUDY = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
+data erase: STUDY += $(if $(DATA_GIVEN),--from "$(DATA)")
+erase: WHO = -- "$(USER_ID)"
+certificate doctor status cost data erase logs stop destroy:
+	@$(DEPLOY) $@ $(STUDY) $(ARGS) $(WHO) $(FOUND)
 
 # The quick tests only compute. All tests together wait for two thirds of their time, so two cores can have more workers.
 WORKERS ?=

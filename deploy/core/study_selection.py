@@ -63,7 +63,7 @@ def local_data(study: StudySelection) -> Path | None:
     if not place.is_dir():
         if may_use_aws(study.folder):
             return None
-        raise none_here(study.id, study.folder, "If they are on AWS, --aws fetches them (with make: ARGS=--aws).")
+        raise none_here(study.id, study.folder, "If they are on AWS, add --aws (with make: ARGS=--aws).")
     return place
 
 

@@ -1,7 +1,7 @@
 """Erases one participant from a data folder of this machine, which `make run` or `make try` has filled.
 
 `make run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
-beside the data folder, in `.hippodrome/`.
+beside the data folder, in `.hippodrome/`, and there too the data that `make run ARGS=--fresh` has moved aside.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import contextlib
 import fcntl
 import json
 import os
+import re
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,15 +23,20 @@ from deploy.core.server_records import keys_of_warm_servers, warm_servers_of
 from deploy.operate.data_folder import DataFolder
 from deploy.operate.lobby_eraser import LobbyEraser
 from deploy.operate.session_eraser import FoundSession, SessionEraser
+from export import keys
 from hippodrome.limits import rules as limits
 from hippodrome.limits.rules import ParticipantSlots
 from hippodrome.model import ids, server
+from hippodrome.model.project import MASTER_LIST, read_list
 from hippodrome.model.records import from_json, to_json
 from hippodrome.model.server import Server
-from protocol.keys import participant_folder, session_folder
+from protocol.keys import participant_folder, session_folder, sessions_folder
 
 STATE = ".hippodrome"
 """Where `make run` keeps tasks, messages and unfinished recordings, beside the data folder."""
+EARLIER = "earlier"
+"""The folder in `STATE` to which `make run ARGS=--fresh` moves data and their state."""
+_UNMISTAKABLE = 6  # characters from which an id cannot well be a part of other values
 
 
 @dataclass
@@ -38,16 +45,16 @@ class Erased:
 
     files: int = 0
     rewritten: int = 0
-    mentioned: Sequence[str] = ()  # files of `.hippodrome/` that still name the participant
 
 
 class FolderEraser:
     """Erases one participant of one project from a data folder. May be interrupted anywhere and called again."""
 
     def __init__(self, data: Path, project: str, user: str) -> None:
+        self.data = data
+        self.project = project
         self._folder = DataFolder(data)
-        self._state = data.resolve().parent / STATE
-        self._project = project
+        self._state = _state_of(data)
         self._user = user
         self._label = ids.server_label(project, user)
         self._sessions = SessionEraser(self._folder, project, user)
@@ -69,15 +76,14 @@ class FolderEraser:
 
             for found in sessions:
                 if not found.others:
-                    self._folder.delete(self._of_server(ids.server_label(self._project, found.id)), note)
+                    self._folder.delete(self._of_server(ids.server_label(self.project, found.id)), note)
                 self._sessions.leave(found, note)
             self._lobby.erase(note)
             self._release_slot()
+            self._delete_state(note)
             self._folder.delete(self._own(), note)
             self._folder.remove_unfinished()  # files that a killed run was writing
-            spool = DataFolder(self._state / self._folder.root.name / "spool")
-            spool.delete(spool.versions(participant_folder(self._project, self._user)), note)
-            done.rewritten, done.mentioned = self._sessions.rewritten, self._mentioned()
+            done.rewritten = self._sessions.rewritten
             return done
 
     @property
@@ -88,7 +94,7 @@ class FolderEraser:
     def _own(self) -> list[Version]:
         return [
             *self._of_server(self._label),
-            *self._folder.versions(participant_folder(self._project, self._user)),
+            *self._folder.versions(participant_folder(self.project, self._user)),
         ]
 
     def _of_server(self, label: str) -> list[Version]:
@@ -98,12 +104,12 @@ class FolderEraser:
             record = from_json((self._folder.root / key).read_bytes(), Server)
         except (OSError, ValueError, RecursionError):
             record = None
-        keys = (*keys_of_warm_servers(self._project, warm_servers_of(record)), key)
+        keys = (*keys_of_warm_servers(self.project, warm_servers_of(record)), key)
         return [version for each in keys for version in self._folder.versions_of(each)]
 
     def _release_slot(self) -> None:
         """Take the participant out of the project's documents of slots (`maxParticipants`)."""
-        for version in list(self._folder.versions(limits.participant_slots_folder(self._project))):
+        for version in list(self._folder.versions(limits.participant_slots_folder(self.project))):
             body = self._folder.read(version)
             try:
                 held = from_json(body, ParticipantSlots)
@@ -112,12 +118,19 @@ class FolderEraser:
             if self._label in held.labels:
                 self._folder.replace(version.key, body, to_json(held.without(self._label)))
 
+    def _delete_state(self, note: Callable[[Sequence[Version]], None]) -> None:
+        """Delete what `make run` keeps of the participant alone: unfinished recordings, tasks and logs."""
+        state, unfinished = DataFolder(self._state), f"spool/{participant_folder(self.project, self._user)}"
+        for prefix in (unfinished, f"tasks/{self._label}", f"logs/{self._label}"):
+            state.delete(state.versions(prefix), note)
+        shutil.rmtree(self._state / unfinished, ignore_errors=True)  # folders without files
+
     # -- what must not run
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
         """Hold the lock of `make run`, if that has ever run. Raises `Problem` if it runs now."""
-        lock = self._state / f"{self._folder.root.name}.lock"
+        lock = self._state.with_name(f"{self._state.name}.lock")
         if not lock.exists():
             yield
             return
@@ -133,27 +146,16 @@ class FolderEraser:
 
     def _must_be_over(self, sessions: Sequence[FoundSession]) -> None:
         """Raise `Problem` if a killed `make run` has left a running server, or recordings that it has not moved."""
-        state = self._state / self._folder.root.name
-        theirs = [session_folder(self._project, found.id) for found in sessions]
-        folders = {participant_folder(self._project, self._user), *theirs}
-        runs = any(_runs(path, folders) for path in sorted((state / "tasks").glob("*")))
-        spool = DataFolder(state / "spool")
+        theirs = [session_folder(self.project, found.id) for found in sessions]
+        folders = {participant_folder(self.project, self._user), *theirs}
+        runs = any(_runs(path, folders) for path in sorted((self._state / "tasks").glob("*")))
+        spool = DataFolder(self._state / "spool")
         unfinished = any(any(spool.versions(folder)) for folder in theirs)
         if runs or unfinished:
             raise Problem(
                 "Their server still runs, or its recording is unfinished: `make run` was killed. Nothing was touched.",
                 "Start `make run` once more and end it with Ctrl-C: it ends all servers and keeps what they recorded.",
             )
-
-    def _mentioned(self) -> list[str]:
-        """Return the files of `.hippodrome/` that name the participant: messages and tasks."""
-        state = self._state / self._folder.root.name
-        names = [self._label.encode(), f'"{self._user}"'.encode(), f"/users/{self._user}".encode()]
-        return [
-            path.relative_to(self._state).as_posix()
-            for path in (state.rglob("*") if state.is_dir() else ())
-            if path.is_file() and any(name in path.read_bytes() for name in names)
-        ]
 
 
 def _runs(path: Path, folders: set[str]) -> bool:
@@ -168,21 +170,52 @@ def _runs(path: Path, folders: set[str]) -> bool:
     return True
 
 
-def erase(
-    data: Path, project: str, user: str, *, dry_run: bool, confirm: Callable[[int, int], None]
-) -> tuple[Erased | None, list[str], int]:
-    """Erase the participant, unless `dry_run`, nothing is found or `confirm` raises.
+def folders(data: Path) -> list[Path]:
+    """Return the data folder, and the folders to which `make run ARGS=--fresh` has moved its earlier data.
 
-    `confirm` gets how many files and how many sessions were found. Return what was done (None: nothing), the keys of
-    documents that cannot be read, and how many files and sessions were found. Raises `Problem` if there is no such
-    folder, and as `FolderEraser.run` does.
+    Raises `Problem` if there is no such folder.
     """
     if not data.is_dir():
-        raise Problem(f"There is no folder {data}.", "Name the data folder of `make run`.")
-    eraser = FolderEraser(data, project, user)
-    own, sessions = eraser.look()
-    found = len(own) + len(sessions)
-    if dry_run or not found:
-        return None, eraser.unreadable, found
-    confirm(len(own), len(sessions))
-    return eraser.run(), eraser.unreadable, found
+        raise Problem(f"There is no folder {data}.", "Name the data folder of `make run` (with make: DATA=).")
+    moved = data.resolve().parent / STATE / EARLIER
+    return [data, *sorted(moved.glob(f"{data.resolve().name}-*/data"))]
+
+
+def projects(data: Path) -> list[str]:
+    """Return the ids of all projects in a data folder: those that are registered or have data of participants."""
+    present = {
+        path.name
+        for path in data.iterdir()
+        if any((data / folder).is_dir() for folder in (keys.prefix(path.name), sessions_folder(path.name)))
+    }
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        present.update(project.id for project in read_list((data / MASTER_LIST).read_bytes()).projects)
+    return sorted(filter(ids.is_project_id, present))
+
+
+def mentions(data: Path, user: str) -> list[Path]:
+    """Return the files in a data folder and in its state whose path or content still names the participant.
+
+    What packed recordings hold is not looked at. A short id is only searched for where it must be an id.
+    """
+    bare = rf"(?<![\w-]){user}(?![\w-])"
+    names = [bare if len(user) >= _UNMISTAKABLE else rf'users/{user}/|Id": ?"{user}"']
+    names += [ids.server_label(project, user) for project in projects(data)]
+    pattern = re.compile("|".join(names).encode())
+    return [
+        path
+        for root in (data, _state_of(data))
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+        and (
+            pattern.search(os.fsencode(path.relative_to(root)))
+            or (path.suffix != ".gz" and pattern.search(path.read_bytes()))
+        )
+    ]
+
+
+def _state_of(data: Path) -> Path:
+    """Return the folder where `make run` keeps the state of this data folder. `--fresh` moves both side by side."""
+    root = data.resolve()
+    moved = root.parent.parent.name == EARLIER and root.parent.parent.parent.name == STATE
+    return root.parent / "state" if moved else root.parent / STATE / root.name

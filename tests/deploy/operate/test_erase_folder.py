@@ -44,8 +44,11 @@ class Machine:
         self.put = into_folder(self.data)
 
     def erase(self, *more: str, user: str = ANN) -> CommandResult:
+        return self.run("--project", "maze", "--from", str(self.data), *more, user=user)
+
+    def run(self, *more: str, user: str = ANN) -> CommandResult:
         self._capsys.readouterr()
-        code = main(["erase", user, "--project", "maze", "--from", str(self.data), *more])
+        code = main(["erase", user, *more])
         printed = self._capsys.readouterr()
         return CommandResult(code, printed.out, printed.err)
 
@@ -141,6 +144,104 @@ def test_documents_of_local_functions_that_name_the_participant_are_reported(mac
     pair(machine.put, machine.tmp)
     into_folder(machine.tmp / ".hippodrome" / "data")("queue/1.json", json.dumps({"userId": ANN}).encode())
     assert ".hippodrome/data/queue/1.json still names them" in machine.erase("--yes").err
+
+
+def test_the_state_of_the_participants_own_server_is_erased(machine: Machine) -> None:
+    put = into_folder(machine.tmp / ".hippodrome" / "data")
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    (machine.tmp / f".hippodrome/data/spool/maze/users/{ANN}/trials").mkdir(parents=True)
+    other = ids.server_label("maze", BOB)
+    for label, user in ((LABEL, ANN), (other, BOB)):
+        put(f"tasks/{label}-1.json", json.dumps({"folder": f"maze/users/{user}"}).encode())
+        put(f"logs/{label}-1.log", b"2026-11-28 INFO the agent is ready")
+    ran = machine.erase("--yes")
+    assert (ran.code, "still names them" in ran.err) == (Exit.DONE, False)
+    state = machine.tmp / ".hippodrome" / "data"
+    assert [path.name for path in sorted(state.rglob("*")) if path.is_file()] == [f"{other}-1.log", f"{other}-1.json"]
+    assert not list(state.rglob(ANN))
+
+
+def test_without_a_project_the_participant_is_erased_in_all_projects_of_the_folder(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands run in another study's folder, such as Hippodrome's."""
+    pair(machine.put, machine.tmp)
+    machine.put(f"trust/users/{ANN}/participant.json", b"{}")
+    machine.put(f"trust/users/{BOB}/participant.json", b"{}")
+    elsewhere = machine.tmp / "elsewhere"
+    into_folder(elsewhere)("config.yml", b"project: {id: another-study}")
+    monkeypatch.chdir(elsewhere)
+    dry = machine.run("--from", str(machine.data), "--dry-run")
+    assert (dry.code, "maze" in dry.out, "trust" in dry.out) == (Exit.CHANGES, True, True)
+    assert machine.run("--from", str(machine.data), "--yes").code == Exit.DONE
+    assert machine.traces() == []
+    assert f"trust/users/{BOB}/participant.json" in machine.contents()
+
+
+def test_an_erasure_in_one_project_says_where_else_the_participant_is(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    machine.put(f"trust/users/{ANN}/participant.json", b"{}")
+    ran = machine.erase("--yes")
+    assert (ran.code, "They are also in trust" in ran.err) == (Exit.DONE, True)
+    assert machine.traces() == [f"trust/users/{ANN}/participant.json"]
+
+
+@pytest.mark.parametrize("data", ["data", "."])
+def test_a_project_or_folder_that_is_not_there_is_no_erasure(machine: Machine, data: str) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    ran = machine.run("--from", str(machine.tmp / data), "--yes", *(["--project", "mase"] if data == "data" else []))
+    told = "holds nothing of a project mase" if data == "data" else "is not a data folder: it holds no project"
+    assert (ran.code, told in ran.err) == (Exit.FAILED, True)
+    assert ("It holds: maze" in ran.err) == (data == "data")
+    assert machine.contents() == before
+
+
+def test_data_that_fresh_has_moved_aside_are_erased_too(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    place = machine.tmp / ".hippodrome" / "earlier" / "data-20261121-144640"
+    into_folder(place / "data")(f"maze/users/{ANN}/answers/1.json", b"{}")
+    into_folder(place / "state")(f"spool/maze/users/{ANN}/trials/s-1/3-trial.jsonl.part", b"")
+    into_folder(place / "state")("queue/1.json", json.dumps({"userId": ANN}).encode())
+    ran = machine.run("--from", str(machine.data), "--yes")
+    assert (ran.code, machine.traces()) == (Exit.DONE, [])
+    assert [path.name for path in place.rglob("*") if path.is_file()] == ["1.json"]
+    assert "state/queue/1.json still names them" in ran.err
+
+
+def test_a_table_in_the_data_folder_that_names_the_participant_is_reported(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    machine.put("tables/answers.csv", f"participant,2.age\n{ANN},33\n".encode())
+    machine.put("tables/of-others.csv", f"participant,2.age\n{ANN}-2,33\n".encode())
+    ran = machine.erase("--yes")
+    assert "tables/answers.csv still names them" in ran.err
+    assert "of-others" not in ran.err
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ("", "1 file deleted"),
+        (", awsSetup: {cpu: 1, memory: 2}", "may be in two places: in data on this machine, and on AWS"),
+    ],
+    ids=["here", "here or on AWS"],
+)
+def test_without_from_the_data_are_those_of_this_machine_only_if_there_can_be_no_others(
+    machine: Machine, keys: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    into_folder(machine.tmp)("config.yml", f"project: {{id: maze{keys}}}".encode())
+    monkeypatch.chdir(machine.tmp)
+    ran = machine.run("--yes")
+    assert told in ran.err
+    assert (machine.traces() == [], ran.code == Exit.DONE) == (not keys, not keys)
+
+
+def test_a_receipt_is_not_promised_for_data_on_this_machine(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    assert "On this machine there is no receipt" in machine.erase("--yes", "--receipt", "r.json").err
+    assert machine.contents() == before
 
 
 class Interruption(BaseException):
