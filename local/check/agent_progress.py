@@ -18,8 +18,10 @@ from local.check.deadline import Deadline
 from local.check.outside import Outside
 from local.check.pace import PLAY_STEPS, Pace
 from trial.recordings import recording
+from trial.recordings.recorded_values import Values
 
 REPORT_BYTES = 2**20  # a report of this size begins anew
+_LOOKED_AT = 1_000  # the most values, and elements of an array, in which objects that are kept as text are looked for
 
 
 class AgentProgress:
@@ -85,19 +87,27 @@ class AgentProgress:
         """Note that a callback of the agent has raised this error."""
         self._callback_errors.append({"name": name, **_described(error, self._folder)})
 
-    def returned(self, infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None) -> None:
-        """Note the first value of a step that is too large for the recording.
+    def returned(
+        self, observations: Iterable[Any], infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None
+    ) -> None:
+        """Note the first value of a step that is too large for the recording, and the first that is kept as text.
 
-        `infos` are those of the step; `extra` are the further values that `step` returned.
+        `extra` are the further values that `step` returned. `observations` are those that are recorded.
         """
+        values = (*(("info", info) for info in infos), ("what step() returns", extra or {}))
+        if "onlyText" not in self.known:
+            for where, value in (*(("an observation", each) for each in observations), *values):
+                reader = Values(most=_LOOKED_AT, longest=_LOOKED_AT)
+                reader.keep(value)
+                if reader.only_text:
+                    self.known["onlyText"] = {"type": reader.only_text[:100], "where": where}
+                    break
         if "tooLarge" in self.known:
             return
-        for where, values in (
-            *(("info", info) for info in infos if recording.is_too_large(info)),
-            ("what it returns", extra),
-        ):
-            found = recording.bounded_extra(values)[1] if values else {}
-            for name, size in found.items():
+        for where, value in values:
+            if where == "info" and not recording.is_too_large(value):
+                continue
+            for name, size in recording.bounded_extra(value)[1].items():
                 self.known["tooLarge"] = {"name": name[:100], "size": size, "where": where}
                 return
 

@@ -71,6 +71,7 @@ class AgentReport:
             *self._undrawn(),
             *self._outside(),
             *self._too_large(),
+            *self._only_text(),
             *self._endless(),
             *self._idle(),
             *self._turns(),
@@ -188,6 +189,17 @@ class AgentReport:
         message = (
             f"{value['name']!r} in {value['where']} is too large for the recording ({value['size']} bytes; all values "
             "of a step may have a megabyte as JSON): its size is recorded instead"
+        )
+        return [self._at(self._place_of("step"), message, remark=True)]
+
+    def _only_text(self) -> list[Diagnostic]:
+        """A remark on an object in a step's values of which the recording has only a text."""
+        value = self._report.get("onlyText")
+        if value is None or self._group:
+            return []
+        message = (
+            f"{value['where']} has an object of the class {printable(value['type'])}, of which only str() is recorded, "
+            "at most 1000 characters; return numbers, texts, arrays, lists, dicts or dataclasses"
         )
         return [self._at(self._place_of("step"), message, remark=True)]
 

@@ -95,7 +95,8 @@ class CheckedGame:
                 progress.pace.took(time.monotonic() - began)
                 progress.known["policies"] = {name: vars(pace) for name, pace in self._paces.items()}
                 progress.known["takeTurns"] = self._take_turns()
-                progress.returned(now.infos.values(), now.extra)
+                recorded = now.observations.values() if self._config.record_observations else ()
+                progress.returned(recorded, now.infos.values(), now.extra)
                 callbacks.stepped(actions, now.rewards, now.observations, now.infos)
             progress.episodes = episode
             callbacks.episode_ended(now.why if now.over else "truncated")

@@ -12,13 +12,15 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from enum import Enum
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from trial.gym.spaces import CodecError, Space
+from trial.recordings.recorded_values import simpler
 
 Decode = Callable[[Any], Any]
 """A function that reads a value of a space from JSON data. It raises CodecError."""
@@ -54,12 +56,10 @@ def plain(value: Any, depth: int = 0) -> Any:
         return value
     if depth > MAX_DEPTH:
         return type(value).__name__
-    if isinstance(value, Mapping):
-        return {_key(key): plain(part, depth + 1) for key, part in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(part, depth + 1) for part in value]
-    simple = _simple(value)
-    return plain(simple, depth + 1) if isinstance(simple, list) else simple
+    simple = value if isinstance(value, list | tuple) else _simple(value)
+    if isinstance(simple, Mapping):
+        return {_key(key): plain(part, depth + 1) for key, part in simple.items()}
+    return [plain(part, depth + 1) for part in simple] if isinstance(simple, list | tuple) else simple
 
 
 def _key(key: Any) -> str:
@@ -74,11 +74,20 @@ def _key(key: Any) -> str:
 
 
 def _simple(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufUO":
-        return value.tolist()
-    if isinstance(value, set | frozenset):
-        return list(value)
-    return type(value).__name__
+    """Convert what JSON's encoder does not take; its class's name stands for an object that holds no values."""
+    if isinstance(value, Enum):
+        return plain(value.value)
+    try:
+        simple = simpler(value)
+    except Exception:  # noqa: BLE001 - the object is the researcher's
+        return type(value).__name__
+    if isinstance(simple, np.ndarray | np.generic):
+        return simple.tolist() if simple is value else _simple(simple)
+    if isinstance(simple, Mapping):
+        return dict(simple)
+    if isinstance(simple, str | int | float):
+        return simple
+    return list(simple) if isinstance(simple, Iterable) and not isinstance(simple, bytes) else type(value).__name__
 
 
 def _written(match: re.Match[str]) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import math
+import sys
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence, Set, ValuesView
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,9 @@ MAX_VALUES = 2_000_000
 """The most values that are converted in one value. Containers that hold one another may have an immense number."""
 CUT_OFF = "<cut off>"
 """The text in a container that stands for the values that were left out."""
+_NUMBERS = "biuf"  # NumPy's kinds of booleans and real numbers
+_ARRAYS = ("__array__", "__array_interface__", "__dlpack__")  # what arrays of other packages have
+_ADDRESS = " at 0x"  # in the text of an object whose class describes none
 _DEPTH = 20  # the most levels of nesting
 _TEXT = 1000  # the most characters of an object that is converted to its text
 _INT_BITS = 10_000  # Python converts no longer integers to text (sys.set_int_max_str_digits)
@@ -35,6 +40,8 @@ class Values:
         self._around: set[int] = set()  # the ids of the containers around the present value
         self.left_out = 0
         """The bytes of the texts and arrays that were too long."""
+        self.only_text: str | None = None
+        """The type of the first object of which only a text was kept that may not say all of its value."""
 
     @property
     def exhausted(self) -> bool:
@@ -53,16 +60,34 @@ class Values:
             return value
         if isinstance(value, str | bytes):
             return self._text(value)
-        if isinstance(value, int) and not isinstance(value, np.generic):
+        if isinstance(value, Enum):
+            return self.keep(value.value, depth)
+        if isinstance(value, int):
             bits = value.bit_length()
             return int(value) if bits <= _INT_BITS else f"<int of {bits} bits>"
         if isinstance(value, float):
             return float(value) if math.isfinite(value) else None
-        if isinstance(value, Mapping | list | tuple | set | frozenset):
-            return self._container(value, depth)
         if isinstance(value, np.generic | np.ndarray):
-            return self._array(value)
-        return text_of(value)
+            return self._array(value, depth)
+        return self._object(value, depth)
+
+    def _object(self, value: Any, depth: int) -> Any:
+        try:
+            simple = simpler(value)
+        except Exception:  # noqa: BLE001 - as in `keep`; its text may still say what it is
+            simple = None
+        if simple is None:
+            return self._described(value)
+        if isinstance(simple, np.ndarray | bytes):
+            return self._converted(simple, depth)
+        return self._container(value, simple, depth)
+
+    def _described(self, value: Any) -> str:
+        text = text_of(value)
+        module = type(value).__module__.partition(".")[0]
+        if module not in sys.stdlib_module_names or _ADDRESS in text:
+            self.only_text = self.only_text or type(value).__name__
+        return text
 
     def _text(self, value: str | bytes) -> str:
         if len(value) > self._longest:
@@ -70,14 +95,13 @@ class Values:
             return ""
         return value if isinstance(value, str) else base64.b64encode(value).decode("ascii")
 
-    def _container(self, value: Any, depth: int) -> Any:
+    def _container(self, value: Any, simple: Mapping[Any, Any] | Iterable[Any], depth: int) -> Any:
+        """`simple` holds what the container `value` holds."""
         if depth >= _DEPTH or id(value) in self._around:
             return f"<{type(value).__name__}>"
         self._around.add(id(value))
         try:
-            if isinstance(value, Mapping):
-                return self._mapping(value, depth)
-            return self._list(value, depth)
+            return self._mapping(simple, depth) if isinstance(simple, Mapping) else self._list(simple, depth)
         finally:
             self._around.discard(id(value))
 
@@ -101,20 +125,73 @@ class Values:
             converted.append(self.keep(item, depth + 1))
         return converted
 
-    def _array(self, value: Any) -> Any:
-        if value.dtype.kind not in "biuf":
-            return text_of(value)
-        if self._listed is None and value.size > self._longest:  # too large even if each number has one byte
-            self.left_out += value.nbytes
+    def _array(self, value: Any, depth: int) -> Any:
+        if value.size > self._longest and (self._listed is None or value.dtype.kind not in _NUMBERS):
+            self.left_out += value.nbytes  # too large even if each element has one byte
             return None
-        if self._listed is None or not isinstance(value, np.ndarray) or value.size <= self._listed:
-            return _numbers(value)
-        if value.nbytes > self._longest * _PACKED_BYTES:
-            self.left_out += value.nbytes
+        simple = simpler(value)
+        if not isinstance(simple, np.generic | np.ndarray) or simple.dtype.kind not in _NUMBERS:
+            return self.keep(simple, depth + 1)
+        if self._listed is None or not isinstance(simple, np.ndarray) or simple.size <= self._listed:
+            return _numbers(simple)
+        if simple.nbytes > self._longest * _PACKED_BYTES:
+            self.left_out += simple.nbytes
             return None
-        array = np.ascontiguousarray(value)
+        array = np.ascontiguousarray(simple)
         packed = base64.b64encode(zlib.compress(array.tobytes(), 1)).decode("ascii")
-        return {"dtype": str(array.dtype), "shape": list(value.shape), "zlib": packed}
+        return {"dtype": str(array.dtype), "shape": list(simple.shape), "zlib": packed}
+
+
+def simpler(value: Any) -> Any:
+    """Return what an object holds as a type that is nearer to JSON's; None if it is of no kind that holds values.
+
+    Another package's array becomes NumPy's. NumPy's numbers, and arrays of numbers, stay, in this machine's byte order;
+    other arrays become lists, or a mapping of their named fields. Everything else becomes a mapping, an iterable or
+    bytes. May raise any error of the object.
+    """
+    if isinstance(value, np.generic | np.ndarray):
+        return _simpler_array(value)
+    if isinstance(value, Mapping):
+        return value
+    if isinstance(value, bytearray | memoryview):
+        return bytes(value)
+    if isinstance(value, Sequence | Set | ValuesView):
+        return value
+    if isinstance(value, type):
+        return None
+    if any(hasattr(value, name) for name in _ARRAYS):
+        return _as_array(value)
+    fields = getattr(value, "__dataclass_fields__", None) or [a.name for a in getattr(value, "__attrs_attrs__", ())]
+    return {name: getattr(value, name) for name in fields} if fields else None
+
+
+def _simpler_array(value: Any) -> Any:
+    if isinstance(value, np.ma.MaskedArray):
+        return value.tolist() if np.ma.is_masked(value) else _simpler_array(value.data)
+    kind = value.dtype.kind
+    if value.dtype.names:
+        return {name: value[name] for name in value.dtype.names}
+    if kind == "V" and not issubclass(value.dtype.type, np.void):  # numbers of another package, such as bfloat16
+        return value.astype(np.float32)
+    if kind == "c":
+        return value.astype(complex).tolist()
+    if kind in "Mm":
+        return value.astype(str).tolist()
+    if kind not in _NUMBERS:
+        return value.tolist()
+    if kind == "f" and value.dtype.itemsize > np.dtype(float).itemsize:
+        return value.astype(float)
+    return value if value.dtype.isnative else value.astype(value.dtype.newbyteorder("="))
+
+
+def _as_array(value: Any) -> Any:
+    """Return the array of another package's array, such as JAX's or a tensor."""
+    try:
+        return np.from_dlpack(value) if not hasattr(value, "__array__") else np.asarray(value)
+    except Exception:
+        if not hasattr(value, "tolist"):
+            raise
+        return np.asarray(value.tolist())  # a tensor with gradients, or on a GPU
 
 
 def text_of(value: Any) -> str:
@@ -131,8 +208,6 @@ def _numbers(value: Any) -> Any:
     """Convert an array to lists, or a NumPy number to a number, with None for NaN and infinities."""
     if value.dtype.kind != "f":
         return value.tolist()
-    if value.dtype.itemsize > np.dtype(float).itemsize:
-        value = value.astype(float)
     finite = np.isfinite(value)
     if finite.all():
         return value.tolist()

@@ -95,6 +95,25 @@ def test_good_callbacks_get_no_remark(folder: Path) -> None:
     assert tried(folder) == []
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("return 0, 1.0", "return {'world': Env()}, 1.0", "an observation"),
+        ("False, {}", "False, {'world': [Env()]}", "info"),
+        ("return 0, 1.0", "return {'at': datetime.date.today(), 'seen': np.array(['a'])}, 1.0", None),
+    ],
+)
+def test_an_object_that_is_kept_as_text_only_is_remarked(folder: Path, old: str, new: str, where: str | None) -> None:
+    config(folder, "trial:\n", "trial:\n  recordObservations: true\n")
+    agent(folder, "import numpy as np", "import datetime; import numpy as np")
+    agent(folder, old, new)
+    remark = (
+        f"agent.py:21: remark: {where} has an object of the class Env, of which only str() is recorded, at most 1000 "
+        "characters; return numbers, texts, arrays, lists, dicts or dataclasses"
+    )
+    assert tried(folder) == ([remark] if where else [])
+
+
 def test_an_agent_that_fails_late_is_reported(folder: Path) -> None:
     agent(folder, "self.n += 1", "self.n += 1; assert self.n != 25, 'late'")
     (line,) = tried(folder)

@@ -23,9 +23,10 @@ def test_the_process_that_listens_imports_neither_numpy_nor_gymnasium() -> None:
     assert not found & {"numpy", "gymnasium", "PIL"}
 
 
-def test_a_client_imports_only_the_trials_modules_for_environments() -> None:
+def test_a_client_imports_only_the_trials_modules_for_environments_and_values() -> None:
     found = imported("from trial.gym import RemoteEnv")
     ours = {name for name in found if name.split(".")[0] in {"trial", "protocol", "hippodrome", "lambdas", "local"}}
-    assert ours - {"trial"} == {name for name in ours if name.startswith("trial.gym")}
+    values = {"trial.recordings", "trial.recordings.recorded_values"}
+    assert ours - {"trial"} - values == {name for name in ours if name.startswith("trial.gym")}
     assert not ours & {"trial.gym.server", "trial.gym.worker", "trial.gym.session"}
     assert not found & {"boto3", "PIL", "ale_py", "isal"}

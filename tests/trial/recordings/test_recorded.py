@@ -1,14 +1,18 @@
 """How the lines of earlier servers are read, and how unusual values are recorded; no server runs here."""
 
+import enum
 import gzip
 import json
 import platform
 import zlib
-from collections import UserDict
+from collections import UserDict, deque
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
+import attrs
 import numpy as np
 import pytest
 
@@ -247,6 +251,52 @@ class LongText:
         return "o" * 2000
 
 
+class Level(enum.Enum):
+    HIGH = "high"
+
+
+@dataclass
+class State:
+    lives: int
+    levels: list[Level]
+
+
+class Point(NamedTuple):
+    x: int
+    y: int
+
+
+class Tensor:
+    """An array of another package, such as JAX's."""
+
+    def __init__(self, values):
+        self.values = np.array(values)
+
+    def __array__(self, dtype=None, copy=None):
+        return self.values
+
+
+class WithGradient(Tensor):
+    """A tensor of torch that NumPy may not read."""
+
+    def __array__(self, dtype=None, copy=None):
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+
+    def tolist(self):
+        return self.values.tolist()
+
+
+class OnlyDlpack:
+    def __init__(self, values):
+        self.values = np.array(values)
+
+    def __dlpack__(self, **options):
+        return self.values.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.values.__dlpack_device__()
+
+
 @pytest.mark.parametrize(
     ("value", "kept"),
     [
@@ -262,13 +312,30 @@ class LongText:
         (np.float64("inf"), None),
         (np.bool_(True), True),
         (np.array([[1, 2]]), [[1, 2]]),
-        (np.array(["a"]), "['a']"),
-        (np.datetime64("2026-01-01"), "2026-01-01"),
+        (np.array(["a", "b"]), ["a", "b"]),
+        (np.array([1, "x", {"a": np.int8(2)}], object), [1, "x", {"a": 2}]),
+        (np.ma.array([1.5, 2.5], mask=[False, True]), [1.5, None]),
+        (np.array([(1, 2.5)], [("x", "i4"), ("y", "f8")]), {"x": [1], "y": [2.5]}),
+        (np.arange(2, dtype=">f4"), [0.0, 1.0]),
+        (np.array([1 + 2j]), ["(1+2j)"]),
+        (np.datetime64("2026-01-01", "ns"), "2026-01-01T00:00:00.000000000"),
+        (State(3, [Level.HIGH]), {"lives": 3, "levels": ["high"]}),
+        (attrs.make_class("Cell", ["x"])(1), {"x": 1}),
+        (Point(1, np.int64(2)), [1, 2]),
+        (deque([1, 2]), [1, 2]),
+        (range(3), [0, 1, 2]),
+        ({"a": 1}.keys(), ["a"]),
+        (UserDict(a=1), {"a": 1}),
+        (Tensor([[1.5, 2.5]]), [[1.5, 2.5]]),
+        (Tensor(3), 3),
+        (WithGradient([1.5]), [1.5]),
+        (OnlyDlpack([1.5]), [1.5]),
         ({1: {"a": (1, 2)}}, {"1": {"a": [1, 2]}}),
         (frozenset({1}), [1]),
         (b"\xff", "/w=="),
+        (bytearray(b"\xff"), "/w=="),
         (LongText(), "o" * 1000),
-        (np.array(["x" * 2000]), f"['{'x' * 998}"),
+        (np.array(["x" * 2000]), ["x" * 2000]),
     ],
 )
 def test_a_value_is_kept_as_json_can_hold_it(value, kept):
@@ -434,7 +501,20 @@ def test_an_observation_is_kept_with_its_shape():
     assert kept["a"][0].keys() == {"dtype", "shape", "zlib"}
     assert (kept["a"][0]["dtype"], kept["a"][0]["shape"]) == ("int16", [3, 2])
     assert np.array_equal(recording.read_observation(kept["a"][0]), array)
-    assert (kept["a"][1], kept["b"]) == ("x", ["['y']"])
+    assert (kept["a"][1], kept["b"]) == ("x", [["y"]])
+
+
+@pytest.mark.parametrize("wrap", [Tensor, lambda array: State(array, []), lambda array: array.astype(">f8")])
+def test_an_array_in_any_observation_is_kept_whole(wrap):
+    array = np.random.default_rng(1).random((40, 40))
+    kept = recording.observation(wrap(array))
+    assert np.array_equal(recording.read_observation(kept.get("lives", kept)), array)
+
+
+def test_an_array_that_contains_itself_does_not_end_the_game():
+    itself = np.empty((), object)
+    itself[()] = itself
+    assert recording.plain({"a": itself}) == {"a": "<ndarray>"}
 
 
 def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_the_head(tmp_path, monkeypatch):
