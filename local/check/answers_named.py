@@ -11,19 +11,21 @@ from local.check.earlier_answers import EarlierAnswers
 from local.check.wording import short
 from protocol.similar import did_you_mean
 
-_METHODS = frozenset(dir(dict))
-"""`answers["2"].items` is a method of Python's dictionary, and no field."""
-
 
 def check_answers_named(label: str, parsed: nodes.Template, earlier: EarlierAnswers) -> Iterator[Diagnostic]:
-    """Yield remarks on keys of steps without quotes, and on fields that an earlier step does not have."""
+    """Yield remarks on steps that the study does not have, and on fields that an earlier step does not have."""
+    called = {id(call.node) for call in parsed.find_all(nodes.Call)}  # `answers["2"].items()` is a method
     for node in _lookups(parsed):
+        if id(node) in called:
+            continue
         inner, key = node.node, _key(node)
         if _is_answers(inner) and isinstance(key, int) and not isinstance(key, bool):
             yield _remark(label, node, f'write answers["{key}"], with quotes')
+        if _is_answers(inner) and isinstance(key, str) and (why := earlier.why_no_step(key)):
+            yield _remark(label, node, why)
         if not isinstance(inner, nodes.Getitem | nodes.Getattr) or not _is_answers(inner.node):
             continue
-        if not isinstance(key, str) or (isinstance(node, nodes.Getattr) and key in _METHODS):
+        if not isinstance(key, str):
             continue
         step = _key(inner)
         known = earlier.fields_of(step) if isinstance(step, str) else None

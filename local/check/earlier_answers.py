@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from random import Random
@@ -35,6 +36,7 @@ class EarlierAnswers:
         """`steps` are the steps before the page; `folder` holds the pages."""
         self._folder = folder
         self._steps = steps
+        self._all = config.steps if config else ()
         self._least_played = {"outcome": UNMATCHED} if config and config.project.has_sessions else _PLAYED
 
     @classmethod
@@ -77,6 +79,16 @@ class EarlierAnswers:
         names = [control.name for text in texts for form in _forms(text) for control in form.controls if control.name]
         may_have_more = any("<script" in text.lower() for text in texts) or any(spans.MARK in name for name in names)
         return None if may_have_more else list(dict.fromkeys(names))
+
+    def why_no_step(self, key: str) -> str | None:
+        """Return why the study has no step with this key; None if it has one, or is not known."""
+        if not self._all or key in [step.key for step in self._all]:
+            return None
+        for step in self._all:
+            names = (file.name for file in step.files)
+            if any(re.fullmatch(rf"{re.escape(key)}(-\d+)?\.html", name) for name in names):
+                return f'answers have the keys of steps: write answers["{step.key}"] for the page {key}'
+        return f"there is no step {key}"
 
     def choices(self, field: str) -> int | None:
         """Return how many different answers a field can have.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from html.parser import HTMLParser
 from typing import Any
@@ -10,9 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from jinja2 import ChainableUndefined, Environment
-from markupsafe import Markup
 
+from hippodrome.participants import sandbox
 from hippodrome.participants.fragments import prepare
 from hippodrome.participants.sandbox import FragmentError, records_mentioned, uses_jinja
 
@@ -324,11 +322,8 @@ def test_characters_of_private_use_stay_unchanged() -> None:
         ("a\nb\n{{ 'x' ~ 1 / 0 }}", 3),
         ("{{ joiner()|tojson }}", 1),
         ("\n{{ x|nosuchfilter }}", 2),
-        ("\n\n{{ 'x' * 10000000 * 1000 }}", 3),
         ("{{ name }", 1),
         ("{% for a in range(1000000) %}{% endfor %}", 1),
-        ("{{ 9 ** 999999 }}", 1),
-        ("{{ '%999999999d' % 1 }}", 1),
         ("{{ ().__class__.__base__.__subclasses__() }}", 1),
         ("{{ answers.update({}) }}", 1),
     ],
@@ -459,174 +454,32 @@ def test_a_comment_of_jinja_is_no_part_of_the_page() -> None:
     assert prepare(css).render({}) == css
 
 
-@pytest.mark.parametrize(
-    ("expression", "fails"),
-    [
-        ("'x' * 2000000", False),
-        ("'x' * 2000001", True),
-        ("2000001 * 'x'", True),
-        ("[0] * 2000001", True),
-        ("'x' * -2000001", True),
-        ("2 * 2000001", False),
-        ("2 ** 64", False),
-        ("2 ** 65", True),
-        ("65 ** 2", False),
-        ("100 ** 0.5", False),
-        ("[['x' * 20]] * 1000000", True),
-        ("[{'x': 'y' * 1000000}] * 20", True),
-        ("[{'y' * 1000000: 1}] * 20", True),
-        ("'x' + 'y'", False),
-        ("('x' * 1000000) + ('y' * 1000000)", False),
-        ("('x' * 1000000) + ('y' * 1000001)", True),
-        ("('x' * 1000000).encode() + ('y' * 1000001).encode()", True),
-        ("'%999d' % 1", False),
-        ("'%1000000000d' % 1", True),
-        ("'%.1000000000f' % 1", True),
-        ("'%9d'.encode() % 1", False),
-        ("'%1000000000d'.encode() % 1", True),
-        ("'%*d' % (9, 1)", True),
-        ("'%.*f' % (9, 1)", True),
-        ("'%(x)999d' % {'x': 1}", False),
-        ("'%(x)1000000000d' % {'x': 1}", True),
-        ("'%(a(b)c)-1000000000d' % {'a(b)c': 1}", True),
-        ("'%%(a(b)c) in 2026: %d' % 7", False),
-        ("('%s' * 1000) % (('y' * 1000000,) * 1000)", True),
-        ("'%1000000000s'|format('x')", True),
-        ("'%(n)s'|format(n=3)", False),
-        ("'%05d'|format(7)", False),
-        ("1000 % 7", False),
-        ("'x'|center(80)", False),
-        ("'x'|center(10 ** 9)", True),
-        ("'x'|center(width=10 ** 9)", True),
-        ("['x']|map('center', 10 ** 9)|list", True),
-        ("(['x'] * 2000)|map('center', 1000000)|join", True),
-        ("(['x'] * 11)|map('center', 1000000)|join", False),
-        ("'x'.center(80)", False),
-        ("'x'.center(10 ** 9)", True),
-        ("'x'['ljust'](10 ** 9)", True),
-        ("('x'|safe).rjust(10 ** 9)", True),
-        ("'1'.zfill(10 ** 9)", True),
-        ("'1'.encode().ljust(10 ** 9)", True),
-        ("(1).to_bytes(10 ** 9, 'big')", True),
-        ("('\t' * 1000000).expandtabs(1000)", True),
-        ("'{:>9.2f} {x}'.format(1.5, x='y')", False),
-        ("'{:1000000000}'.format(1)", True),
-        ("('{:1000000000}'|safe).format(1)", True),
-        ("'{x:1000000000}'.format_map({'x': 1})", True),
-        ("'{:{}}'.format(1, 10 ** 9)", True),
-        ("('{0}' * 1000).format('y' * 1000000)", True),
-        ("'a b'|replace(' ', '<br>')", False),
-        ("('x' * 1000000)|replace('x', 'y' * 1000000)", True),
-        ("('x' * 1000000).replace('x', 'y' * 1000000)", True),
-        ("('x' * 1000).translate({120: 'y' * 1000000})", True),
-        ("['a', 'b']|join(', ')", False),
-        ("''.join(['y' * 1000000] * 20)", True),
-        ("['y' * 1000000, 'y' * 1000000]|join", False),
-        ("('x' * 1000000)|join('y' * 1000000)", True),
-        ("{'a': [1]}|tojson(indent=2)", False),
-        ("[1]|tojson(indent=10 ** 9)", True),
-        ("'a'|indent(10 ** 9)", True),
-        ("[1]|batch(10 ** 9, 'x')|list", True),
-        ("1|round(10 ** 9, 'ceil')", True),
-        ("''|default(10 ** 9)", False),
-        ("''|center(2 * 10 ** 7)", False),
-        ("''|center(2 * 10 ** 7 + 1)", True),
-        ("(['y' * 1000000] * 11)|join", False),
-        ("((['y' * 1000000] * 11)|join ~ (['y' * 1000000] * 11)|join)|length ~ ''", True),
-        ("lipsum(2)", False),
-        ("lipsum(10 ** 6)", True),
-        ("lipsum(10 ** 6, html=false)", True),
-        ("lipsum(1, true, 1, 20000)", False),
-        ("lipsum(1, true, 1, 20001)", True),
-    ],
-)
-def test_a_small_text_is_not_multiplied_into_a_huge_one(expression: str, fails: bool) -> None:
-    page = prepare(f"{{% set x = {expression} %}}done")
-    if fails:
-        with pytest.raises(FragmentError, match="SecurityError"):
-            page.render({})
-    else:
-        assert page.render({}) == "done"
+def test_a_page_that_takes_too_long_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sandbox, "SECONDS", 0.2)
+    pieces = "{% for a in range(99999) %}{% for b in range(9999) %}{% endfor %}{{ '' }}{% endfor %}"
+    with pytest.raises(FragmentError, match=r"the page takes longer than 0\.2 seconds"):
+        prepare(pieces).render({})
+
+
+@pytest.mark.parametrize("name", ["items", "keys", "values", "get", "copy", "update", "pop", "clear"])
+@pytest.mark.parametrize("source", ["{{ x.NAME }}", "{{ x['NAME'] }}", "{{ [x]|map(attribute='NAME')|first }}"])
+def test_a_value_named_like_a_method_is_that_value_and_without_one_nothing(name: str, source: str) -> None:
+    page = prepare(f"[{source.replace('NAME', name)}]")
+    assert page.render({"x": {name: "sword"}}) == "[sword]"
+    assert page.render({"x": {}}) == "[]"
 
 
 @pytest.mark.parametrize(
-    ("expression", "name"),
+    ("source", "shown"),
     [
-        ("'x' * 2000001", "*"),
-        ("['x' * 1000000] * 21", "*"),
-        ("'%1000000000d' % 1", "%"),
-        ("9 ** 99", "**"),
-        ("'{:1000000000}'.format(1)", "format"),
-        ("'x'.center(10 ** 9)", "center"),
-        ("'x'|indent(10 ** 9)", "indent"),
-        ("lipsum(10 ** 6)", "lipsum"),
+        ("{% for name, value in x.items() %}{{ name }}={{ value }}{% endfor %}", "a=1"),
+        ("{{ x.get('a') }}{{ x.get('b', 2) }}{{ x.keys()|list|length }}", "121"),
+        ("{{ x.items|default('none') }}{{ 'yes' if x.values else 'no' }}", "noneno"),
+        ("{{ x.a.bit_count }}{{ range }}{{ lipsum }}", ""),
     ],
 )
-def test_what_would_make_a_huge_text_is_named(expression: str, name: str) -> None:
-    with pytest.raises(FragmentError, match=re.escape(f"the result of {name} would be too large")):
-        prepare(f"{{{{ {expression} }}}}").render({})
-
-
-def test_a_filter_takes_no_more_of_a_long_sequence_than_it_may() -> None:
-    lines = iter(["x" * 1_000_000] * 40)
-    with pytest.raises(FragmentError, match="SecurityError"):
-        prepare("{{ lines|join }}").render({"lines": lines})
-    assert len(list(lines)) in range(15, 25), "half of them were not taken"
-
-
-def test_what_follows_a_list_in_a_list_counts_as_well() -> None:
-    most = 20_000_000 - 3  # the lists count 1 and 2
-    with pytest.raises(FragmentError, match="SecurityError"):
-        prepare("{{ x|join }}").render({"x": [["y" * most], "z"]})
-    assert prepare("{{ x|join|length }}").render({"x": ["y" * most]}) == str(most)
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "{{ 'a'|center(width=5) }}.",
-        "{{ ['a', '<b>']|join(d=', ') }}",
-        "{{ ['a', 'b']|map('upper')|join('-') }}",
-        "{{ '%(n)05d <'|format(n=7) }}",
-        "{{ '{:>5} {x}'.format(1, x='<') }}",
-        "{{ dict(a=1)['a'] }}",
-        "{{ [1, 2, 3]|batch(2, 'z')|list }}{{ [1, 2, 3]|slice(2)|list }}",
-        "{{ 'a b c'|wordwrap(1) }}{{ 'abcdefgh'|truncate(4, leeway=0) }}{{ 2.345|round(2) }}",
-        "{{ {'b': 1, 'a': [2]}|tojson(indent=1) }}",
-        "{{ 7 % 4 }} {{ 2 ** 3 }} {{ 2 + 3 }} {{ 'a' * 3 }} {{ '%s' % '<' }} {{ ['a'] + ['b'] }}",
-        "{% set text %}a{{ 1 }}{{ '<' }}{% endset %}{{ text }}\n",
-        "{% macro m(x) %}<i>{{ x }}</i>{% endmacro %}{{ m('<') ~ m(2) }}\n",
-    ],
-)
-def test_what_is_limited_does_otherwise_what_jinja_does(source: str) -> None:
-    jinja = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True)
-    assert prepare(source).render({}) == jinja.from_string(source).render()
-
-
-def test_a_part_of_a_page_may_have_more_characters_than_the_page() -> None:
-    source = "{% set text %}{% for a in range(11) %}{{ x }}{% endfor %}{% endset %}{{ text|length }}"
-    assert prepare(source).render({"x": "x" * 1_000_000}) == "11000000"
-
-
-@pytest.mark.parametrize(
-    "step",
-    [
-        "{% set ns.text = ns.text ~ ns.text %}",
-        "{% set ns.text = ns.text + ns.text %}",
-        "{% set text %}{{ ns.text }}{{ ns.text }}{% endset %}{% set ns.text = text %}",
-    ],
-)
-def test_a_text_is_not_doubled_into_a_huge_one(step: str) -> None:
-    page = prepare(f"{{% set ns = namespace(text='x') %}}{{% for a in range(40) %}}{step}{{% endfor %}}")
-    with pytest.raises(FragmentError, match="SecurityError"):
-        page.render({})
-
-
-@given(st.lists(st.sampled_from(["<", Markup("<b>"), 1, None, [1, "<"], ""]), min_size=2))
-def test_texts_are_put_together_as_jinja_does_it(values: list[Any]) -> None:
-    jinja = Environment(autoescape=True, undefined=ChainableUndefined)
-    source = "{{ unknown ~ " + " ~ ".join(f"values[{at}]" for at in range(len(values))) + " }}"
-    assert prepare(source).render({"values": values}) == jinja.from_string(source).render({"values": values})
+def test_methods_can_be_called_and_are_never_shown(source: str, shown: str) -> None:
+    assert prepare(source).render({"x": {"a": 1}}) == shown
 
 
 def test_a_page_may_have_two_million_characters() -> None:
