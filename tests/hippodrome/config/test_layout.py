@@ -158,7 +158,7 @@ def test_an_agent_in_a_file_of_another_name_gets_a_remark(clone: Path) -> None:
     put(clone / "my_agent.py", "class Agent:\n    pass\n")
     (remark,) = read_project(clone).remarks
     assert str(remark) == (
-        "my_agent.py: remark: its class Agent does not play, since the agent is taken from agent.py: rename the file"
+        "my_agent.py: remark: its class Agent does not play, since Hippodrome takes the agent from agent.py: rename the file"
     )
 
 
