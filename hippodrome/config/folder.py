@@ -102,7 +102,8 @@ def _agent_problems(source: ConfigSource) -> Iterator[Diagnostic]:
     yield from problems
     refused = any(not problem.remark for problem in problems)
     trial = source.parsed.values.get("trial")
-    if source.layout.agent is None and not refused and "game" in (trial or {}) and is_blank(trial["game"]):
+    named = isinstance(trial, dict) and ("game" not in trial or not is_blank(trial["game"]))
+    if source.layout.agent is None and not refused and not named:
         message = f"is empty, and there is no {AGENT}: name an environment, or write an {AGENT}"
         yield source.diagnostic(("trial", "game"), message)
 

@@ -68,6 +68,7 @@ class AgentReport:
             *self._arrows(),
             *self._slow(),
             *self._slow_policies(),
+            *self._forgetful(),
             *self._undrawn(),
             *self._outside(),
             *self._too_large(),
@@ -157,6 +158,15 @@ class AgentReport:
                 message = f"{needs}; {why}, so its actions come late"
                 found.append(self._in_config(self._player(player), message, remark=True))
         return found
+
+    def _forgetful(self) -> list[Diagnostic]:
+        """Remarks on policies that lose their state with a server, for the first group only."""
+        message = (
+            "has reset() but no resume(): if a server is lost, its state is lost within an episode; see "
+            "docs/players.md#after-a-lost-server"
+        )
+        players = () if self._group else self._report.get("forgetful", ())
+        return [self._in_config(self._player(name), f"{self._plays(name)} {message}", remark=True) for name in players]
 
     def _undrawn(self) -> list[Diagnostic]:
         """Remarks on images and objects that cannot be drawn. The game goes on without them."""
@@ -329,7 +339,7 @@ class AgentReport:
 
     def _asked_policy(self) -> str | None:
         """The player whose policy was called last, if one was."""
-        called = re.fullmatch(r"policy (.*) (act|reset)", self._report.get("call", ""))
+        called = re.fullmatch(r"policy (.*) (act|reset|resume)", self._report.get("call", ""))
         return called[1] if called else None
 
     def _callbacks(self) -> list[Diagnostic]:

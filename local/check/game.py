@@ -20,9 +20,11 @@ from local.check.pace import Pace
 from protocol.trial import TrialSection
 from trial.agent.joint import Joint, JointAdapter
 from trial.core.players import PLAYER, Player, legal_actions
+from trial.core.policies import Observed
 from trial.core.seeds import policy_seed
 from trial.policies.places import load_policies
 from trial.policies.policy import Policy
+from trial.policies.simple import AgentPolicy
 
 STAYS = 20  # steps for which a substitute plays in one place
 
@@ -41,6 +43,7 @@ class CheckedGame:
         self._policies: dict[str, Policy] = {}
         self._paces: dict[str, Pace] = {}
         self._last: dict[str, int] = {}
+        self._observed: dict[str, list[Observed]] = {}  # what each policy has chosen in the episode
         self._random = Random(1)  # noqa: S311 - the same each time
         self._pressed = 0
         self._substitutes: dict[str, Policy] = {}  # by the player in whose place each plays
@@ -62,6 +65,8 @@ class CheckedGame:
             if not loaded([replace(player, plays=plays) for player in humans]):
                 return False
             self._substitutes = self._progress.result
+        forget = [name for name, policy in self._policies.items() if isinstance(policy, AgentPolicy) and policy.forgets]
+        self._progress.known["forgetful"] = forget
         self._paces = {name: Pace() for name in (*self._policies, *self._substitutes)}
         return True
 
@@ -104,14 +109,20 @@ class CheckedGame:
         return True
 
     def close(self) -> bool:
-        """Close the policies and the agent; return False if that failed, which is reported."""
+        """Close the policies and the agent; return False if that failed, which is reported.
+
+        Before, policies resume the last episode, as on a server that replaces a lost one.
+        """
+        for name, observed in self._observed.items():
+            if not self._progress.call(f"policy {name} resume", partial(self._policies[name].resume, observed)):
+                return False
         for policy in (*self._policies.values(), *self._substitutes.values()):
             if not self._progress.call("close", policy.close):
                 return False
         return self._progress.call("close", self._adapter.close)
 
     def _reset_policies(self, episode: int) -> bool:
-        self._last = {}
+        self._last, self._observed = {}, {}
         for name, policy in (self._policies | self._substitutes).items():
             seed = policy_seed(episode, name)
             if not self._progress.call(f"policy {name} reset", partial(policy.reset, seed)):
@@ -174,5 +185,8 @@ class CheckedGame:
 
         if not self._progress.call(f"policy {name} act", act):
             return None
-        self._last[name] = self._progress.result
+        self._last[name] = action = self._progress.result
+        if name in self._policies:
+            chosen = Observed(now.observations.get(name), now.infos.get(name, {}), now.masks.get(name), action)
+            self._observed.setdefault(name, []).append(chosen)
         return self._last[name]

@@ -102,8 +102,15 @@ class Partner:
     def reset(self, seed):
         self.state = seed % 997
 
-    def act(self, observation, info, mask):
+    def look(self, observation, info):
         self.state = (31 * self.state + 7 * int(observation[0]) + int(observation[1]) + info["t"]) % 997
+
+    def resume(self, steps):
+        for observation, info, action in steps:
+            self.look(observation, info)
+
+    def act(self, observation, info, mask):
+        self.look(observation, info)
         if self.state % 7 == 0:
             raise ValueError("no idea")
         legal = [index for index in range(4) if mask is None or mask[index]]
@@ -189,8 +196,7 @@ class Game:
             effect = waiting.popleft()
             if isinstance(effect, ResetPolicy):
                 policy.reset(effect.seed)
-                for seen in effect.observed:
-                    chosen(policy, seen.observation, seen.info, seen.mask)
+                policy.resume(effect.observed)
                 continue
             action = chosen(policy, effect.observation, effect.info, effect.mask)
             if isinstance(action, Exception):

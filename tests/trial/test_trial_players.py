@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import re
 import statistics
 import time
 
@@ -213,6 +214,11 @@ async def test_an_interrupted_game_of_two_players_goes_on_where_it_was(launch, o
     asked = [part["action"] for part in fresh]
     assert asked == [number % 3 for number in range(1, len(asked) + 1)], "the partner remembers what it saw"
     observed = [part["observed"] for part in fresh]
+    earlier = [(part["observed"], part["action"]) for part in parts[: len(before)] if "observed" in part]
+    _, told, later = second.log_text().partition(f"told of {earlier}\n")
+    assert told, second.log_text()
+    questions = [int(step) for step in re.findall(r"asked at (\d+)", later)]
+    assert (len(questions), min(questions)) >= (2, len(before)), "no question is put twice"
     every_second = range(0, len(parts), 2)
     # A partner that is late is not asked again meanwhile, and an answer after a server's last step counts nowhere.
     lasting = [

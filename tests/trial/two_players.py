@@ -5,6 +5,7 @@ never 0: with a 0, some tests' policies would answer zeros.
 """
 
 TWO = '''
+import sys
 import time
 import numpy as np
 
@@ -44,7 +45,12 @@ class Partner:
     def reset(self, seed):
         self.asked = 0
 
+    def resume(self, steps):
+        print("told of", [(int(observation[0]), action) for observation, info, action in steps], file=sys.stderr)
+        self.asked = len(steps)
+
     def act(self, observation, info):
+        print("asked at", int(observation[0]), file=sys.stderr)
         self.asked += 1
         {act}
         return self.asked % 3

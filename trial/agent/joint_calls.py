@@ -194,19 +194,21 @@ class _Observations:
     """Collects, while steps are taken again, the observations for which each policy had chosen its actions."""
 
     def __init__(self, unfinished: UnfinishedEpisode) -> None:
-        self._wanted: dict[int, list[str]] = defaultdict(list)  # policies' players by the number of steps taken before
+        # Policies' players and their actions, by the number of steps taken before.
+        self._chosen: dict[int, list[tuple[str, int | None]]] = defaultdict(list)
         for step in unfinished.steps:
             for player, part in step.players.items():
                 if part.observed is not None:
-                    self._wanted[part.observed].append(player)
+                    action = part.action if part.by == "policy" else None
+                    self._chosen[part.observed].append((player, action))
         self.by_player: dict[str, list[Observed]] = defaultdict(list)
 
     def add(self, steps: int, joint: Joint) -> None:
         """Keep the observation of each policy that chose an action for `joint`, the results after `steps` steps."""
-        for player in self._wanted.get(steps, ()):
+        for player, action in self._chosen.get(steps, ()):
             observation = snapshot(joint.observations.get(player))
             info = snapshot(joint.infos.get(player, {}))
-            self.by_player[player].append(Observed(observation, info, joint.masks.get(player)))
+            self.by_player[player].append(Observed(observation, info, joint.masks.get(player), action))
 
 
 def snapshot(observation: Any) -> Any:

@@ -176,7 +176,7 @@ class StepTaken(NamedTuple):
 class Replayed:
     """The result of a `ReplayCall`: the present picture, and what the players see (`view` as in `Begun`).
 
-    `observed`: by player, the observations with which its policy was asked for the actions of these steps, in order.
+    `observed`: by player, what its policy was asked for the actions of these steps and what it chose, in order.
     """
 
     pictures: Pictures
@@ -189,9 +189,9 @@ class Replayed:
 
 @dataclass(frozen=True, slots=True)
 class ResetPolicy:
-    """Begin an episode for the player's policy, then let it choose an action for each of `observed`, and drop these.
+    """Begin an episode for the player's policy. `observed` is what it has chosen in the episode on an earlier server.
 
-    So the policy reaches the state that it had on an earlier server.
+    The policy reaches the state that it had there (`Policy.resume`).
     """
 
     player: str

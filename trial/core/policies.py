@@ -23,11 +23,15 @@ FAILURES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """The input with which a policy chooses an action: observation, info and action mask."""
+    """The input with which a policy chose an action (observation, info and action mask), and the action's number.
+
+    `action` is None if the policy failed or was late, or if its action had become illegal.
+    """
 
     observation: Any
     info: Any
     mask: Mask | None
+    action: int | None
 
 
 @dataclass(frozen=True, slots=True)

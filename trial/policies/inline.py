@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from trial.core.players import Mask
+from trial.core.policies import Observed
 from trial.policies.policy import Policy
 from trial.policies.thread import Done
 
@@ -25,9 +26,10 @@ class InlinePolicy:
         """Ask for an action. The event loop then calls `done(ask_id, action, None)`."""
         self._loop.call_soon(self._done, ask_id, self.policy.act(observation, info, mask), None)
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode."""
+    def reset(self, seed: int, observed: Sequence[Observed] = ()) -> None:
+        """Begin an episode, or resume it after the choices `observed`."""
         self.policy.reset(seed)
+        self.policy.resume(observed)
 
     def close(self) -> None:
         """Close the policy."""

@@ -9,7 +9,7 @@ The name of an input or output says what it is for. These names are known: RLlib
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -19,8 +19,9 @@ import numpy as np
 
 from protocol.players import ONNXRUNTIME
 from trial.core.players import ACTION_MASK, Mask, legal_actions
+from trial.core.policies import Observed
 from trial.policies.observations import Array, Encoding, Shape, encodings, fitted, shown, without_mask, zero
-from trial.policies.policy import PolicyError
+from trial.policies.policy import PolicyError, choose_again
 
 _OBSERVATION = ("obs", "observation", "observations", "input", "inputs", "state", "features", "x")
 _CONSTANT = {"seq_lens": 1, "episode_starts": 0, "is_init": 0, "is_training": 0, "timestep": 0}
@@ -98,6 +99,9 @@ class OnnxPolicy:
     def reset(self, seed: int) -> None:
         self._random.seed(seed)
         self._state = {port.name: port.zeros() for port in self._ports.states.values()}
+
+    def resume(self, observed: Sequence[Observed]) -> None:
+        choose_again(self, observed)
 
     def close(self) -> None:
         self._session = None

@@ -18,8 +18,6 @@ from trial.policies.thread import PolicyThread
 Acted = Callable[[str, int, int | None, Exception | None], None]
 """A function that gets the player, the id of a question, and the action, or None and the policy's exception."""
 
-_UNUSED = -1  # the id of questions whose answers are not used
-
 
 def load_policies(
     players: Iterable[Player], folder: Path, agent_module: Any, observation_spaces: Mapping[str, Any]
@@ -79,8 +77,7 @@ class Places:
 
     def _running(self, player: Player, policy: Policy) -> PolicyThread | InlinePolicy:
         def done(ask_id: int, action: int | None, error: Exception | None) -> None:
-            if ask_id != _UNUSED:
-                self._acted(player.name, ask_id, action, error)
+            self._acted(player.name, ask_id, action, error)
 
         if isinstance(policy, RandomPolicy | IdlePolicy):
             return InlinePolicy(policy, done)
@@ -91,11 +88,8 @@ class Places:
         self._policies[effect.player].ask(effect.ask_id, effect.observation, effect.info, effect.mask)
 
     def reset(self, effect: ResetPolicy) -> None:
-        """Begin an episode for a policy. After a replay, let it choose again for each observation that it has had."""
-        policy = self._policies[effect.player]
-        policy.reset(effect.seed)
-        for observed in effect.observed:
-            policy.ask(_UNUSED, observed.observation, observed.info, observed.mask)
+        """Begin an episode for a policy, or resume it after a replay."""
+        self._policies[effect.player].reset(effect.seed, effect.observed)
 
     def close(self) -> None:
         """Close all policies: the trial is over."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from trial.core.players import Mask
+from trial.core.policies import Observed
 
 
 class PolicyError(Exception):
@@ -33,6 +35,13 @@ class Policy(Protocol):
         """Begin an episode. After the same seed, the same observations lead to the same actions."""
         ...
 
+    def resume(self, observed: Sequence[Observed]) -> None:
+        """Reach the state after these choices of the episode, which were made on an earlier server.
+
+        Called after `reset`. Raises whatever the researcher's code raises.
+        """
+        ...
+
     def close(self) -> None:
         """Free the policy's resources."""
         ...
@@ -40,3 +49,10 @@ class Policy(Protocol):
     def description(self) -> Mapping[str, Any]:
         """Return the policy's fields in a recording: `kind`, `policy` as in config.yml, and of a file its `sha256`."""
         ...
+
+
+def choose_again(policy: Policy, observed: Sequence[Observed]) -> None:
+    """Resume a policy whose choices cost nothing and follow from its seed: let it make them again."""
+    for choice in observed:
+        with contextlib.suppress(Exception):  # it failed on the earlier server too
+            policy.act(choice.observation, choice.info, choice.mask)

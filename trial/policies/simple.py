@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Any
 
 from trial.agent import signatures
 from trial.core.players import Mask, is_legal, legal_actions
-from trial.policies.policy import PolicyError
+from trial.core.policies import Observed
+from trial.policies.policy import PolicyError, choose_again
 
 
 class RandomPolicy:
@@ -24,6 +25,9 @@ class RandomPolicy:
 
     def reset(self, seed: int) -> None:
         self._random.seed(seed)
+
+    def resume(self, observed: Sequence[Observed]) -> None:
+        choose_again(self, observed)
 
     def close(self) -> None:
         """Do nothing: there is nothing to free."""
@@ -45,6 +49,9 @@ class IdlePolicy:
     def reset(self, seed: int) -> None:
         """Do nothing: no episode differs from another."""
 
+    def resume(self, observed: Sequence[Observed]) -> None:
+        """Do nothing: no choice changes another."""
+
     def close(self) -> None:
         """Do nothing: there is nothing to free."""
 
@@ -55,7 +62,7 @@ class IdlePolicy:
 class AgentPolicy:
     """Calls an object of a class of agent.py with `act(observation, info)` or `act(observation, info, mask)`.
 
-    `reset(seed)` or `reset()`, and `close()`, are called if the class has them.
+    `reset(seed)` or `reset()`, `resume(steps)`, and `close()`, are called if the class has them.
     """
 
     def __init__(self, spec: str, instance: Any, count: int) -> None:
@@ -63,7 +70,7 @@ class AgentPolicy:
         self._spec, self._instance, self._count = spec, instance, count
         self._act: Callable[..., Any] = instance.act
         self._takes_mask = _takes(instance.act, 3)
-        self._reset = getattr(instance, "reset", None)
+        self._reset, self._resume = getattr(instance, "reset", None), getattr(instance, "resume", None)
         self._reset_takes_seed = callable(self._reset) and _takes(self._reset, 1)
 
     def act(self, observation: Any, info: Mapping[str, Any], mask: Mask | None) -> int:
@@ -73,6 +80,16 @@ class AgentPolicy:
     def reset(self, seed: int) -> None:
         if callable(self._reset):
             self._reset(*((seed,) if self._reset_takes_seed else ()))
+
+    @property
+    def forgets(self) -> bool:
+        """Whether the object has a state, and loses it with its server: it has `reset`, but no `resume`."""
+        return callable(self._reset) and not callable(self._resume)
+
+    def resume(self, observed: Sequence[Observed]) -> None:
+        """Tell the object what it was asked and what it chose. It is not asked again: that may take long, or cost."""
+        if callable(self._resume):
+            self._resume([(choice.observation, choice.info, choice.action) for choice in observed])
 
     def close(self) -> None:
         close = getattr(self._instance, "close", None)
@@ -119,6 +136,9 @@ def of_class(spec: str, module: Any, player: str, count: int) -> AgentPolicy:
     instance = policy_class(player=player) if signatures.names(policy_class, "player") else policy_class()
     if _has_signature(instance.act) and not (_takes(instance.act, 2) or _takes(instance.act, 3)):
         raise PolicyError(f"act of class {name} in agent.py takes other values; write act(self, observation, info)")
+    resume = getattr(instance, "resume", None)
+    if callable(resume) and _has_signature(resume) and not _takes(resume, 1):
+        raise PolicyError(f"resume of class {name} in agent.py takes other values; write resume(self, steps)")
     return AgentPolicy(spec, instance, count)
 
 

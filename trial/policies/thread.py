@@ -6,10 +6,11 @@ import asyncio
 import contextlib
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from trial.core.players import Mask
+from trial.core.policies import Observed
 from trial.policies.policy import Policy
 
 Done = Callable[[int, int | None, Exception | None], None]
@@ -53,15 +54,17 @@ class PolicyThread:
 
         self._jobs.put(answer)
 
-    def reset(self, seed: int) -> None:
-        """Begin an episode for the questions from now on.
+    def reset(self, seed: int, observed: Sequence[Observed] = ()) -> None:
+        """Begin an episode, or resume it after the choices `observed`, for the questions from now on.
 
-        If the policy's `reset` raises, they are answered by its error.
+        If the policy's `reset` or `resume` raises, they are answered by its error.
         """
 
         def begin() -> None:
             try:
                 self.policy.reset(seed)
+                if observed:
+                    self.policy.resume(observed)
                 self._reset_error = None
             except BaseException as problem:  # noqa: BLE001 - as above
                 self._reset_error = _plain(problem)

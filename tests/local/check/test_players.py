@@ -49,6 +49,9 @@ class Partner:
 
     def reset(self, seed):
         pass
+
+    def resume(self, steps):
+        pass
 """
 
 TRIAL = """
@@ -153,6 +156,7 @@ def test_a_policy_that_cannot_play_is_reported_at_its_line_in_config_yml(folder:
         ("return 2", "return 7", "config.yml:12: trial.players.right: act() returned action 7; there are 0 to 2"),
         ("return 2", "return 1 / 0", "agent.py:32: act() of agent:Partner fails: ZeroDivisionError"),
         ("    def reset(self, seed):\n        pass", "    def reset(self, seed):\n        seed.x", "agent.py:35: reset() of agent:Partner fails: AttributeError"),
+        ("steps):\n        pass", "steps):\n        steps.x", "agent.py:38: resume() of agent:Partner fails"),
         ("class Partner:", "class Partner:\n    def __init__(self):\n        self.y = x\n", "agent.py:31: making the policies fails: NameError"),
     ],
 )  # fmt: skip
@@ -160,6 +164,15 @@ def test_a_policy_of_agent_py_that_fails_is_reported_at_its_line(folder: Path, o
     (folder / "agent.py").write_text(AGENT.replace(old, new))
     (line,) = tried(folder, "agent:Partner")
     assert line.startswith(said)
+
+
+def test_a_policy_that_loses_its_state_with_a_server_gets_a_remark(folder: Path) -> None:
+    (folder / "agent.py").write_text(AGENT.replace("def resume", "def other"))
+    (line,) = tried(folder, "agent:Partner")
+    assert line.endswith(
+        "remark: trial.players.right: agent:Partner has reset() but no resume(): if a server is lost, its state is lost "
+        "within an episode; see docs/players.md#after-a-lost-server"
+    )
 
 
 def test_a_policy_file_that_takes_hours_is_reported_at_its_line_in_config_yml(folder: Path) -> None:

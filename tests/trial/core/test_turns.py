@@ -647,7 +647,7 @@ def test_an_episode_is_repeated_with_the_idle_actions_of_all_players() -> None:
     game.event("start", who_plays(game.settings.trial, dict.fromkeys(PLAYS, SPACE), None), recorded, game.now)
     assert isinstance(game.open_call, ReplayCall)
     assert game.open_call.default_actions == {"me": 0, "it": 2}
-    looked_at = Observed("o", {}, None)
+    looked_at = Observed("o", {}, None, 1)
     game.returns(Replayed(FRAME, view_for("me", "it"), {"it": [looked_at]}))
     (reset,) = [one for one in game.all if isinstance(one, ResetPolicy)]
     assert (reset.seed, reset.observed) == (policy_seed(7, "it"), [looked_at]), "the seed of the episode"

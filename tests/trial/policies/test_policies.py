@@ -20,6 +20,7 @@ from onnx import TensorProto, helper
 from protocol.players import ONNXRUNTIME
 from testing import onnx_files
 from testing.waiting import PATIENCE, until_async
+from trial.core.policies import Observed
 from trial.core.seeds import policy_seed
 from trial.policies.load import load
 from trial.policies.policy import PolicyError
@@ -405,6 +406,54 @@ def test_without_onnxruntime_the_error_says_what_to_install(tmp_path: Path, monk
     assert wanted == ONNXRUNTIME
 
 
+# ---- after a lost server
+
+
+def test_a_class_is_told_what_it_was_asked_and_what_it_chose_and_is_not_asked_again(tmp_path: Path) -> None:
+    told: list[Any] = []
+
+    class Partner:
+        def act(self, observation: Any, info: Any) -> int:
+            raise AssertionError("asked again")
+
+        def resume(self, steps: Any) -> None:
+            told.extend(steps)
+
+    class Stateless:
+        def act(self, observation: Any, info: Any) -> int:
+            raise AssertionError("asked again")
+
+    agent = agent_module(Partner=Partner, Stateless=Stateless)
+    observed = [Observed([0, 1], {"t": 0}, None, 2), Observed([1, 1], {"t": 1}, None, None)]
+    for name in ("Partner", "Stateless"):
+        load(f"agent:{name}", tmp_path, agent, 3).resume(observed)
+    assert told == [([0, 1], {"t": 0}, 2), ([1, 1], {"t": 1}, None)]
+
+
+def test_a_resume_that_takes_other_values_is_refused(tmp_path: Path) -> None:
+    class Partner:
+        def act(self, observation: Any, info: Any) -> int:
+            return 0
+
+        def resume(self) -> None: ...
+
+    with pytest.raises(PolicyError, match=r"resume of class Partner in agent.py takes other values; write resume\("):
+        load("agent:Partner", tmp_path, agent_module(Partner=Partner), 3)
+
+
+@pytest.mark.parametrize("spec", ["random", "p.onnx", "sample:p.onnx"])
+def test_chance_and_files_go_on_as_if_there_had_been_no_other_server(tmp_path: Path, spec: str) -> None:
+    onnx_files.counter(tmp_path / "p.onnx", state=("h", "hn"), seq_lens=None)
+    lost, following = (load_policy(spec, tmp_path) for _ in range(2))
+    mask = (True, True, True)
+    lost.reset(5)
+    observed = [Observed([0, 0], {}, mask, lost.act([0, 0], {}, mask)) for _ in range(2)]
+    following.reset(5)
+    following.resume([*observed])
+    ahead = [[policy.act([0, 0], {}, mask) for _ in range(30)] for policy in (lost, following)]
+    assert ahead[0] == ahead[1]
+
+
 # ---- the thread
 
 
@@ -426,6 +475,9 @@ class PolicyByObservation:
         if seed < 0:
             raise RuntimeError("no such seed")
         self.seeds.append(seed)
+
+    def resume(self, observed: Any) -> None:
+        raise RuntimeError("no memory")
 
     def close(self) -> None:
         self.closed.set()
@@ -496,14 +548,17 @@ async def test_an_error_or_an_exit_of_a_policy_is_an_answer_too() -> None:
     ]
 
 
-async def test_a_failed_reset_is_the_answer_until_the_next_reset() -> None:
+async def test_a_failed_reset_or_resume_is_the_answer_until_the_next_reset() -> None:
     async with policy_thread() as (_, thread, answers):
         thread.reset(-1)
         thread.ask(1, 1, {}, None)
         thread.reset(2)
         thread.ask(2, 1, {}, None)
-        await until_async(lambda: len(answers) == 2)
-    assert [(ask, action, str(error)) for ask, action, error in answers] == [(1, None, "no such seed"), (2, 1, "None")]
+        thread.reset(2, [Observed(1, {}, None, 1)])
+        thread.ask(3, 1, {}, None)
+        await until_async(lambda: len(answers) == 3)
+    said = [(ask, action, str(error)) for ask, action, error in answers]
+    assert said == [(1, None, "no such seed"), (2, 1, "None"), (3, None, "no memory")]
 
 
 async def test_a_policy_that_hangs_holds_up_nothing_but_its_answers() -> None:
