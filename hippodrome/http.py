@@ -11,7 +11,7 @@ import binascii
 import gzip
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
@@ -144,9 +144,10 @@ def _raw_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
     raw = event.get("rawQueryString") or ""
     try:
         raw.encode()  # half a surrogate pair could be neither stored nor sent back
-        return tuple(parse_qsl(raw, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict"))
+        query = parse_qsl(raw, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict")
     except ValueError:
         return None
+    return _from_html(query)
 
 
 def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
@@ -160,7 +161,12 @@ def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | Non
             f"{key}{value}".encode()
     except ValueError:
         return None
-    return query if len(query) <= MAX_QUERY_FIELDS else None
+    return _from_html(query) if len(query) <= MAX_QUERY_FIELDS else None
+
+
+def _from_html(query: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """The fields of a link that may have been copied from HTML, where `&` is written `&amp;`."""
+    return tuple((re.sub(r"\A(?:amp;)+", "", name), value) for name, value in query)
 
 
 def _headers(event: Mapping[str, Any]) -> dict[str, str]:

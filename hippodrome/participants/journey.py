@@ -22,6 +22,7 @@ from hippodrome.participants import forms, previews
 from hippodrome.participants.answers import Answers
 from hippodrome.participants.events import publish_events
 from hippodrome.participants.files import Files
+from hippodrome.participants.link_fields import IDS, OUR_FIELDS, respelled
 from hippodrome.participants.page_error import PROJECT_NOT_FOUND, REFUSED, PageError
 from hippodrome.participants.previews import PreviewKind
 from hippodrome.participants.steps import HANDLERS
@@ -34,10 +35,6 @@ from hippodrome.storage.project_cache import ProjectCache
 from hippodrome.storage.repository import Repository
 from hippodrome.storage.secret import SecretCache
 
-RECRUITER_IDS = ("PROLIFIC_PID", "workerId", "survey_code")
-"""The fields of recruiters' links (Prolific, MTurk, SONA) that take the place of `userId`."""
-OUR_FIELDS = {"projectId", "userId", "poll", "signature"}
-"""The fields of a link that are not kept in the participant's record as the recruiter's."""
 LEAVE = "leave"
 """The value of `hippodrome-action` in the form that the lobby's page sends when it is closed."""
 LINK = "…/next?projectId=your-project&userId=…"
@@ -69,6 +66,7 @@ class Journey:
                 raise PageError(405, "This address is only for reading and answering", "Please open your study link.")
             if request.path.startswith("/steps/"):
                 return self._files.respond(request)
+            request = respelled(request)
             project = self._project(request)
             if (kind := previews.preview_kind(request)) is not None:
                 return _preview_response(request, project, kind)
@@ -216,7 +214,7 @@ def _user_id(request: Request, texts: Texts) -> str | None:
 
     Raises `PageError` if the id is not valid, or if a POST has none.
     """
-    given = next((name for name in ("userId", *RECRUITER_IDS) if request.has_query(name)), None)
+    given = next((name for name in IDS if request.has_query(name)), None)
     if given is None:
         if request.method == "POST":
             raise PageError.of(texts, 400, "whoAreYou")

@@ -117,10 +117,50 @@ def test_a_link_without_an_id_gets_one_and_keeps_it(platform: FakePlatform) -> N
     Browser(platform, query).get()
 
 
-@pytest.mark.parametrize("name", ["PROLIFIC_PID", "workerId", "survey_code"])
+@pytest.mark.parametrize("name", ["PROLIFIC_PID", "workerId", "survey_code", "participantId"])
 def test_the_recruiters_id_is_the_participants_id(platform: FakePlatform, name: str) -> None:
     Browser(platform, f"projectId=maze&{name}=R2D2").get()
     assert stored(platform, "participant.json", "R2D2")
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "projectId=maze&prolific_pid=R2D2",
+        "projectId=maze&ProlificPid=R2D2",
+        "projectId=maze&amp;PROLIFIC_PID=R2D2",
+        "projectId=maze&amp;amp;prolific-pid=R2D2",
+        "projectId=maze&workerid=R2D2",
+        "projectId=maze&worker_id=R2D2",
+        "projectId=maze&SURVEY_CODE=R2D2",
+        "projectId=maze&surveyCode=R2D2",
+        "projectId=maze&participant_id=R2D2",
+        "projectId=maze&user_id=R2D2",
+        "projectID=maze&amp;USERID=R2D2",
+        "amp;project_id=maze&userid=R2D2",
+        "projectId=maze&project_id=other&userId=R2D2",
+        "projectId=maze&PROLIFIC_PID=R2D2&user_id=C3PO",
+        "projectId=maze&user_id=C3PO&userId=R2D2",
+    ],
+)
+def test_another_spelling_of_an_id_is_the_same_participant(platform: FakePlatform, query: str) -> None:
+    """The right spelling wins: a field that is only similar may be the recruiter's own."""
+    browser = Browser(platform, query)
+    browser.answer(browser.get(), consent="yes")
+    assert stored(platform, "answers/1.json", "R2D2")
+
+
+def test_a_link_copied_from_html_and_in_other_spellings_has_the_same_fields(platform: FakePlatform) -> None:
+    Browser(platform, "projectid=maze&amp;prolific_pid=R2D2&amp;STUDY_ID=7&amp;group=a").get()
+    assert stored(platform, "participant.json", "R2D2")["link"] == {
+        "PROLIFIC_PID": "R2D2",
+        "STUDY_ID": "7",
+        "group": "a",
+    }
+
+
+def test_an_id_given_twice_with_two_values_is_refused_in_every_spelling(platform: FakePlatform) -> None:
+    assert Browser(platform, "projectId=maze&userid=a&USERID=b").send()["statusCode"] == 400
 
 
 # Nothing is lost, nothing is overwritten

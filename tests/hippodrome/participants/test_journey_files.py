@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hippodrome.model.project import Events
-from hippodrome.participants.journey import OUR_FIELDS, RECRUITER_IDS
+from hippodrome.participants.link_fields import OUR_FIELDS, RECRUITER_IDS
 from lambdas import next_step
 from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform
@@ -94,7 +94,7 @@ def test_fields_of_the_recruiters_link_are_stored_within_limits(platform: FakePl
     Browser(platform, f"{link}&{long}").get()
     assert stored(platform, "participant.json")["link"] == {"SESSION": "7", "n" * 64: "v" * 256}
     assert sorted(OUR_FIELDS) == ["poll", "projectId", "signature", "userId"]
-    assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code")
+    assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code", "participantId")
 
 
 def test_the_answer_to_a_poll_names_the_step_that_was_asked_for(platform: FakePlatform) -> None:
