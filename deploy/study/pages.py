@@ -14,9 +14,8 @@ from deploy.aws.account import Account
 from deploy.study.image.files import inside
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import layout
+from hippodrome.participants.files import MAX_BYTES
 from hippodrome.ports import Conflict
-
-LIMIT_BYTES = 4 * 1024**2  # a file's size: `next_step` sends it, and a function's answer has 6 MB at most, in base64
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,9 @@ def _files(folder: Path) -> list[Path]:
             )
         if not file.is_file():
             continue
-        if file.stat().st_size > LIMIT_BYTES:
+        if file.stat().st_size > MAX_BYTES:
             raise Problem(
-                f"{name} is larger than {LIMIT_BYTES // 1024**2} MB.",
+                f"{name} is larger than {MAX_BYTES // 1024**2} MB.",
                 "Put it on a site of its own, name that site in allowedHosts, and link to it.",
             )
         found.append(file)

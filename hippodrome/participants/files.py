@@ -1,4 +1,4 @@
-"""Serves files of the steps folder that pages load by relative addresses, such as pictures."""
+"""Serves files of the steps folder that pages load or link to by relative addresses: pictures, PDFs and the like."""
 
 from __future__ import annotations
 
@@ -8,19 +8,41 @@ from hippodrome.participants.page_error import PageError
 from hippodrome.storage.project_cache import ProjectCache
 
 MAX_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
-_HEADERS = {
-    "Cache-Control": "public, max-age=300",
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox",  # no script in an SVG runs
-}
+MAX_BYTES = 4 * 1024**2  # a file's size on AWS: a function's answer has 6 MB at most, and the file is in base64 there
+_CACHE = {"Cache-Control": "public, max-age=300"}
+_SANDBOX = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}  # for scripts in SVGs
 KINDS = {
     "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
     "svg": "image/svg+xml", "mp4": "video/mp4", "webm": "video/webm", "mp3": "audio/mpeg", "ogg": "audio/ogg",
     "wav": "audio/wav", "css": "text/css", "js": "text/javascript", "vtt": "text/vtt", "woff2": "font/woff2",
+    "pdf": "application/pdf", "txt": "text/plain; charset=utf-8", "csv": "text/csv; charset=utf-8",
+    "ics": "text/calendar; charset=utf-8", "odt": "application/vnd.oasis.opendocument.text",
+    "docx": "application/vnd.openxmlformats-officedocument.wordprocessingml.document",
 }  # fmt: skip
+_SAVED = ("csv", "ics", "odt", "docx")
+"""The endings of files that browsers save, since other programs open them."""
+
+
+def is_served(name: str) -> bool:
+    """Return whether files with this name's ending are served."""
+    return ending(name) in KINDS
+
+
+def ending(name: str) -> str:
+    """Return the ending of a file's name, without its dot, in lower case; empty if it has none."""
+    return name.rpartition(".")[2].lower() if "." in name else ""
+
+
+def _headers(name: str) -> dict[str, str]:
+    """The headers of a file. Browsers show no PDF in a sandbox, and run none of its scripts as this site's."""
+    kind = ending(name)
+    sandbox = {} if kind == "pdf" else _SANDBOX
+    saved = {"Content-Disposition": "attachment"} if kind in _SAVED else {}
+    return {"Content-Type": KINDS[kind], **_CACHE, **sandbox, **saved}
 
 
 class Files:
-    """Serves files of live projects. Only files with a suffix in `KINDS` are served."""
+    """Serves files of live projects. Only files with an ending in `KINDS` are served."""
 
     def __init__(self, project_cache: ProjectCache) -> None:
         self._project_cache = project_cache
@@ -32,9 +54,8 @@ class Files:
             self._project_cache.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
         )
         name = parts[-1]
-        kind = KINDS.get(name.rsplit(".", 1)[-1].lower())
-        is_valid = name.isprintable() and not name.startswith(".") and len(name) <= MAX_NAME
-        found = self._project_cache.document(f"{project.id}/steps/{name}") if project and kind and is_valid else None
-        if found is None or kind is None:
+        is_valid = is_served(name) and name.isprintable() and not name.startswith(".") and len(name) <= MAX_NAME
+        found = self._project_cache.document(f"{project.id}/steps/{name}") if project and is_valid else None
+        if found is None:
             raise PageError(404, "There is nothing here", "Please open your study link again.")
-        return Response(200, found.body, {"Content-Type": kind, **_HEADERS})
+        return Response(200, found.body, _headers(name))

@@ -1,10 +1,10 @@
 """Prepares a researcher's step page for the frame, and fills values into it (`sandbox.py`).
 
 The researcher's text stays unchanged, byte for byte, except for a few tags. Before values are filled in, relative
-addresses, of pictures for example, become addresses of the project's files, and scripts get the nonce without which no
-browser runs them: so a tag in a value gets neither. All else depends on which branches of a template are shown, and
-happens afterwards: tags of a whole document (`<html>`, `<body>`, `<form>` …) are dropped, what is left open is closed,
-and the page's own button and heading are noted.
+addresses, of pictures for example, become addresses of the project's files (a link to one opens a tab), and scripts get
+the nonce without which no browser runs them: so a tag in a value gets neither. All else depends on which branches of a
+template are shown, and happens afterwards: tags of a whole document (`<html>`, `<body>`, `<form>` …) are dropped, what
+is left open is closed, and the page's own button and heading are noted.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from hippodrome.participants import sandbox
+from hippodrome.participants.files import is_served
 
 _MARK = f"nonce-{secrets.token_hex(16)}"  # takes the nonce's place in prepared pages; known to this process only
 
@@ -56,7 +57,9 @@ ADDRESSES = {
     "link": ("href",),
     "input": ("src",),
 }
-"""The attributes that hold addresses, by tag."""
+"""The attributes that hold the addresses of what a page loads, by tag."""
+LINKS = ("a", "area")
+"""The tags that lead to the address in their `href`."""
 
 
 class Content(NamedTuple):
@@ -137,8 +140,10 @@ class _Preparation:
     def _tag(self, token: re.Match[str]) -> str:
         name, attributes = token["start"].lower(), token["attributes"]
         address = _attributes(attributes).get("src", "") if name == "script" else ""
+        if name in LINKS and self._base:
+            attributes = self._link(attributes)
         if name in ADDRESSES and self._base:
-            attributes = _ATTRIBUTE.sub(lambda each: self._address(name, each), attributes)
+            attributes = _ATTRIBUTE.sub(lambda each: self._relocated(each, *ADDRESSES[name]), attributes)
         if name == "script" and self._may_run(address):
             attributes = f' nonce="{_MARK}"{attributes}'
         return f"<{token['start']}{attributes}>"
@@ -151,9 +156,21 @@ class _Preparation:
             return origin is not None and origin[0].lower() in self._hosts
         return "\ue000" not in address
 
-    def _address(self, name: str, found: re.Match[str]) -> str:
+    def _link(self, attributes: str) -> str:
+        """The attributes of a link. Only a link to a file is changed: `next?…`, for one, is an address of ours."""
+        given = _attributes(attributes)
+        relocated = self._relocate(given.get("href", ""))
+        if not relocated.startswith(self._base) or not is_served(re.split(r"[?#]", relocated, maxsplit=1)[0]):
+            return attributes
+        attributes = _ATTRIBUTE.sub(lambda each: self._relocated(each, "href"), attributes)
+        return (
+            attributes if "target" in given or "download" in given else f' target="_blank" rel="noopener"{attributes}'
+        )
+
+    def _relocated(self, found: re.Match[str], *names: str) -> str:
+        """This attribute with an address of the project's files, if it is one of `names`."""
         attribute, value = found["name"].lower(), found["value"]
-        if value is None or attribute not in ADDRESSES[name]:
+        if value is None or attribute not in names:
             return found[0]
         quote = value[0] if value[0] in "\"'" else ""
         inner = value[1:-1] if quote else value

@@ -11,6 +11,7 @@ from bots.page import leads_elsewhere, links
 from hippodrome.config import Config, Diagnostic
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import sandbox
+from hippodrome.participants.files import MAX_BYTES
 from local.check import spans
 from local.check.earlier_answers import EarlierAnswers, every_branch, source_of
 from local.check.structure import check_structure
@@ -56,6 +57,7 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
             message = "its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
             found.append(Diagnostic(f"{folder.name}/{file.name}", None, "", message, remark=True))
     if config.project.use_aws:
+        found += [_too_large(folder, name) for name in sorted(names) if _size(folder / name) > MAX_BYTES]
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
         found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
     return found
@@ -75,6 +77,17 @@ def _unused(folder: Path, names: list[str]) -> Diagnostic:
     listed = printable(", ".join(names), 1000)
     message = f"no step shows these pages; name them under project.steps, or delete them: {listed}"
     return Diagnostic(f"{folder.name}/", None, "", message, remark=True)
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.is_file() and not file.name.startswith(".") else 0
+
+
+def _too_large(folder: Path, name: str) -> Diagnostic:
+    message = (
+        f"larger than {MAX_BYTES // 1024**2} MB, which AWS does not serve; make it smaller, or put it on another site"
+    )
+    return Diagnostic(f"{folder.name}/{name}", None, "", message)
 
 
 def _no_code(label: str) -> Diagnostic:

@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 
 from hippodrome.config import Config, Diagnostic
 from hippodrome.participants import fragments
-from hippodrome.participants.files import KINDS
+from hippodrome.participants.files import KINDS, is_served
 from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from local.check.wording import short
@@ -20,6 +20,10 @@ _IN_STYLE = re.compile(r"""url\(\s*["']?([^"')\s]+)""", re.IGNORECASE)
 _IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
 BUTTONS = ("button", "reset", "submit", "image")
 """The types of inputs that need no name."""
+_HOST = re.compile(r"(?:[a-z][a-z0-9+.-]*:)?//[^/?#]*(?=[/?#]|\Z)", re.IGNORECASE)
+_SCRIPT = (
+    "a script of the project whose address holds a value never runs; write its name, and pass the value in the page"
+)
 _LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
@@ -38,7 +42,7 @@ class Tags(PageParser):
         self._styling = False
 
     def read(self, source: str) -> list[Diagnostic]:
-        """Return the problems of a page's tags. Values with Jinja expressions are not checked."""
+        """Return the problems of a page's tags. What a Jinja expression stands for is not checked."""
         self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
         self.close()
         return [*self._found, *self._without_a_name()]
@@ -47,6 +51,7 @@ class Tags(PageParser):
         given = {name: value.strip() for name, value in attributes_of(attrs).items()}
         self._styling = tag == "style"
         self._field(tag, given)
+        self._left_out(tag, given)
         for name, value in given.items():
             if _HANDLER.fullmatch(name) and value:
                 self._remark(f"{name} never runs; use addEventListener in a <script> of the page")
@@ -54,6 +59,10 @@ class Tags(PageParser):
                 self._remark("javascript: never runs; use addEventListener in a <script> of the page")
             elif name == "style":
                 self._style(value)
+            elif name == "href" and tag in fragments.LINKS:
+                self._link(value)
+            elif name == "formaction" and self._is_elsewhere(value):
+                self._mistake("a form is never sent to another site; take formaction out")
             elif name in _LOADED.get(tag, ()):
                 for address in _IN_SRCSET.findall(value) if name == "srcset" else [value]:
                     self._address(tag, address, given)
@@ -71,6 +80,19 @@ class Tags(PageParser):
             self._mistake("files cannot be sent; take this field out")
         elif tag in ("input", "select", "textarea") and kind not in BUTTONS and not given.get("name"):
             self._unnamed.append((self.getpos()[0], tag))
+
+    def _left_out(self, tag: str, given: dict[str, str]) -> None:
+        """Remark on tags that the frame leaves out, where a page would need them."""
+        if tag == "meta" and given.get("http-equiv", "").lower() == "refresh":
+            self._remark('<meta http-equiv="refresh"> does nothing; write a link and a <script> (docs/recruiting.md)')
+        elif tag == "base" and given.get("href"):
+            self._remark("<base> does nothing; write the whole address in each tag")
+        elif tag == "form" and self._is_elsewhere(given.get("action", "")):
+            self._remark("the answers are stored as those of this study, and are not sent to the form's action")
+
+    @staticmethod
+    def _is_elsewhere(address: str) -> bool:
+        return address.startswith("//") or _SCHEME.match(address) is not None
 
     def _without_a_name(self) -> list[Diagnostic]:
         """One remark on all fields without a name: a name that is missing once is often missing everywhere."""
@@ -94,14 +116,37 @@ class Tags(PageParser):
     def _address(self, tag: str, address: str, given: dict[str, str]) -> None:
         """Check whether the file or the page at this address can be loaded."""
         relations = given.get("rel", "").lower().split()
-        if spans.MARK in address or not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
+        if not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
             return
-        if address.startswith("//") or _SCHEME.match(address):
-            self._elsewhere(tag, address, "stylesheet" in relations)
+        if self._is_elsewhere(address):
+            host = _HOST.match(address)
+            if host is None or spans.MARK not in host[0]:
+                self._elsewhere(tag, host[0] if host else address, "stylesheet" in relations)
+        elif address.startswith(spans.MARK):
+            if tag == "script":
+                self._mistake(_SCRIPT)
         elif tag in ("iframe", "embed", "object"):
             self._remark(f"<{tag}> cannot show a file of the project")
         elif not address.startswith(("#", "?")):
-            self._file(unquote(re.split(r"[?#]", address, maxsplit=1)[0]))
+            path = _path(address)
+            if spans.MARK not in path:
+                self._file(path)
+            elif tag == "script":
+                self._mistake(_SCRIPT)
+
+    def _link(self, address: str) -> None:
+        """Check whether the file at this address can be opened. A link to another site opens whatever it names."""
+        path = _path(address)
+        if not path or spans.MARK in path or self._is_elsewhere(address):
+            return
+        if path.startswith("/") and not path.startswith("/steps/"):
+            return
+        if path.lower().endswith((".html", ".htm")):
+            self._remark(f"{short(path)} cannot be opened by a link; make it a step, or link to a PDF")
+        elif path.startswith("www."):
+            self._remark(f"{short(path)} is not found; write https:// before it")
+        elif path != "next":
+            self._file(path)
 
     def _elsewhere(self, tag: str, address: str, style_sheet: bool) -> None:
         try:
@@ -126,10 +171,9 @@ class Tags(PageParser):
         name = path.removeprefix(self._own) if self._own else path.rpartition("/")[2]
         name = name.removeprefix("./")
         alone = re.split(r"[/\\]", name)[-1]
-        kind = alone.rpartition(".")[2].lower()
         if name != alone:
             message = f"{short(name)} is not found: put the file into {self._folder}/ itself and write {short(alone)}"
-        elif kind not in KINDS:
+        elif not is_served(name):
             message = f"{short(name)} is not shown: of files beside the pages only {', '.join(KINDS)} are"
         elif name.startswith("."):
             message = f"{short(name)} is not found: its name must not begin with a dot"
@@ -144,6 +188,11 @@ class Tags(PageParser):
 
     def _mistake(self, message: str) -> None:
         self._found.append(Diagnostic(self._label, self.getpos()[0], "", message))
+
+
+def _path(address: str) -> str:
+    """The path in a relative address, decoded."""
+    return unquote(re.split(r"[?#]", address, maxsplit=1)[0])
 
 
 def _lines(numbers: list[int]) -> str:

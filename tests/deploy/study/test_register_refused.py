@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from console.problem import Exit
-from deploy.study import pages
 from hippodrome import registry
+from hippodrome.participants.files import MAX_BYTES
 from hippodrome.registry import NotRegistered
 from testing.files import write_files
 from tests.deploy.registering import CONFIG, Register, RegisterWorld, configure, write_study
@@ -214,7 +214,7 @@ def test_links_out_of_the_folder_and_large_pages_are_refused(
     if name == "link":
         (folder / "steps/keys.txt").symlink_to("/etc/passwd")
     else:
-        (folder / "steps/film.mp4").write_bytes(b"x" * (pages.LIMIT_BYTES + 1))
+        (folder / "steps/film.mp4").write_bytes(b"x" * (MAX_BYTES + 1))
     ran = register(code=Exit.FAILED)
     assert ("link out of the project folder" if name == "link" else "larger than 4 MB") in ran.err
     assert register_world.keys() == []

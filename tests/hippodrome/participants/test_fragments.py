@@ -218,6 +218,34 @@ def test_relative_addresses_point_to_the_projects_files(source: str, expected: s
 # Scripts
 
 
+OPENS = ' target="_blank" rel="noopener"'
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ('<a href="sheet.pdf">x</a>', f'<a{OPENS} href="/steps/demo/sheet.pdf">x</a>'),
+        ("<A HREF=./Sheet.PDF#page=2>x</A>", f"<A{OPENS} HREF=/steps/demo/Sheet.PDF#page=2>x</A>"),
+        ('<a href="/steps/demo/sheet.pdf">x</a>', f'<a{OPENS} href="/steps/demo/sheet.pdf">x</a>'),
+        ('<a href="sheet-{{ group }}.pdf">x</a>', f'<a{OPENS} href="/steps/demo/sheet-{{{{ group }}}}.pdf">x</a>'),
+        ('<area href="map.png"/>', f'<area{OPENS} href="/steps/demo/map.png"/>'),
+        ('<a href="sheet.pdf" target="_self">x</a>', '<a href="/steps/demo/sheet.pdf" target="_self">x</a>'),
+        ('<a href="sheet.pdf" download>x</a>', '<a href="/steps/demo/sheet.pdf" download>x</a>'),
+    ],
+)
+def test_a_link_to_a_file_opens_it_in_a_tab_unless_the_author_says_otherwise(source: str, expected: str) -> None:
+    assert prepare(source, BASE).text == expected
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["#part", "?userId=x", "next?projectId=x.pdf", "/other/x.pdf", "https://a.example/x.pdf", "more.html", ""],
+)
+def test_other_links_stay_unchanged(address: str) -> None:
+    source = f'<a href="{address}">x</a>'
+    assert prepare(source, BASE).text == source
+
+
 def test_scripts_of_the_page_get_the_nonce() -> None:
     text = prepare('<script>a()</script><script src="b.js"></script>', BASE).render({}, "N")
     assert text == '<script nonce="N">a()</script><script nonce="N" src="/steps/demo/b.js"></script>'

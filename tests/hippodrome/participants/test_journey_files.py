@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from typing import Any
 
 import pytest
 
 from hippodrome.model.project import Events
+from hippodrome.participants.files import MAX_BYTES
 from hippodrome.participants.link_fields import OUR_FIELDS, RECRUITER_IDS
 from lambdas import next_step
 from testing.aws_events import http_event
@@ -32,6 +34,11 @@ KINDS = {
     "js": "text/javascript",
     "vtt": "text/vtt",
     "woff2": "font/woff2",
+    "txt": "text/plain; charset=utf-8",
+    "csv": "text/csv; charset=utf-8",
+    "ics": "text/calendar; charset=utf-8",
+    "odt": "application/vnd.oasis.opendocument.text",
+    "docx": "application/vnd.openxmlformats-officedocument.wordprocessingml.document",
 }
 
 
@@ -52,6 +59,28 @@ def test_each_kind_of_file_is_served_with_its_content_type_in_a_sandbox(platform
         assert headers["Content-Type"] == KINDS[ending]
         assert headers["Cache-Control"] == "public, max-age=300"
         assert headers["Content-Security-Policy"] == "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+
+
+def test_a_pdf_is_served_to_be_shown_and_cannot_be_read_as_a_page(platform: FakePlatform) -> None:
+    """Browsers show no PDF in a sandbox. `nosniff` keeps what is no PDF from being run as HTML."""
+    keep(platform, "sheet.pdf")
+    response = ask("/steps/maze/sheet.pdf")
+    headers = response["headers"]
+    assert (headers["Content-Type"], headers["X-Content-Type-Options"]) == ("application/pdf", "nosniff")
+    assert not headers.keys() & {"Content-Security-Policy", "Content-Disposition"}
+    assert response["isBase64Encoded"]
+    assert base64.b64decode(response["body"]) == b"x"
+
+
+@pytest.mark.parametrize(("ending", "saved"), [("csv", 1), ("ics", 1), ("odt", 1), ("docx", 1), ("txt", 0), ("svg", 0)])
+def test_a_file_that_browsers_cannot_show_is_saved(platform: FakePlatform, ending: str, saved: int) -> None:
+    keep(platform, f"a.{ending}")
+    assert ask(f"/steps/maze/a.{ending}")["headers"].get("Content-Disposition") == ("attachment" if saved else None)
+
+
+def test_the_largest_file_fits_into_a_functions_answer(platform: FakePlatform) -> None:
+    platform.documents.put("maze/steps/sheet.pdf", b"x" * MAX_BYTES)
+    assert len(json.dumps(ask("/steps/maze/sheet.pdf"))) < 6 * 1024 * 1024  # Lambda's quota
 
 
 @pytest.mark.parametrize("name", [".png", ".hidden.png", "a\u200b.png", "x" * 197 + ".png", "a.html"])

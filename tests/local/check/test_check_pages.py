@@ -133,6 +133,16 @@ def test_each_group_is_shown_its_page(folder: Path) -> None:
         ("<a href='javascript:go()'>x</a>", "javascript: never runs; "),
         ("<textarea></textarea>", "this <textarea> has no name"),
         ("<select name=''></select>", "this <select> has no name"),
+        ("<a href='sheet.pdf'>x</a>", "there is no sheet.pdf in steps/"),
+        ("<a href='/steps/quick/sheet.pdf'>x</a>", "there is no sheet.pdf in steps/"),
+        ("<map><area href='ct.png'></map>", "there is no ct.png in steps/; did you mean cat.png?"),
+        ("<a href='files/cat.png'>x</a>", "files/cat.png is not found: put the file into steps/ itself"),
+        ("<a href='cat.zip'>x</a>", "cat.zip is not shown: of files beside the pages only png, "),
+        ("<a href='bye.html#end'>x</a>", "bye.html cannot be opened by a link; make it a step, or link to a PDF"),
+        ("<a href='www.example.org/x'>x</a>", "www.example.org/x is not found; write https:// before it"),
+        ("<meta http-equiv=Refresh content='0;url=https://a.example'>", '<meta http-equiv="refresh"> does nothing; '),
+        ("<base href='https://a.example/'>", "<base> does nothing; write the whole address in each tag"),
+        ("<form action='https://a.example/'></form>", "the answers are stored as those of this study, and are not"),
         ("<p style='background: url(cat.png)'>", "cat.png is not found from a style; write url(/steps/quick/cat.png)"),
         ("<style>p { background: url('cat.png') }</style>", "cat.png is not found from a style; "),
     ],
@@ -160,6 +170,17 @@ def test_doubtful_html_is_remarked(folder: Path, text: str, said: str) -> None:
         ),
         ("<link rel=stylesheet href=https://media.example/x.css>", "style sheets of other places are not loaded"),
         ("<embed src=https://media.example/x>", "<embed> is never shown"),
+        ("<iframe src='https://q.example/f?PID={{ participant.userId }}'></iframe>", "https://q.example is not in "),
+        ("<iframe src='//q.example/{{ group }}'></iframe>", "https://q.example is not in allowedHosts"),
+        ("<img src='https://q.example/{{ group }}.png'>", "https://q.example is not in allowedHosts"),
+        ("<img srcset='cat-{{ group }}.png 1x, https://q.example/{{ group }} 2x'>", "https://q.example is not in"),
+        ("<video src='https://q.example#{{ group }}'></video>", "https://q.example is not in allowedHosts"),
+        ("<script src='https://q.example/x.js?{{ group }}'></script>", "https://q.example is not in allowedHosts"),
+        ("<link rel=stylesheet href='https://media.example/{{ group }}.css'>", "style sheets of other places are not"),
+        ("<object data='https://q.example/{{ group }}'></object>", "<object> is never shown"),
+        ("<script src='x-{{ group }}.js'></script>", "a script of the project whose address holds a value never runs"),
+        ("<script src='{{ group }}.js'></script>", "a script of the project whose address holds a value never runs"),
+        ("<button formaction='https://q.example/?{{ group }}'>x</button>", "a form is never sent to another site"),
     ],
 )
 def test_mistakes_in_html_are_reported(folder: Path, text: str, said: str) -> None:
@@ -167,6 +188,16 @@ def test_mistakes_in_html_are_reported(folder: Path, text: str, said: str) -> No
     page(folder, f"\n{text}")
     (line,) = looked(folder)
     assert line.startswith(f"steps/hello.html:2: {said}")
+
+
+@pytest.mark.parametrize("size", [4 * 1024**2, 4 * 1024**2 + 1])
+def test_a_file_that_aws_does_not_serve_is_a_mistake(on_aws: Path, size: int) -> None:
+    (on_aws / "steps" / "sheet.pdf").write_bytes(b"x" * size)
+    lines = [line for line in looked(on_aws) if "sheet.pdf" in line]
+    too_large = (
+        "steps/sheet.pdf: larger than 4 MB, which AWS does not serve; make it smaller, or put it on another site"
+    )
+    assert lines == ([too_large] if size > 4 * 1024**2 else [])
 
 
 def test_comments_end_where_browsers_end_them(folder: Path) -> None:
@@ -188,7 +219,11 @@ def test_good_html_gets_no_finding(folder: Path) -> None:
         <script>if (1 < 2) document.write('<img src="none.png" onclick="x">')</script>
         <input type="submit"><input type=button><button>Go</button><input name="q{{ group }}" value="{{ answers["1"].n }}">
         <!-- <img src="none.png"> --> <style>p { background: url(/steps/quick/x.png), url(data:image/png;base64,AA=) }</style>
-        <p one="x" only="y">""",
+        <iframe src="https://media.example/{{ group }}"></iframe><img src="https://{{ group }}.example/x.png">
+        <img src="https://media.example{{ group }}/x.png"><img src="cat-{{ group }}.png"><script src="x.js?{{ group }}"></script>
+        <a href="a%20cat.png">x</a><a href="#part">x</a><a href="?userId=x">x</a><a href="next?projectId=x">x</a><a href="/">x</a>
+        <a href="mailto:a@b.example">x</a><a href="{{ answers["1"].link }}">x</a><a href="sheet-{{ group }}.pdf">x</a>
+        <meta name="viewport" content="width=device-width"><p one="x" only="y">""",
     )
     assert looked(folder) == []
 
