@@ -39,6 +39,7 @@ IN_SESSIONS = (
     "Several people played together: the others' steps of the same games are in other datasets. A policy took "
     "the actions by policy while the participant was away. "
 )
+OTHER_NUMBERS = "To get the environment's own number of an action, add {start}. "
 STEP_NUMBERS = "The observations were not recorded; the number of the step takes their place."
 
 
@@ -146,6 +147,7 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
         )
     description = "Recorded by Hippodrome: the actions of people and their results. "
     description += "" if spec.dtype else STEP_NUMBERS + " "
+    description += OTHER_NUMBERS.format(start=spec.start) if spec.start else ""
     player = f"the player {spec.human}" if spec.together else "the first human"
     description += OF_HUMAN.format(player=player) if spec.players else ""
     description += IN_SESSIONS if spec.together else ""

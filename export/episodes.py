@@ -24,6 +24,7 @@ class Spec(NamedTuple):
     players: tuple[str, ...] = ()  # all players, if there are several
     human: str = ""  # the player whose steps these are, if there are several
     together: bool = False  # whether the participant played with others, in a session
+    start: int = 0  # the environment's own number of action 0
 
 
 def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
@@ -39,13 +40,15 @@ def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Ite
         names = header.get("actionSpace")
         actions = tuple(map(str, names)) if isinstance(names, list) else ()
         players, humans = players_of(header), humans_of(header)
+        starts = header.get("actionStart") or {}
         columns = ["kind", "observationDtype", "observationShape", "other"]
         batch = next(file.iter_batches(batch_size=256, columns=columns), None)
         rows = [row for row in batch.to_pylist() if row["kind"] in ("reset", "step")] if batch else []
         if people is None:
             human = humans[0] if humans else ""
             dtype, shape = _observed(rows, "")
-            yield Spec(step, actions, dtype, shape, players, human), _highest(file, "action")
+            start = starts.get(human or "player_0", 0)
+            yield Spec(step, actions, dtype, shape, players, human, start=start), _highest(file, "action")
             return
         if people and not any(people.values()):
             return  # all participants were erased
@@ -54,7 +57,8 @@ def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Ite
             own_actions = tuple(map(str, own)) if isinstance(own, list) else actions
             dtype, shape = _observed(rows, "" if human == humans[0] else human)
             highest = _highest(file, f"action.{human}")
-            yield Spec(step, own_actions, dtype, shape, players, human, together=True), highest
+            start = starts.get(human, 0)
+            yield Spec(step, own_actions, dtype, shape, players, human, together=True, start=start), highest
 
 
 def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:

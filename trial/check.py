@@ -168,7 +168,10 @@ def _remedy(error: BaseException) -> str:
         return "put the file there, and do not name it in .dockerignore"
     kinds = {kind.__name__ for each in errors for kind in type(each).__mro__} & _MISSING
     if "UnregisteredEnv" in kinds:
-        return "write the package with this game into requirements.txt and import it in agent.py, or correct its name"
+        return (
+            "write the package with this game into requirements.txt, and its module before the game (module:Id-v0), or "
+            "correct its name"
+        )
     return "correct the packages and versions in requirements.txt beside agent.py" if kinds else ""
 
 

@@ -34,27 +34,30 @@ def starts_at_link(config: Config) -> bool:
     return bool(config.steps) and config.events.start_server_step == config.steps[0].key
 
 
-def without_a_key(config: Config) -> Remark | None:
-    """Return a remark if the action that the game takes without a key seems to do something.
+def without_a_key(config: Config, actions: Sequence[str] = (), taken: str | None = None) -> Remark | None:
+    """Return a remark if the action that the game takes without a key is not known to do nothing.
 
-    Without a key the trial takes `idleAction`, or the action `noop`, or the first action (`trial/core/players.py`).
-    With `pace: turns` it takes none.
+    Without a key the trial takes `idleAction`, or the action `noop`, or the first action (`trial/core/players.py`);
+    `taken` is that action, if it is known. With `pace: turns` it takes none. `actions` are the names of all actions,
+    if config.yml does not have them.
     """
-    if config.trial.idle_action is not None or config.trial.pace == "turns":
+    names = [name.strip().lower() for name in config.trial.action_space or actions]
+    if config.trial.idle_action is not None or config.trial.pace == "turns" or not names or not config.game_steps:
         return None
-    names = [name.strip().lower() for name in config.trial.action_space]
-    if not names or "noop" in names or names[0] in IDLE or not config.game_steps:
+    taken = taken or ("noop" if "noop" in names else names[0])
+    if taken in IDLE:
         return None
-    rate = config.trial.starting_frame_rate
     idle = next((name for name in names if name in IDLE), None)
     advice = (
         f"write idleAction: {idle}, and that is taken instead"
         if idle is not None
-        else "if one of the actions does nothing, name it as idleAction; if none does, see docs/agent.md#no-key"
+        else "if one of the actions does nothing, name it as idleAction; if none does, write pace: turns, or see "
+        "docs/agent.md#no-key"
     )
     return Remark(
         ("trial", "actionSpace"),
-        f'while no key is pressed, the game takes "{names[0]}", {rate} times a second; {advice}',
+        f'while no key is pressed, the game takes "{taken}", {config.trial.starting_frame_rate} times a second; '
+        f"{advice}",
     )
 
 

@@ -11,11 +11,11 @@ import json
 import os
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from local.check import idle
 from local.check.agent_progress import AgentProgress
 from local.check.deadline import Deadline
 from local.check.game import CheckedGame
@@ -26,7 +26,7 @@ from protocol import handover
 from protocol.handover import Handover
 from protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
 from protocol.trial import TrialSection
-from trial.agent import match
+from trial.agent import environments, match
 from trial.agent.agent import AgentAdapter, AgentError
 from trial.agent.callbacks import Callbacks, TrialFacts
 from trial.agent.joint import JointAdapter
@@ -37,6 +37,8 @@ from trial.pictures.assets import Assets
 from trial.pictures.reader import PictureReader
 from trial.server import assignment
 from trial.settings import trial_section
+
+NO_KEY_SECONDS = 2.0  # an episode that ends within these seconds without a key gets a remark
 
 _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # where os.getenv, environ.get and `in` are implemented
 
@@ -97,7 +99,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     names, count = progress.known["names"], progress.known["count"]
     if count is not None and names > count:
         if isinstance(player, AgentAdapter):
-            first = int(getattr(player.env.action_space, "start", 0))
+            first = environments.first_number(player.env.action_space)
             progress.foreign = _foreign_actions(player.env, range(first, first + count))
         elif not player.steps_itself:
             progress.foreign = [count]
@@ -156,8 +158,10 @@ def _assigned(given: Handover) -> assignment.AssignmentDocument:
 def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[str, Any]:
     """The number of actions' names, and of actions (None: not known); the names, if config.yml does not give them."""
     if isinstance(player, AgentAdapter):
-        count = getattr(getattr(player.env, "action_space", None), "n", None)
-        found = {"names": len(player.action_space), "count": None if count is None else int(count)}
+        found = {
+            "names": len(player.action_space),
+            "count": environments.count_of(getattr(player.env, "action_space", None)),
+        }
         return found | ({} if config.action_space else {"actions": player.action_space})
     counts = [count for count in player.action_counts.values() if count is not None]
     found = {"names": len(config.action_space), "count": int(max(counts)) if counts else None}
@@ -167,24 +171,20 @@ def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[
 def _note_idle(
     joint: JointAdapter | OnePlayer, players: Sequence[Player], config: TrialSection, progress: AgentProgress
 ) -> None:
-    """Note whether the idle action, which is taken while no key is pressed, changes the picture.
+    """Note which action the game takes without a key, and after how many steps this ends an episode, if it does soon.
 
-    It does nothing turn by turn, or if config.yml names that action or all actions. Errors are ignored: the agent has
-    played already.
+    Errors are ignored: the agent has played already.
     """
     human = next(one for one in players if one.human)
-    if config.pace == "turns" or config.action_space or config.idle_action is not None:
-        return
-    others = {one.name: one.idle for one in players}
-
-    def step(action: int) -> bool:
-        return joint.step({**others, human.name: action}).over
-
+    progress.known["idle"] = human.action_space[human.idle]
+    idle, until = {one.name: one.idle for one in players}, time.monotonic() + NO_KEY_SECONDS
     with contextlib.suppress(Exception):
-        still = idle.actions_without_effect(joint.reset, step, joint.pictures, len(human.action_space), human.idle)
-        if still is not None:
-            names = [human.action_space[action] for action in still]
-            progress.known["idle"] = {"action": human.action_space[human.idle], "still": names}
+        joint.reset(1)
+        for steps in range(1, int(NO_KEY_SECONDS * config.starting_frame_rate) + 1):
+            if joint.step(idle).over:
+                progress.known["idleEnds"] = steps
+            if "idleEnds" in progress.known or time.monotonic() > until:
+                break
 
 
 def _callbacks(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.config import Config, Diagnostic, agent_imports, layout, remarks
+from hippodrome.config.diagnostics import Remark
 from hippodrome.config.folder import read_source
 from hippodrome.config.layout import AGENT
 from local.check import waiting
@@ -22,6 +23,7 @@ from local.check.wording import short
 from protocol import environment as variables
 from protocol.players import HUMAN
 from protocol.values import KeyPath, printable
+from trial.agent import environments
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
@@ -231,22 +233,19 @@ class AgentReport:
         return [self._at(self._place_of("step"), message, remark=True)]
 
     def _idle(self) -> list[Diagnostic]:
-        """A remark on an idle action that changes the picture, for the first group only."""
-        found = self._report.get("idle")
-        if found is None or self._group or found["action"] in remarks.IDLE:
+        """Remarks on what happens while no key is pressed, for the first group only."""
+        config, report = self._config, self._report
+        taken = report.get("idle")
+        remark = remarks.without_a_key(config, report.get("actions", ()), taken)
+        if taken is None or remark is None or self._group:
             return []
-        still = ", ".join(found["still"])
-        advice = (
-            f'write idleAction: "{found["still"][0]}"'
-            if still
-            else "name one as idleAction, or see docs/agent.md#no-key"
-        )
-        others = f"; {still} {'does' if len(found['still']) == 1 else 'do'} not" if still else ""
-        message = (
-            f'missing; while no key is pressed, the game takes its action "{found["action"]}", which changes the '
-            f"picture{others}: {advice}"
-        )
-        return [self._in_config(("trial", "idleAction"), message, remark=True)]
+        found = [] if config.trial.action_space else [remark]  # with names in config.yml, it is made without the agent
+        steps = report.get("idleEnds")
+        if steps:
+            message = f"realtime, and without a key an episode ends after {steps} step{'' if steps == 1 else 's'}"
+            seconds = f"{steps / config.trial.starting_frame_rate:.2g} s"
+            found.append(Remark(("trial", "pace"), f"{message} ({seconds}); write pace: turns, unless that is meant"))
+        return [self._in_config(*each, remark=True) for each in found]
 
     def _turns(self) -> list[Diagnostic]:
         """A remark on players who take turns in real time, for the first group only."""
@@ -308,8 +307,8 @@ class AgentReport:
         of_players = self._of_players(error, place)
         if of_players is not None:
             return [of_players]
-        remark = report["call"] == "close"
-        message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'])}"
+        remark, game = report["call"] == "close", printable(self._config.trial.game or "Id-v0")
+        message = f"{call} fails{self._where()}: {short(error['text'])}{remedy(error['type'], error['text'], game)}"
         return [self._at(place, message, remark=remark)]
 
     @property
@@ -372,7 +371,7 @@ class AgentReport:
     def _breach(self, text: str, place: tuple[str, int] | None) -> Diagnostic:
         """The mistake of an agent that does not keep the contract of docs/agent.md."""
         text = text.partition(": ")[2] or text  # without the error's own name
-        if "trial.actionSpace" in text:
+        if text == environments.ACTIONS_UNKNOWN:
             message = "missing; list the game's actions, since the environment does not name them"
             return self._in_config(("trial", "actionSpace"), message)
         text = text.replace(str(self._code / AGENT), AGENT).replace(f" in {AGENT}", "")

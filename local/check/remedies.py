@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from importlib import util
 
-_PIP = ".venv/bin/pip"
+_INSTALL = re.compile(r"pip install [\"']?([\w.-]+(?:\[[\w.,-]+\])?)")
+_UNREGISTERED = ("NameNotFound", "NamespaceNotFound", "UnregisteredEnv")
 _MODULE = re.compile(r"No module named '(?P<module>[\w.]+)'")
 _NAME = re.compile(r"cannot import name '(?P<name>\w+)' from '(?P<module>gym(\.\w+)*)'")
 _ATTRIBUTE = re.compile(r"module '(?P<module>gym(\.\w+)*)' has no attribute '(?P<name>\w+)'")
@@ -24,18 +25,32 @@ _OLD = {
 """Modules from the time of HIPPO Gym that have no versions for the Pythons of Hippodrome."""
 
 
-def remedy(kind: str, text: str) -> str:
+def remedy(kind: str, text: str, game: str = "Id-v0") -> str:
     """Return advice to append to an error's text, beginning with a semicolon; "" if there is none for this error.
 
-    `kind` is the name of the exception's class.
+    `kind` is the name of the exception's class, and `game` the id of the environment.
     """
     if kind == "DependencyNotInstalled":  # the error's text names the packages, as Gymnasium calls them
-        return f"; here pip is {_PIP}"
+        named = _INSTALL.findall(text)  # the last one is Gymnasium's own, with what the game needs
+        package = f": {named[-1]}" if named else ""
+        return f"; instead of installing it by hand, name it in a requirements.txt beside agent.py{package}"
+    if kind in _UNREGISTERED:
+        return "" if "Did you mean" in text else _of_id(game)
     lacking = _NAME.search(text) or _ATTRIBUTE.search(text)
     if lacking and kind in ("ImportError", "AttributeError"):
         return _of_gym(f"{lacking['module']}.{lacking['name']}")
     found = _MODULE.search(text)
     return _of_module(found["module"]) if found and kind == "ModuleNotFoundError" else ""
+
+
+def _of_id(game: str) -> str:
+    """Advice for an id that Gymnasium does not have: other packages register their environments when imported."""
+    module = re.split("[-/]", game)[0].lower()
+    module = module if module.isidentifier() and util.find_spec(module) else "MODULE"
+    return (
+        f"; if another package has it, write the package's module before it (game: {module}:{game}), and the package "
+        "into a requirements.txt beside agent.py"
+    )
 
 
 def _of_module(module: str) -> str:

@@ -219,3 +219,30 @@ def test_the_replay_takes_the_actions_that_the_environment_was_given(by, given):
     step = {"kind": "step", "episode": 1, "human": None, "action": 2, "by": by, "reward": 1.0}
     add_lines(recorded, [{"kind": "reset", "episode": 1, "seed": 3}, step])
     assert recorded.unfinished.steps[0].advice == given, "by agent: it was asked for another action than it took"
+
+
+OWN_NUMBERS = """
+import gymnasium, numpy
+class Env:
+    action_space = gymnasium.spaces.Discrete(3, start=5)
+    def reset(self, seed=None, options=None): return 0, {}
+    def step(self, action): return 0, float(action), False, False, {}
+    def render(self): return numpy.zeros((2, 2, 3), numpy.uint8)
+    def close(self): pass
+class Agent:
+    def start(self, game): return Env()
+"""
+
+
+async def test_a_game_whose_actions_begin_with_another_number_is_continued_and_its_recording_says_which(
+    launch, open_client
+):
+    trial = {"ui": {"stop": True, "start": True}}
+    await play(launch(agent=OWN_NUMBERS, trial=trial, SERVER="a-1"), open_client, 10)
+    second = launch(agent=OWN_NUMBERS, trial=trial, SERVER="a-2")
+    await play(second, open_client, 10, stop=True)
+    (lines,) = second.recordings(server="a-2").values()
+    assert lines[0]["actionStart"] == {"player_0": 5}
+    assert lines[1]["kind"] == "resume"
+    taken = [(line["action"], line["reward"]) for line in lines if line["kind"] == "step"]
+    assert set(taken) == {(0, 5)}, "action 0 of actionSpace, which the environment calls 5"

@@ -107,6 +107,9 @@ def load(folder: Path) -> Any:
         return Agent()
     # agent.py can import the files beside it, and `gym`. They come last, so that they hide no installed package.
     sys.path.extend(str(place) for place in (folder, _OLD_GYM) if str(place) not in sys.path)
+    sys.argv = [
+        path.name
+    ]  # for an agent that reads arguments: not the arguments of this process, which differ between check and server
     spec = importlib.util.spec_from_file_location("agent", path)
     if spec is None or spec.loader is None:
         raise AgentError(f"{path.name} cannot be imported")
@@ -183,6 +186,7 @@ class AgentAdapter:
         self._env_reports_action = False
         self.action_space: tuple[str, ...] = self.configured_actions
         """The names of the actions, by their numbers; without names in config.yml, empty until `name_actions`."""
+        self._first_number = 0  # the environment's number of action 0, if its own `step` gets the actions
 
     @property
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:
@@ -229,9 +233,21 @@ class AgentAdapter:
     def name_actions(self) -> None:
         """Set `action_space` for an environment with one player: the names in config.yml, or the environment's.
 
-        Raises AgentError if there are none in config.yml, and the environment does not say how many actions it has.
+        Raises AgentError if there are none in config.yml, and the environment does not say how many actions it has; or
+        if the environment's own `step` gets the actions, and they are not numbers.
         """
+        space = getattr(self.env, "action_space", None)
+        try:
+            environments.check_numbered(space, not self.steps_itself)
+        except environments.PlayersUnknown as error:
+            raise AgentError(str(error)) from None
+        self._first_number = 0 if self.steps_itself else environments.first_number(space)
         self.action_space = self.configured_actions or _action_names(self.env)
+
+    @property
+    def action_starts(self) -> Mapping[str, int]:
+        """The environment's number of action 0, by player, where it is not 0."""
+        return {PLAYER: self._first_number} if self._first_number else {}
 
     @property
     def steps_itself(self) -> bool:
@@ -289,8 +305,11 @@ class AgentAdapter:
         """
         if self.reader.first_due:  # no picture yet: an earlier server's steps are repeated without them
             self.render()
-        result = self._agent.step(action) if self._unusual_step is None else self._unusual_step(action)
+        number = self._first_number + action
+        result = self._agent.step(number) if self._unusual_step is None else self._unusual_step(number)
         outcome = read_step_result(result)
+        if outcome.action is not None and self._first_number:
+            outcome = replace(outcome, action=outcome.action - self._first_number)
         if outcome.action is None or (isinstance(result, Mapping) and result.get("action") is not None):
             return outcome
         if isinstance(self._agent, Agent) or (self._env_reports_action and outcome.action == action):
@@ -417,7 +436,7 @@ def _action_names(env: Any) -> tuple[str, ...]:
     names = environments.action_meanings(env)
     if names:
         return tuple(names)
-    count = getattr(getattr(env, "action_space", None), "n", None)
+    count = environments.count_of(getattr(env, "action_space", None))
     if count is None:
         raise AgentError(environments.ACTIONS_UNKNOWN)
-    return tuple(str(index) for index in range(int(count)))
+    return tuple(str(index) for index in range(count))

@@ -127,9 +127,20 @@ def players_of(owner: Any, keys: Sequence[Any], configured: Sequence[str], *, st
         keys=by_name,
         action_names={name: _action_names(owner, spaces[name], configured, stepped) for name in by_name},
         observation_spaces={name: _space(owner, "observation_space", key) for name, key in by_name.items()},
-        starts={name: int(getattr(space, "start", 0)) if stepped else 0 for name, space in spaces.items()},
-        counts={name: getattr(space, "n", None) for name, space in spaces.items()},
+        starts={name: first_number(space) if stepped else 0 for name, space in spaces.items()},
+        counts={name: count_of(space) for name, space in spaces.items()},
     )
+
+
+def count_of(space: Any) -> int | None:
+    """Return how many actions a space has whose actions are single numbers (`Discrete`); None for any other space."""
+    count = getattr(space, "n", None)
+    return None if count is None or getattr(space, "shape", None) else int(count)  # MultiBinary has a shape
+
+
+def first_number(space: Any) -> int:
+    """Return the environment's number of the first action: `start` of a `Discrete`, else 0."""
+    return 0 if count_of(space) is None else int(getattr(space, "start", 0))
 
 
 def _space(env: Any, name: str, key: Any) -> Any:
@@ -152,14 +163,28 @@ def _space(env: Any, name: str, key: Any) -> Any:
 def _action_names(env: Any, space: Any, configured: Sequence[str], stepped: bool) -> tuple[str, ...]:
     if configured and not stepped:
         return tuple(configured)
-    count = getattr(space, "n", None)
+    check_numbered(space, stepped)
+    count = count_of(space)
     names = list(configured) or action_meanings(env)
     if count is None:
         if not names:
             raise PlayersUnknown(ACTIONS_UNKNOWN)
         return tuple(names)
-    more = (str(index) for index in range(len(names), int(count)))
-    return (*names[: int(count)], *more)
+    more = (str(index) for index in range(len(names), count))
+    return (*names[:count], *more)
+
+
+def check_numbered(space: Any, stepped: bool) -> None:
+    """Raise PlayersUnknown if the environment's own `step` (`stepped`) gets a number, and takes no single numbers.
+
+    An object without `sample` is not a space, so nothing is known of the actions.
+    """
+    if stepped and callable(getattr(space, "sample", None)) and count_of(space) is None:
+        raise PlayersUnknown(
+            f"the environment takes actions of {str(space)[:100]}, and a key is the number of an action; write "
+            "step(self, action) in class Agent of agent.py, which makes such an action of each number, and list the "
+            "names of these actions as trial.actionSpace in config.yml"
+        )
 
 
 def action_meanings(env: Any) -> list[str]:

@@ -74,6 +74,8 @@ class JointAdapter:
         """The space (Gymnasium) of each player's observations; None if it is not known."""
         self.action_counts: Mapping[str, int | None] = players.counts
         """The number of each player's actions in the environment; None if it is not known."""
+        self.action_starts: Mapping[str, int] = {name: start for name, start in players.starts.items() if start}
+        """The environment's number of each player's action 0, where it is not 0."""
         self.views: tuple[str, ...] = self.players
         """The players whose pictures are drawn, if `render` takes a player."""
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from protocol.keys import recordings_folder
+from trial.agent import environments
 from trial.gym.errors import EnvironmentFailed
 from trial.recordings import recording
 from trial.recordings.recording import Recording
@@ -43,7 +44,7 @@ class ConnectionRecorder:
         except OSError as error:
             raise _not_written(error) from error
         recorded = Recorded(env, file, {"v": recording.SCHEMA, "session": server, "trial": server})
-        count = getattr(env.action_space, "n", None)
+        count, first = environments.count_of(env.action_space), environments.first_number(env.action_space)
         recorded.write(
             "header",
             project=PROJECT,
@@ -51,7 +52,7 @@ class ConnectionRecorder:
             server=server,
             step=step,
             game=env_id,
-            actionSpace=[str(at) for at in range(int(count))] if isinstance(count, int | np.integer) else [],
+            actionSpace=[str(first + at) for at in range(count or 0)],
             seed=seed,
             versions=recording.versions(),
         )

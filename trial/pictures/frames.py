@@ -37,6 +37,9 @@ FIRST_ROW = struct.Struct("!H")
 MAX_JPEG_SIDE = 65_500
 """In pixels; libjpeg's JPEG_MAX_DIMENSION."""
 
+_EXPECTED = (
+    "and must return height x width x 3 bytes (numpy.uint8): environments of Gymnasium do with render_mode='rgb_array'"
+)
 _FIRST_CHUNK = 131_072  # bytes of pixels that are packed before the size is compared with the limit
 
 
@@ -49,11 +52,17 @@ def as_frame(picture: Any) -> Frame:
     if picture is None:
         why = "is a `return` missing? Gymnasium's environments need render_mode='rgb_array'"
         raise FrameError(f"render() returned nothing: {why}")
-    array = np.asarray(picture)
+    if hasattr(picture, "getpalette"):  # a picture of Pillow, of any mode
+        picture = picture.convert("RGB")
+    try:
+        array = np.asarray(picture)
+    except Exception as error:  # the object's own code
+        raise FrameError(f"render() returned {type(picture).__name__}, {_EXPECTED}") from error
     if array.ndim == 2:
         array = array[:, :, np.newaxis]
     if array.ndim != 3 or array.dtype != np.uint8:
-        raise FrameError(f"render() must return height x width x 3 bytes, not {array.dtype} of {array.shape}")
+        described = f"{array.dtype} of {array.shape}" if array.dtype.kind in "biuf" else type(picture).__name__
+        raise FrameError(f"render() returned {described}, {_EXPECTED}")
     if array.shape[2] == 4:
         array = array[:, :, :3]
     height, width, channels = array.shape

@@ -93,10 +93,11 @@ class Recorder:
         """Whether a recording is open, to which lines can be written."""
         return self._recording is not None
 
-    def open(self, opening: OpenRecording, players: Mapping[str, Any]) -> None:
+    def open(self, opening: OpenRecording, players: Mapping[str, Any], action_starts: Mapping[str, int]) -> None:
         """Open a recording and write its header. Raises OSError.
 
         `players` describes who plays each player, if there are several (`Places.described`); else it is empty.
+        `action_starts` are the environment's numbers of the players' action 0, where they are not 0.
         """
         settings, config = self._settings, self._settings.trial
         name = "trial" if config.data_file == "trial" else f"episode-{opening.episode:04d}"
@@ -110,6 +111,7 @@ class Recorder:
             step=self._step,
             game=config.game,
             actionSpace=list(opening.action_space),
+            **({"actionStart": dict(action_starts)} if action_starts else {}),
             **({"players": _with_actions(players, opening), **rules(config, opening.players)} if players else {}),
             frameRate=opening.frame_rate,
             actionBufferLifespan=config.action_buffer_lifespan,

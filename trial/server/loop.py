@@ -205,6 +205,7 @@ class TrialLoop:
             return
         recorded = await self._recorder.recorded()
         self._calls = self._calls_of(started, playing)
+        self._action_starts = started.agent.action_starts
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
         self._use_callbacks(started, playing.players)
         effects = self.core.start(
@@ -366,7 +367,7 @@ class TrialLoop:
 
     def _open_recording(self, opening: OpenRecording) -> None:
         try:
-            self._recorder.open(opening, self._places.described if opening.players else {})
+            self._recorder.open(opening, self._places.described if opening.players else {}, self._action_starts)
         except OSError as error:
             log.error("a recording cannot be opened (%s)", short_error(error))
             self._apply(self.core.recording_failed(self._loop.time()))

@@ -249,10 +249,10 @@ def test_an_arrow_that_no_action_is_called_after_is_remarked(folder: Path, actio
     ],
 )  # fmt: skip
 def test_arrows_of_actions_without_names_are_remarked(folder: Path, ui: str, count: int, remark: str | None) -> None:
-    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "  actionSpace: [noop, left]\n", "  idleAction: '0'\n")
     config(folder, "left: true", ui)
     agent(folder, "class Env:", f"class Space:\n    n = {count}\n\nclass Env:\n    action_space = Space()")
-    assert tried(folder) == ([] if remark is None else [f"config.yml:13: remark: trial.ui: {remark}"])
+    assert tried(folder) == ([] if remark is None else [f"config.yml:14: remark: trial.ui: {remark}"])
 
 
 @pytest.mark.parametrize("action_space", ["", "  actionSpace: []\n"])
@@ -265,7 +265,7 @@ def test_an_arrow_without_an_action_of_the_environment_is_remarked(folder: Path,
 
 
 def test_without_ui_arrows_of_actions_without_names_get_no_remark(folder: Path) -> None:
-    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "  actionSpace: [noop, left]\n", "  idleAction: '0'\n")
     config(folder, "  ui: {start: true, pause: true, stop: true, left: true}\n", "")
     agent(folder, "class Env:", "class Space:\n    n = 2\n\nclass Env:\n    action_space = Space()")
     assert tried(folder) == []
@@ -502,7 +502,7 @@ def test_processes_of_the_agent_end_with_the_check(folder: Path, tmp_path: Path)
 
 
 def test_a_custom_agent_needs_an_action_space(folder: Path) -> None:
-    config(folder, "  actionSpace: [noop, left]\n", "")
+    config(folder, "  actionSpace: [noop, left]\n", "  idleAction: '0'\n")
     assert tried(folder) == [
         "config.yml:8: trial.actionSpace: missing; list the game's actions, since the environment does not name them"
     ]

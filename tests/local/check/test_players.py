@@ -270,20 +270,13 @@ def test_scenes_of_several_players_are_checked(folder: Path) -> None:
 
 # ---- the action of no key
 
-WORLD = """
+ALONE_AGENT = """
 import numpy
+from gymnasium.spaces import Discrete
 
 
 class Env:
-    STILL = 3
-    def __init__(self):
-        from gymnasium.spaces import Discrete
-        self.action_space = Discrete(4)
-    def get(self):
-        return numpy.full((8, 8, 3), self.at % 200, numpy.uint8)
-    def move(self, action):
-        self.n += 1
-        self.at += (0 if action == self.STILL else action + 1) + self.WIND
+    action_space = Discrete(4)
 
 
 class Agent:
@@ -291,44 +284,49 @@ class Agent:
         self.env = Env()
         return self.env
     def reset(self, seed=None):
-        self.env.at = self.env.n = 0
+        self.n = 0
         return 0, {}
     def step(self, action):
-        self.env.move(action)
-        return 0, 0, self.env.n == 20, False, {}
+        self.n += 1
+        return 0, 0, self.n == 200 or action == FATAL, False, {}
     def render(self):
-        return self.env.get()
+        return numpy.zeros((8, 8, 3), numpy.uint8)
     def close(self):
         pass
 """
 
-ALONE = ("  actionSpace: [noop, up, down]\n  players: {left: human, right: PLAYS}\n", "")
+ALONE = "  actionSpace: [noop, up, down]\n  players: {left: human, right: PLAYS}\n"
 
 
-def world(folder: Path, wind: str, still: str = "3") -> None:
-    (folder / "agent.py").write_text(WORLD.replace("STILL = 3", f"STILL = {still}; WIND = {wind}"))
+def without_a_key(folder: Path, more: str = "", fatal: int = 3) -> list[str]:
+    """The remarks on a game for one player in which action `fatal` ends the episode; `more` are lines of `trial`."""
+    (folder / "agent.py").write_text(ALONE_AGENT.replace("FATAL", str(fatal)))
+    return tried(folder, "", ALONE, more)
 
 
-def test_an_idle_action_that_changes_the_picture_is_remarked_with_one_that_does_not(folder: Path) -> None:
-    world(folder, "0")
-    found = [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
-    assert len(found) == 1
-    assert found[0].endswith(
-        'trial.idleAction: missing; while no key is pressed, the game takes its action "0", which changes the picture; '
-        '3 does not: write idleAction: "3"'
+def test_the_action_that_is_taken_without_a_key_is_named_if_nobody_says_that_it_does_nothing(folder: Path) -> None:
+    (line,) = without_a_key(folder)
+    assert line.endswith(
+        'remark: trial.actionSpace: while no key is pressed, the game takes "0", 30 times a second; if one of the '
+        "actions does nothing, name it as idleAction; if none does, write pace: turns, or see docs/agent.md#no-key"
     )
-    assert "remark: " in found[0]
-    for new in ('  idleAction: "3"\n', "  pace: turns\n", "  actionSpace: [stay, up, down, left]\n"):
-        assert not [line for line in tried(folder, "", ALONE[0], new) if "idleAction" in line]
 
 
 @pytest.mark.parametrize(
-    ("wind", "still"), [("0", "0"), ("1", "3"), ("property(lambda _: __import__('random').randrange(9))", "3")]
+    "more", ['  idleAction: "3"\n', '  idleAction: "0"\n', "  pace: turns\n", "  actionSpace: [stay, up, down, left]\n"]
 )
-def test_an_idle_action_without_a_clear_effect_gets_no_remark(folder: Path, wind: str, still: str) -> None:
-    """Action 0 does nothing; the game moves by itself; it plays differently each time."""
-    world(folder, wind, still)
-    assert not [line for line in tried(folder, "", *ALONE) if "idleAction" in line]
+def test_an_action_without_a_key_that_was_chosen_on_purpose_gets_no_remark(folder: Path, more: str) -> None:
+    assert without_a_key(folder, more, fatal=9) == []
+
+
+def test_an_episode_that_soon_ends_without_a_key_is_remarked(folder: Path) -> None:
+    *_, line = without_a_key(folder, fatal=0)
+    assert line.endswith(
+        "remark: trial.pace: realtime, and without a key an episode ends after 1 step (0.033 s); write pace: turns, unless "
+        "that is meant"
+    )
+    *_, line = without_a_key(folder, "  actionSpace: [stick, hit, up, down]\n", fatal=0)
+    assert "without a key an episode ends after 1 step" in line
 
 
 def test_callbacks_get_the_values_of_all_players(folder: Path) -> None:

@@ -49,8 +49,27 @@ def test_the_advice_names_the_package_and_not_the_module(module: str, package: s
 
 
 def test_gymnasium_names_its_packages_itself() -> None:
-    text = 'pygame is not installed, run `pip install "gymnasium[classic_control]"`'
-    assert remedy("DependencyNotInstalled", text) == "; here pip is .venv/bin/pip"
+    text = 'Box2D is not installed, run `pip install swig` followed by `pip install "gymnasium[box2d]"`'
+    advice = "; instead of installing it by hand, name it in a requirements.txt beside agent.py: gymnasium[box2d]"
+    assert remedy("DependencyNotInstalled", text) == advice
+
+
+@pytest.mark.parametrize(
+    ("game", "proposed"),
+    [
+        ("MiniGrid-DoorKey-5x5-v0", "MODULE:MiniGrid-DoorKey-5x5-v0"),
+        ("Numpy/X-v0", "numpy:Numpy/X-v0"),
+        ("CartPol-v1", None),
+    ],
+)
+def test_an_id_that_gymnasium_does_not_have_needs_the_module_that_registers_it(game: str, proposed: str | None) -> None:
+    advice = remedy(*raised(f"import gymnasium; gymnasium.make({game!r})"), game)
+    assert advice == (
+        f"; if another package has it, write the package's module before it (game: {proposed}), and the package into a "
+        "requirements.txt beside agent.py"
+        if proposed
+        else ""
+    )
 
 
 def raised(code: str) -> tuple[str, str]:

@@ -242,6 +242,70 @@ def test_other_entries_of_the_dict_are_kept() -> None:
     assert both.extra == {"done": True, "action": "left"}
 
 
+# ---- actions that the environment numbers in another way, and actions that are no numbers
+
+OWN_STEP = """
+import numpy
+from gymnasium import spaces
+class Env:
+    action_space = SPACE
+    def reset(self, seed=None, options=None):
+        self.taken = []
+        return 0, {}
+    def step(self, action):
+        self.taken.append(action)
+        return 0, float(action), False, False, {"action": action}
+    def render(self):
+        return numpy.zeros((2, 2, 3), numpy.uint8)
+    def close(self):
+        pass
+class Agent:
+    def start(self, game):
+        return Env()
+"""
+
+
+@pytest.mark.parametrize("start_number", [-1, 5])
+def test_an_environment_whose_actions_begin_elsewhere_gets_its_own_numbers(tmp_path: Path, start_number: int) -> None:
+    player = started_agent(tmp_path, source=OWN_STEP.replace("SPACE", f"spaces.Discrete(2, start={start_number})"))
+    player.reset(1)
+    results = [player.step(action) for action in (0, 1)]
+    assert player.env.taken == [start_number, start_number + 1]
+    assert [result.action for result in results] == [0, 1], "as everywhere in Hippodrome, places in actionSpace"
+    assert player.action_starts == {PLAYER: start_number}
+
+
+def test_a_step_of_agent_py_gets_the_numbers_of_action_space(tmp_path: Path) -> None:
+    player = started_agent(
+        tmp_path, "class Env:", "import gymnasium\nclass Env:\n    action_space = gymnasium.spaces.Discrete(2, start=5)"
+    )
+    player.step(1)
+    assert player.env.said == [("step", 1)]
+    assert player.action_starts == {}
+
+
+SPACES = [
+    "spaces.Box(-1, 1, (2,))", "spaces.MultiDiscrete([2, 3])", "spaces.MultiBinary(3)",
+    "spaces.Dict(x=spaces.Discrete(2))", "spaces.Tuple([spaces.Discrete(2)])",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("names", [("left", "right"), ()])
+@pytest.mark.parametrize("several", [False, True])
+def test_actions_that_are_no_numbers_need_a_step_that_translates_them(
+    tmp_path: Path, space: str, names: tuple[str, ...], several: bool
+) -> None:
+    source = OWN_STEP.replace("SPACE", space + ("; possible_agents = ['a']" if several else ""))
+    (tmp_path / "agent.py").write_text(source)
+    with pytest.raises(
+        AgentError, match=rf"takes actions of {space.partition('.')[2].partition('(')[0]}.*write step\(self, action\)"
+    ):
+        start(AgentAdapter(tmp_path, "a-game", names))
+    (tmp_path / "agent.py").write_text(f"{source}    def step(self, action): ...\n")
+    start(AgentAdapter(tmp_path, "a-game", ("left", "right")))
+
+
 # ---- what is recorded of it
 
 
@@ -382,3 +446,10 @@ def test_a_step_may_return_a_tuple_or_hippos_dict():
     for wrong in (None, (1, 2), (1, "x", False, {}), (1, math.nan, False, {}), 5):
         with pytest.raises(AgentError):
             read_step_result(wrong)
+
+
+def test_an_agent_that_reads_arguments_when_it_is_imported_gets_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["process.py", "report"])
+    started_agent(tmp_path, "import numpy", "import argparse, numpy\nargparse.ArgumentParser().parse_args()")

@@ -427,3 +427,30 @@ async def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> No
         assert client.websocket.subprotocol == "hippodrome.3"
         await client.play(30)
         assert set(client.kinds) == EXACT
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "1", "LA", "CMYK"])
+def test_a_picture_of_pillow_shows_its_colours_in_every_mode(mode: str) -> None:
+    picture = Image.new("RGB", (3, 2), (255, 255, 255)).convert(mode)
+    assert frames.as_frame(picture).tolist() == [[[255, 255, 255]] * 3] * 2
+
+
+class Surface:
+    """Such as pygame's: it is not an array."""
+
+
+@pytest.mark.parametrize(
+    ("picture", "described"),
+    [
+        (Surface(), "Surface"),
+        ("a text", "str"),
+        ([np.zeros((2, 3, 3), np.uint8)], "uint8 of (1, 2, 3, 3)"),
+        ([np.zeros((2, 3, 3)), np.zeros((1, 3, 3))], "list"),
+        (np.zeros((2, 3, 3)), "float64 of (2, 3, 3)"),
+    ],
+)
+def test_what_is_not_a_picture_is_named_with_the_advice_of_gymnasium(picture: Any, described: str) -> None:
+    with pytest.raises(frames.FrameError) as raised:
+        frames.as_frame(picture)
+    assert str(raised.value).startswith(f"render() returned {described}, and must return height x width x 3 bytes")
+    assert str(raised.value).endswith("render_mode='rgb_array'")
