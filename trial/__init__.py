@@ -21,6 +21,7 @@ _INTERACTIVE_GYM = {
     "app": "server_app",
     "gym_scene": "scenes",
     "static_scene": "scenes",
+    "scene": "scenes",
     "stager": "scenes",
     "experiment_config": "scenes",
     "callback": "callback",
@@ -28,10 +29,28 @@ _INTERACTIVE_GYM = {
     "inference_utils": "inference_utils",
     "onnx_inference_utils": "onnx_inference_utils",
 }
+_PAGE = "write its pages as files of steps/ (docs/pages.md)"
+_PART = "it is a part of Interactive Gym's own server: take the import out"
+_MISSING = {
+    "unity_scene": "games made with Unity are not played here",
+    "constructors": _PAGE,
+    "utils": "write `from trial import onnx_inference_utils`, or take the import of server/utils.py out",
+    "game_manager": _PART,
+    "pyodide_game_coordinator": _PART,
+    "typing": "its names are for type checkers alone: take the import out",
+    "configurations": "write `from trial import remote_config` and the like",
+    "scenes": "write `from trial import static_scene` and the like",
+}
+"""The modules and packages of Interactive Gym that are not here, and what to do."""
 
 
 def __getattr__(name: str) -> Any:
-    """Load a name of Interactive Gym: `from trial import RemoteConfig`."""
+    """Load a name of Interactive Gym: `from trial import RemoteConfig`.
+
+    Raises ImportError with a sentence for a module of Interactive Gym that is not here.
+    """
+    if name in _MISSING:
+        raise ImportError(f"Interactive Gym's {name} is not in Hippodrome: {_MISSING[name]} (docs/interactive-gym.md)")
     if name not in _INTERACTIVE_GYM:
         raise AttributeError(f"module 'trial' has no attribute {name!r}")
     module, _, attribute = _INTERACTIVE_GYM[name].partition(".")
@@ -48,6 +67,8 @@ class _InteractiveGymFinder:
     @staticmethod
     def find_spec(name: str, _path: Any = None, _target: Any = None) -> Any:
         module = name.removeprefix("trial.")
+        if module != name and module in _MISSING:
+            __getattr__(module)
         if module in (name, "RemoteConfig") or module not in _INTERACTIVE_GYM:
             return None
         return importlib.machinery.ModuleSpec(name, _InteractiveGymFinder)  # type: ignore[arg-type]

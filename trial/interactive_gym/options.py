@@ -33,6 +33,18 @@ class Option:
         """Return the default value. A list or a dictionary is a new one at each call."""
         return self.default() if isinstance(self.default, type) else self.default
 
+    def read(self, value: Any) -> Any:
+        """Return the value that the experiment sets; as a text, if the option is one."""
+        is_text = isinstance(self.default, str) or self.name.endswith(("_url", "_file"))
+        return text_of(value) if is_text and (value is not None or self.default is not None) else value
+
+
+def text_of(value: Any) -> str:
+    """Return the text that an option or a scene is given. Parts of a list, or of a tuple by a stray comma, are joined."""
+    if isinstance(value, list | tuple):
+        return "\n".join(map(text_of, value))
+    return "" if value is None else str(value)
+
 
 _ALONE = "each participant plays alone, so none waits for another"
 _LOBBY = "a participant waits only until others are there"

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from trial.interactive_gym.options import text_of
 from trial.interactive_gym.playing import humans_of
 from trial.interactive_gym.remote_config import RemoteConfig
 from trial.interactive_gym.sources import Locate, put
@@ -42,12 +43,11 @@ def _name(where: str, number: int, scene: Any) -> str:
 
 
 def _static(scene: Any) -> str:
-    page = _page(
-        scene.scene_header, f"<p>{scene.scene_subheader}</p>" if scene.scene_subheader else "", scene.scene_body
-    )
+    subheader = text_of(scene.scene_subheader)
+    page = _page(text_of(scene.scene_header), f"<p>{subheader}</p>" if subheader else "", text_of(scene.scene_body))
     if type(scene).__name__ == "CompletionCodeScene":
         page += '<p class="code">{{ completion_code }}</p>\n'
-    url = getattr(scene, "url", None)
+    url = text_of(getattr(scene, "url", None))
     return page + (_onward(url, bool(scene.append_subject_id)) if url else "")
 
 

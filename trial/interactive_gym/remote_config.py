@@ -23,9 +23,10 @@ class RemoteConfig:
             object.__setattr__(self, option.name, option.new_default())
 
     def __setattr__(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
         if name in options.BY_NAME:
             self.given.add(name)
+            value = options.BY_NAME[name].read(value)
+        object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"RemoteConfig has no option {name}{did_you_mean(name, options.BY_NAME)}")

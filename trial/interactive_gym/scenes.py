@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
 from protocol.similar import did_you_mean
+from trial.interactive_gym.options import text_of
 from trial.interactive_gym.playing import Unplayable
 from trial.interactive_gym.remote_config import RemoteConfig
 
@@ -24,12 +25,25 @@ _IGNORED = {"on_game_step_code", "restart_pyodide"}
 
 
 class _Scene:
+    """A part of an experiment."""
+
     scene_id: str | None = None
 
     def scene(self, scene_id: str | None = None, experiment_config: Any = None, **_more: Any) -> Self:
         """Set the scene's id."""
         self.scene_id = scene_id or self.scene_id
         return self
+
+
+Scene = _Scene
+"""The name by which experiments import it, for type checkers."""
+
+
+class SceneWrapper:
+    """Several scenes that stand in a stager as one."""
+
+    def __init__(self, scenes: Any, **_more: Any) -> None:
+        self.scenes = list(scenes) if isinstance(scenes, list | tuple) else [scenes]
 
 
 class GymScene(_Scene, RemoteConfig):
@@ -48,7 +62,7 @@ class GymScene(_Scene, RemoteConfig):
         given: dict[str, Any] = {}
         for name, value in named.items():
             if name in _FILES:
-                given[_FILES[name]] = Path(value).read_text(encoding="utf-8")
+                given[_FILES[name]] = Path(text_of(value)).read_text(encoding="utf-8")
             elif name == "max_steps":
                 self.max_steps = value
             elif name in _IGNORED:
@@ -73,7 +87,7 @@ class StaticScene(_Scene):
     ) -> Self:
         """Set the page's texts. Raises OSError if the file cannot be read."""
         if scene_body_filepath is not None:
-            scene_body = Path(scene_body_filepath).read_text(encoding="utf-8")
+            scene_body = Path(text_of(scene_body_filepath)).read_text(encoding="utf-8")
         self.scene_header = self.scene_header if scene_header is None else scene_header
         self.scene_subheader = self.scene_subheader if scene_subheader is None else scene_subheader
         self.scene_body = self.scene_body if scene_body is None else scene_body
@@ -105,7 +119,12 @@ class Stager:
     """Holds the scenes of an experiment in their order."""
 
     def __init__(self, scenes: Iterable[Any] = ()) -> None:
-        self.scenes = list(scenes)
+        self.scenes = list(_unpacked(scenes))
+
+
+def _unpacked(scenes: Iterable[Any]) -> Iterator[Any]:
+    for scene in scenes:
+        yield from _unpacked(scene.scenes) if isinstance(scene, SceneWrapper) else (scene,)
 
 
 class ExperimentConfig:
@@ -138,8 +157,15 @@ def game_of(config: Any) -> Any:
     if not isinstance(stager, Stager):
         return config
     games = [scene for scene in stager.scenes if isinstance(scene, GymScene)]
-    if len(games) != 1:
-        raise Unplayable(f"the stager has {len(games)} games (GymScene); a study has one game step here")
+    if not games:
+        raise Unplayable(
+            "the stager has no game (GymScene); without one, a study is pages of steps/ alone (docs/pages.md)"
+        )
+    if len(games) > 1:
+        raise Unplayable(
+            f"the stager has {len(games)} games (GymScene), and a study has one game here: make an experiment of each, "
+            "with its own file and link"
+        )
     (game,) = games
     place = stager.scenes.index(game)
     game.before, game.after = stager.scenes[:place], stager.scenes[place + 1 :]
@@ -154,6 +180,11 @@ def game_of(config: Any) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    known = ("GymScene", "StaticScene", "StartScene", "EndScene", "CompletionCodeScene", "Stager", "ExperimentConfig")
+    """Raise ImportError for a scene of Interactive Gym that is not here: `from … import` shows no other sentence."""
+    if not name[:1].isupper():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    known = ("GymScene", "SceneWrapper", "StaticScene", "StartScene", "EndScene", "CompletionCodeScene", "Stager")
     hint = did_you_mean(name, known) or "; its questions are written as a page of steps/ (docs/pages.md)"
-    raise AttributeError(f"there is no scene {name} here{hint}")
+    if name in ("RandomizeOrder", "RepeatScene"):
+        hint = "; scenes are shown once, in the order of the stager"
+    raise ImportError(f"there is no scene {name} here{hint}")

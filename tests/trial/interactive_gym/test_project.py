@@ -383,11 +383,47 @@ def test_scenes_before_and_after_the_game_become_pages(tmp_path: Path) -> None:
     assert run_python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
+def test_texts_may_be_tuples_by_a_stray_comma_lists_paths_or_none(tmp_path: Path) -> None:
+    write(tmp_path)
+    texts = """
+import pathlib
+from trial import scene
+more.display(scene_header=("Much",), scene_subheader=["more"], scene_body=("<p>Read</p>", "<p>this</p>"))
+game.welcome_text, game.game_page_text, game.instructions_html_file = None, ("Go",), pathlib.Path("how.html")
+stager = """
+    source = SCENES.replace("GAMES", "scene.SceneWrapper(scenes=(game,))").replace("stager = ", texts, 1)
+    (tmp_path / "experiment.py").write_text(source)
+    done = run_experiment(tmp_path)
+    assert done.returncode == 0, done.stderr
+    steps = tmp_path / "experiment-study/steps"
+    assert (steps / "before_2.html").read_text() == "<h1>Much</h1>\n<p>more</p>\n<p>Read</p>\n<p>this</p>\n"
+    assert "Go" in (steps / "instructions.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("imports", "said"),
+    [
+        ("from trial.scenes import static_scene", "write `from trial import static_scene` and the like"),
+        ("import trial.configurations.remote_config", "write `from trial import remote_config` and the like"),
+        ("from trial.server import server_app", "write `from trial import server_app`"),
+        ("from trial import utils", "take the import of server/utils.py out"),
+        ("from trial.utils import onnx_inference_utils", "write `from trial import onnx_inference_utils`"),
+        ("from trial import unity_scene", "games made with Unity are not played here"),
+        ("from trial.static_scene import OptionBoxes", "its questions are written as a page of steps/"),
+        ("from trial.scene import RandomizeOrder", "scenes are shown once, in the order of the stager"),
+    ],
+)
+def test_an_import_of_interactive_gyms_that_is_not_here_says_what_to_do(imports: str, said: str) -> None:
+    with pytest.raises(ImportError, match=re.escape(said)):
+        exec(imports, {})
+
+
 @pytest.mark.parametrize(
     ("scenes", "said"),
     [
-        ("game, game", "the stager has 2 games (GymScene); a study has one game step here"),
-        ("more", "the stager has 0 games (GymScene); a study has one game step here"),
+        ("game, game", "the stager has 2 games (GymScene), and a study has one game here: make an experiment of each"),
+        ("static_scene.SceneWrapper([game, game])", "the stager has 2 games (GymScene), and"),
+        ("more", "the stager has no game (GymScene)"),
         ("game, type('OptionBoxes', (static_scene.StaticScene,), {})()", "a OptionBoxes is no page that can be shown"),
     ],
 )
