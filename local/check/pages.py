@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from local.check.structure import check_structure
 from local.check.tags import Tags
 from local.check.templates import Visitors, check_template
 from protocol.values import printable
+
+_CODE = re.compile(r"""\bclass=["']?code\b""", re.IGNORECASE)
+"""A code that the researcher has written."""
 
 
 def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
@@ -58,6 +62,7 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
             found.append(Diagnostic(f"{folder.name}/{file.name}", None, "", message, remark=True))
     if config.project.use_aws:
         found += [_too_large(folder, name) for name in sorted(names) if _size(folder / name) > MAX_BYTES]
+    if not config.project.keeps_off_aws and not config.project.signed_links:  # strangers may come, from a recruiter
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
         found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
     return found
@@ -91,20 +96,24 @@ def _too_large(folder: Path, name: str) -> Diagnostic:
 
 
 def _no_code(label: str) -> Diagnostic:
-    message = "this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+    message = (
+        "this last page shows no completion code and no link: those who come from a recruiting site need one; "
+        "write {{ completion_code }}, or a link back to the site"
+    )
     return Diagnostic(label, None, "", message, remark=True)
 
 
 def _leads_back(source: str) -> bool:
-    """Whether a last page shows the completion code or has a link to another site (docs/recruiting.md)."""
+    """Whether a last page has a completion code, or leads to another site (docs/recruiting.md)."""
     try:
         if "completion_code" in meta.find_undeclared_variables(sandbox.environment().parse(source)):
             return True
     except Exception:  # noqa: BLE001 - the check of the page reports what Jinja cannot read
         return True
-    return any(
-        leads_elsewhere(address) or address.startswith(spans.MARK) for address in links(every_branch(source).html)
-    )
+    page = every_branch(source).html
+    by_script = any("://" in page[script.inside : script.until] for script in spans.spans(page, spans.SCRIPT))
+    by_link = any(leads_elsewhere(address) or address.startswith(spans.MARK) for address in links(page))
+    return by_script or by_link or _CODE.search(page) is not None
 
 
 def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | None]]:

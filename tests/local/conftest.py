@@ -93,7 +93,9 @@ def write_study(
         hold.touch()
     for page in ("hello", "bye"):
         (folder / "steps" / f"{page}.html").write_text(f"<h1>{page}</h1><input name=word><button>Go on</button>")
-    (folder / "steps" / "end.html").write_text("<h1>end</h1>")
+    (folder / "steps" / "end.html").write_text(
+        '<h1>end</h1><a href="https://recruiter.example/complete?cc=C1">Back</a>'
+    )
     return folder
 
 

@@ -427,9 +427,9 @@ def test_answers_after_which_nobody_can_go_on_are_remarked(folder: Path, conditi
 
 
 def test_the_last_page_needs_a_button_only_if_it_asks_something(folder: Path) -> None:
-    page(folder, "<button hidden>x</button>", "end")
+    page(folder, "{{ completion_code }}<button hidden>x</button>", "end")
     assert looked(folder) == []
-    page(folder, "<input name=a><button hidden>x</button>", "end")
+    page(folder, "{{ completion_code }}<input name=a><button hidden>x</button>", "end")
     assert [line.partition(":")[2] for line in looked(folder)] == [NOBODY.partition(":")[2]]
 
 
@@ -444,7 +444,8 @@ def test_an_answer_with_which_a_page_fails_is_named(folder: Path) -> None:
 # --- the code that recruiters ask for -----------------------------------------------------------------
 
 NO_CODE = (
-    "remark: this last page shows no code for the recruiting site: write {{ completion_code }}, or a link back to it"
+    "remark: this last page shows no completion code and no link: those who come from a recruiting site need one; "
+    "write {{ completion_code }}, or a link back to the site"
 )
 
 
@@ -453,15 +454,15 @@ def of_codes(folder: Path, name: str = "end") -> list[str]:
 
 
 @pytest.fixture
-def on_aws(folder: Path) -> Path:
-    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+def no_code(folder: Path) -> Path:
+    page(folder, "<h1>end</h1>", "end")
     return folder
 
 
-def test_a_last_page_without_a_code_is_remarked(on_aws: Path) -> None:
-    assert of_codes(on_aws) == [NO_CODE]
-    page(on_aws, "{{ completion_code }}", "hello")
-    assert of_codes(on_aws) == [NO_CODE], "those who do not finish see the earlier pages, too"
+def test_a_last_page_without_a_code_is_remarked(no_code: Path) -> None:
+    assert of_codes(no_code) == [NO_CODE]
+    page(no_code, "{{ completion_code }}", "hello")
+    assert of_codes(no_code) == [NO_CODE], "those who do not finish see the earlier pages, too"
 
 
 @pytest.mark.parametrize(
@@ -474,9 +475,9 @@ def test_a_last_page_without_a_code_is_remarked(on_aws: Path) -> None:
         "<a href='more.html'>more</a>",
     ],
 )
-def test_pages_without_a_visible_code_are_remarked(on_aws: Path, text: str) -> None:
-    page(on_aws, text, "end")
-    assert of_codes(on_aws) == [NO_CODE]
+def test_pages_without_a_visible_code_are_remarked(no_code: Path, text: str) -> None:
+    page(no_code, text, "end")
+    assert of_codes(no_code) == [NO_CODE]
 
 
 @pytest.mark.parametrize(
@@ -486,19 +487,23 @@ def test_pages_without_a_visible_code_are_remarked(on_aws: Path, text: str) -> N
         "{% if group %}{{ completion_code|lower }}{% endif %}",
         "<p><a href='https://recruiter.example/submissions/complete?cc=YOURCODE'>Return</a></p>",
         '<a href="https://recruiter.example/?id={{ participant.userId }}">Return</a>',
+        '<p class="code">C1A2B3</p>',
+        '<script>location.href = "https://recruiter.example/complete?cc=C1"</script>',
     ],
 )
-def test_a_code_or_a_link_back_gets_no_remark(on_aws: Path, text: str) -> None:
-    page(on_aws, text, "end")
-    assert of_codes(on_aws) == []
+def test_a_code_or_a_link_back_gets_no_remark(no_code: Path, text: str) -> None:
+    page(no_code, text, "end")
+    assert of_codes(no_code) == []
 
 
-def test_each_groups_last_page_needs_one(on_aws: Path) -> None:
-    (on_aws / "steps" / "end.html").unlink()
-    page(on_aws, "{{ completion_code }}", "end-0")
-    page(on_aws, "<h1>Goodbye</h1>", "end-1")
-    assert of_codes(on_aws, "end-1") == [NO_CODE]
+def test_each_groups_last_page_needs_one(no_code: Path) -> None:
+    (no_code / "steps" / "end.html").unlink()
+    page(no_code, "{{ completion_code }}", "end-0")
+    page(no_code, "<h1>Goodbye</h1>", "end-1")
+    assert of_codes(no_code, "end-1") == [NO_CODE]
 
 
-def test_a_study_on_one_machine_needs_no_code(folder: Path) -> None:
-    assert of_codes(folder) == []
+@pytest.mark.parametrize("key", ["useAWS: false", "signedLinks: true"])
+def test_a_study_that_no_recruiting_site_sends_people_to_needs_no_code(no_code: Path, key: str) -> None:
+    config(no_code, "  maxRuntime: 5", f"  maxRuntime: 5\n  {key}")
+    assert of_codes(no_code) == []
