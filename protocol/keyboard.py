@@ -40,6 +40,10 @@ _OTHER_NAMES = {
 }
 _CODE = re.compile(r"(?:Key([A-Z])|(?:Digit|Numpad)([0-9]))")  # KeyboardEvent.code
 
+_PART = re.compile(r"(\+|[^+]+)(?:\+|$)")
+_SPACED = re.compile(r"\s\+\s+$|^\s+\+\s")
+_JOINED = re.compile(r"(?:\+|[^+]+)(?:\+(?:\+|[^+]+))*")
+
 
 def key_name(text: str) -> str:
     """Return the name of the key as in `KeyboardEvent.key`: a letter always small, and " " for `Space`.
@@ -73,20 +77,19 @@ def _meant(text: str) -> str | None:
 
 
 def parts(combined: str) -> tuple[str, ...]:
-    """Return the keys that are joined by `+`, as written.
-
-    A `+` that stands alone, or a second one at the end, is the key `+` itself.
-    """
-    if combined == "+":
-        return ("+",)
-    if combined.endswith("++"):
-        return (*parts(combined[:-2]), "+")
-    return tuple(part.strip() or _SPACE for part in combined.split("+"))
+    """Return the keys that are joined by `+`, as written. A `+` where a key must stand is the key `+` itself."""
+    return tuple(part.strip() or _SPACE for part in _PART.findall(combined))
 
 
 def combination(text: str) -> str:
     """Return the keys in a text, each as by `key_name`, joined by `+`. Raises ValueError with what to write."""
-    keys = [key_name(part) for part in parts(text if text == _SPACE else text.strip() or _SPACE)]
+    if not text:
+        raise ValueError("names no key; write Space for the space key")
+    if not _JOINED.fullmatch(text) or _SPACED.search(text):  # only in "a+ " and " +a" is the space a key
+        text = text.strip()
+    if not _JOINED.fullmatch(text):
+        raise ValueError("has a + that joins nothing; a++ is a and + together, and + alone is the key +")
+    keys = [key_name(part) for part in parts(text)]
     if len(set(keys)) < len(keys):
         raise ValueError("names the same key twice; write it once")
     if len(keys) > MAX_TOGETHER:

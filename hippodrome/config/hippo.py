@@ -362,11 +362,43 @@ def _unknown(adapted: Adapted) -> None:
                 _own_control(adapted, path)
                 continue
             value = adapted.section(section).pop(key)
+            advice = f"; {_CONDITIONS}" if _names_conditions(key) else ""
             if section == ("trial",):
-                why = "no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md)"
+                why = f"no key of Hippodrome's: the agent gets it as one of its own (docs/agent.md){advice}"
                 _give_to_agent(adapted, path, value, why)
             else:
-                adapted.remark(path, "no effect: Hippodrome has no such key")
+                adapted.remark(path, f"no effect: Hippodrome has no such key{advice}")
+
+
+_CONDITIONS = (
+    "the conditions of an experiment are groups, and those come from versions of a page, such as consent-0.html and "
+    "consent-1.html (docs/pages.md#groups)"
+)
+_OF_CONDITIONS = frozenset(
+    [
+        "condition",
+        "group",
+        "treatment",
+        "factor",
+        "arm",
+        "variant",
+        "cell",
+        "randomize",
+        "randomise",
+        "randomization",
+        "randomisation",
+        "counterbalance",
+        "counterbalancing",
+        "betweensubject",
+        "withinsubject",
+    ]
+)
+
+
+def _names_conditions(key: str) -> bool:
+    """Whether an unknown key has a name by which other programs know the conditions of an experiment."""
+    name = re.sub(r"[^a-z]", "", key.lower())
+    return name in _OF_CONDITIONS or name.removesuffix("s") in _OF_CONDITIONS
 
 
 def _is_mistake(adapted: Adapted, path: KeyPath) -> bool:

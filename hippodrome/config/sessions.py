@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Mistake, Remark
@@ -16,6 +16,9 @@ PLAYERS: KeyPath = ("project", "players")
 MATCHING: KeyPath = ("project", "matching")
 SEATS: KeyPath = ("project", "seats")
 WHO_PLAYS: KeyPath = ("trial", "players")
+
+VERSIONS = "write two versions of a page, such as rules-0.html and rules-1.html"
+"""How a study gets groups."""
 
 OF_SESSIONS: tuple[KeyPath, ...] = (
     MATCHING,
@@ -46,18 +49,34 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
 
 
 def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
-    """Yield mistakes in keys that need groups if the study has none.
+    """Yield mistakes in keys that need groups, or name other groups than the study has.
 
     `groups` is their number: the versions of a page.
     """
     project = checked.project
+    if by_group(checked.trial.players) and checked.game_steps and checked.valid(WHO_PLAYS):
+        yield from _other_groups(checked.trial.groups(), groups)
     if not project.has_sessions or not checked.valid(PLAYERS, MATCHING) or groups:
         return
-    pages = "write two versions of a page, such as rules-0.html and rules-1.html"
     if project.seats == "group" and project.matching == "match" and checked.valid(SEATS):
-        yield Mistake(SEATS, f"group, and there are no groups; {pages}, or seats: match")
+        yield Mistake(SEATS, f"group, and there are no groups; {VERSIONS}, or seats: match")
     if project.matching in ("group", "mixed"):
-        yield Mistake(MATCHING, f"{project.matching}, and there are no groups; {pages}, or matching: arrival")
+        yield Mistake(MATCHING, f"{project.matching}, and there are no groups; {VERSIONS}, or matching: arrival")
+
+
+def _other_groups(named: Sequence[int], groups: int) -> Iterator[Mistake]:
+    """Yield a mistake if `players` is given group by group, and these are not all groups of the study."""
+    if not groups:
+        yield Mistake(WHO_PLAYS, f"is given group by group, and there are no groups; {VERSIONS}, or one map for all")
+        return
+    there = f"there are {groups} groups, 0 to {groups - 1}, since a page has {groups} versions"
+    for group in named:
+        if group >= groups:
+            message = f"{there}; write a page for this group, such as rules-{group}.html, or leave the group out"
+            yield Mistake((*WHO_PLAYS, str(group)), message)
+    missing = next((group for group in range(groups) if group not in named), None)
+    if missing is not None:
+        yield Mistake(WHO_PLAYS, f"does not say who plays in group {missing}; {there}")
 
 
 def _humans(checked: Checked) -> Iterator[Mistake]:

@@ -358,6 +358,18 @@ def test_keys_are_sent_as_held_and_released(world: World, tab: Any) -> None:
     world.wait_for({"command": "reset"})
     said = [each for each in world.received if each.get("action") == "left"]
     assert said == [{"action": "left", "held": True}, {"action": "left", "held": False}]
+
+
+def test_the_numeric_keypad_has_arrows_without_numlock_and_digits_with_it(world: World, tab: Any) -> None:
+    world.controls = {"actionSpace": ["noop", "left", "jump", "crouch"]}
+    play(world, tab)
+    tab.keyboard.down("Numpad4")  # in Playwright "ArrowLeft", and with Shift "4"
+    world.wait_for({"action": "left", "held": True})
+    tab.keyboard.down("Shift")
+    tab.keyboard.up("Numpad4")
+    world.wait_for({"action": "left", "held": False})
+    tab.keyboard.press("Numpad2")
+    world.wait_for({"action": "crouch", "held": False})
     assert world.player_commands()[0] == "start"  # the first key starts the game
     assert tab.evaluate("scrollY") == 0
 

@@ -34,6 +34,11 @@ def problems_of(**section: Any) -> list[str]:
         ("ArrowLeft+ArrowUp", "ArrowLeft+ArrowUp"),
         ("ArrowLeft + Space", "ArrowLeft+ "),
         ("a++", "a++"),
+        ("a+ ", "a+ "),
+        ("++a", "++a"),
+        ("a+++b", "a+++b"),
+        (" + ", "+"),
+        ("  ", " "),
         ("ß", "ß"),
     ],
 )
@@ -45,6 +50,7 @@ def test_a_key_is_called_as_the_browser_calls_it(written: str, key: str) -> None
 def test_a_combination_is_split_into_its_keys() -> None:
     assert keyboard.parts("ArrowLeft+ ") == ("ArrowLeft", " ")
     assert keyboard.parts("a++") == ("a", "+")
+    assert keyboard.parts("++ ") == ("+", " ")
 
 
 @pytest.mark.parametrize(
@@ -61,6 +67,8 @@ def test_a_combination_is_split_into_its_keys() -> None:
         ("esc", "Escape cannot be a key of the game: browsers leave the full screen with it"),
         ("ArrowLeft+Ctrl", "Control cannot be a key of the game: browsers take it for their own commands"),
         ("a+A", "names the same key twice; write it once"),
+        *((text, "has a + that joins nothing; a++ is a and + together, and + alone is the key +") for text in ("a+", "+a", "++", "a++b", "a + ", " + a")),
+        ("", "names no key; write Space for the space key"),
         ("a+b+c+d+e", "joins 5 keys; 4 at most, since few keyboards report more at once"),
     ],
 )  # fmt: skip

@@ -13,6 +13,7 @@ export const DIRECTIONS = {
 const COMMANDS = { reset: ["R", TEXT.keyReset], good: ["G", TEXT.keyGood], bad: ["B", TEXT.keyBad] }; // key, and text of the legend
 
 let keys = new Map(); // event.code -> `{ action }` or `{ command }`
+const actionsDown = new Map(); // event.code -> the action at the press: NumLock or Shift may change the key before the release
 
 // `space`: whether the game uses the space key; then P starts and pauses the game.
 export function assignKeys(directions, others, shown, space) {
@@ -45,19 +46,27 @@ export function showLegend(directions, others, shown, space, lines = []) {
   }));
 }
 
+// The numeric keypad has the arrows without NumLock, and digits with it.
+function codeOf({ code, key }) {
+  if (!code.startsWith("Numpad")) return code;
+  return /^[0-9]$/.test(key) ? `Digit${key}` : key;
+}
+
 export function onKeyDown(event) {
   if (event.key === "Meta") releaseAll(); // macOS sends no keyup of other keys while Cmd is held
-  const does = hooks.key(event) ?? keys.get(event.code);
+  const does = hooks.key(event) ?? keys.get(codeOf(event));
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const { target } = event;
   if (target.matches("input, select, textarea") || (target.matches("button") && event.code === "Space")) return;
   event.preventDefault(); // the page must not scroll
   if (event.repeat) return;
-  if (does.action) press(does.action, event.code);
-  else command(does.command);
+  if (!does.action) return command(does.command);
+  actionsDown.set(event.code, does.action);
+  press(does.action, event.code);
 }
 
 export function onKeyUp(event) {
-  const does = hooks.key(event) ?? keys.get(event.code);
-  if (does?.action) release(does.action, event.code);
+  const action = hooks.key(event)?.action ?? actionsDown.get(event.code);
+  actionsDown.delete(event.code);
+  if (action) release(action, event.code);
 }

@@ -13,10 +13,7 @@ const pressedKeys = new Map(); // event.code -> the name at the press: Shift may
 const nameOfKey = (key) => `key:${key}`;
 
 // The single keys of a combination; the same as `parts` in protocol/keyboard.py.
-function partsOf(combined) {
-  if (combined === "+") return ["+"];
-  return combined.endsWith("++") ? [...partsOf(combined.slice(0, -2)), "+"] : combined.split("+");
-}
+const partsOf = (combined) => [...combined.matchAll(/(\+|[^+]+)(?:\+|$)/g)].map(([, key]) => key);
 
 hooks.means = (name) => (bound.has(name) ? { key: bound.get(name) } : { action: name });
 

@@ -38,8 +38,8 @@ def test_a_missing_policy_file_is_named_with_the_existing_ones(folder: Path) -> 
         "trial.players.right: there is no file policies/partner.onnx beside agent.py; there are "
         "policies/small/partner.onnx"
     )
-    text = small(trial="players: {0: {left: human, right: 'sample:policies/small/partner.onnx'}}\n")
-    assert read(folder, text).trial.players == {"0": {"left": "human", "right": "sample:policies/small/partner.onnx"}}
+    text = small(trial="players: {left: human, right: 'sample:policies/small/partner.onnx'}\n")
+    assert read(folder, text).trial.players == {"left": "human", "right": "sample:policies/small/partner.onnx"}
 
 
 def test_a_group_that_is_named_twice_is_refused(folder: Path) -> None:

@@ -56,12 +56,12 @@ def test_a_study_of_two_participants_in_one_game_is_read(folder: Path) -> None:
             "players: 3 under project",
         ),
         (
-            "matching: group\n", "players: {0: {a: human, b: human}, 1: {a: human, b: random}}\n",
+            "matching: group\n", "players: {0: {a: human, b: human}, 1: {a: human, b: random}, 2: {a: human, b: human}}\n",
             "trial.players.1: 1 player is human (a), and project.players is 2; write human for 2 of them, or "
             "players: 1 under project",
         ),
         (
-            "", "players: {0: {a: human, b: human}, 1: {b: human, a: human}}\n",
+            "", "players: {0: {a: human, b: human}, 1: {b: human, a: human}, 2: {a: human, b: human}}\n",
             "trial.players: is given group by group, and a game may have participants of several groups; write "
             "matching: group under project, or one map for all",
         ),
@@ -126,6 +126,35 @@ def test_keys_that_do_not_go_together_get_a_message(folder: Path, project: str, 
 def test_each_of_three_groups_has_its_players(folder: Path) -> None:
     trial = "players: {0: {a: human, b: human}, 1: {a: human, b: human, c: random}, 2: {b: human, a: human}}\n"
     assert read(folder, pair("matching: group\n", trial, GROUPS)).project.matching == "group"
+
+
+GROUP_0, GROUP_1, GROUP_2, GROUP_3 = (f"{number}: {{a: human, b: {plays}}}" for number, plays in enumerate(
+    ("random", "idle", "random", "idle")
+))  # fmt: skip
+THREE = "there are 3 groups, 0 to 2, since a page has 3 versions"
+
+
+@pytest.mark.parametrize(
+    ("steps", "players", "expected"),
+    [
+        (
+            STEPS, (GROUP_0, GROUP_1),
+            "trial.players: is given group by group, and there are no groups; write two versions of a page, such as "
+            "rules-0.html and rules-1.html, or one map for all",
+        ),
+        (
+            GROUPS, (GROUP_0, GROUP_1, GROUP_2, GROUP_3),
+            f"trial.players.3: {THREE}; write a page for this group, such as rules-3.html, or leave the group out",
+        ),
+        (GROUPS, (GROUP_0, GROUP_2), f"trial.players: does not say who plays in group 1; {THREE}"),
+    ],
+    ids=["no groups", "a group too many", "a group is missing"],
+)  # fmt: skip
+def test_players_by_group_name_the_groups_that_the_pages_make(
+    folder: Path, steps: str, players: tuple[str, ...], expected: str
+) -> None:
+    assert only_mistake(folder, small(steps=steps, trial=f"players: {{{', '.join(players)}}}\n")) == expected
+    read(folder, small(steps=GROUPS, trial=f"players: {{{GROUP_0}, {GROUP_1}, {GROUP_2}}}\n"))
 
 
 @pytest.mark.parametrize(("matching", "seats"), [("mixed", "group"), ("match", "group"), ("match", "match")])

@@ -298,6 +298,8 @@ def test_players_without_a_participant_are_remarked(folder: Path) -> None:
     )
     groups = "players: {0: {a: human, b: random}, 1: {a: human, b: human}}"
     config(folder, "players: {a: human, b: human, c: idle}", groups)
+    page = (folder / "steps" / "hello.html").rename(folder / "steps" / "hello-0.html")
+    (folder / "steps" / "hello-1.html").write_bytes(page.read_bytes())
     (line,) = looked(folder)
     assert "trial.players.1: 2 players are human" in line
 
