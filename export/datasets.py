@@ -3,7 +3,8 @@
 In sessions, each human player has a dataset.
 
 Minari needs an observation for every step. Recordings hold observations if the study has `recordObservations`.
-Otherwise the number of the step takes their place, and the dataset's description says so. Episodes are written one at a
+Otherwise, or if Minari has no space for them, the number of the step takes their place, and the dataset's description
+says so. Episodes are written one at a
 time. Images are stored without loss, not as JPEG, which is Minari's default.
 
 Facts (minari 0.5.4, read in its source): `load_dataset(id)` reads `$MINARI_DATASETS_PATH/{id}/data`; observations and
@@ -26,7 +27,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from export import episodes
+from export import episodes, observations
 from export.episodes import Spec
 from export.state import ExportState
 
@@ -40,7 +41,11 @@ IN_SESSIONS = (
     "the actions by policy while the participant was away. "
 )
 OTHER_NUMBERS = "To get the environment's own number of an action, add {start}. "
-STEP_NUMBERS = "The observations were not recorded; the number of the step takes their place."
+STEP_NUMBERS = "The observations were not recorded; the number of the step takes their place. "
+NO_SPACE = (
+    "The observations were recorded, but Minari has no space for them, such as one for lists of different lengths: the "
+    "number of the step takes their place. "
+)
 
 
 @dataclass
@@ -51,6 +56,8 @@ class Dataset:
     id: str = ""
     began: str = "~"  # the first episode's time; it orders the datasets of a step
     highest: int = -1  # the highest number of an action
+    characters: set[str] = field(default_factory=set)  # of texts in observations
+    longest: int = 0  # the most characters of such a text
     files: list[str] = field(default_factory=list)  # converted recordings
     episodes: int = 0
     steps: int = 0
@@ -88,7 +95,8 @@ def build(folder: Path, state: ExportState, project: str, progress: Callable[[in
             "id": dataset.id,
             "episodes": dataset.episodes,
             "steps": dataset.steps,
-            "observations": bool(dataset.spec.dtype),
+            "observations": dataset.spec.kind is not None,
+            "observationsRecorded": dataset.spec.recorded,
             "leftOut": dict(dataset.left_out),
         }
         for dataset in datasets
@@ -99,10 +107,12 @@ def _datasets(folder: Path, state: ExportState, project: str) -> list[Dataset]:
     found: dict[Spec, Dataset] = {}
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         first = next(several)[2]
-        for spec, highest in episodes.specs(folder / path, str(first["step"]), first.get("people")):
+        for spec, highest, texts in episodes.specs(folder / path, str(first["step"]), first.get("people")):
             dataset = found.setdefault(spec, Dataset(spec))
             dataset.files.append(path)
             dataset.highest = max(dataset.highest, highest)
+            dataset.characters |= texts.characters
+            dataset.longest = max(dataset.longest, texts.longest)
             dataset.began = min(dataset.began, str(first["started"]))
     humans: dict[str, set[str]] = {}
     for spec in found:
@@ -127,26 +137,20 @@ def _storage(data: Path, dataset: Dataset, version: str) -> Any:
     from minari.dataset.minari_storage import MinariStorage
 
     spec = dataset.spec
-    observations: Any
-    if not spec.dtype:
-        observations = Box(0, np.iinfo(np.int64).max, (1,), np.int64)
-    elif spec.dtype == "bool":
-        observations = Box(0, 1, spec.shape, np.uint8)
-    elif spec.dtype.startswith("float"):
-        observations = Box(-np.inf, np.inf, spec.shape, np.dtype(spec.dtype).type)
-    else:
-        limits = np.iinfo(spec.dtype)
-        observations = Box(int(limits.min), int(limits.max), spec.shape, np.dtype(spec.dtype).type)
+    seen = Box(0, np.iinfo(np.int64).max, (1,), np.int64)
+    if spec.kind is not None:
+        seen = observations.space(spec.kind, "".join(sorted(dataset.characters)), dataset.longest)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         storage = MinariStorage.new(
             data,
-            observation_space=observations,
+            observation_space=seen,
             action_space=Discrete(max(len(spec.actions), dataset.highest + 1, 1)),
             jpeg_encoding=False,
         )
     description = "Recorded by Hippodrome: the actions of people and their results. "
-    description += "" if spec.dtype else STEP_NUMBERS + " "
+    if spec.kind is None:
+        description += NO_SPACE if spec.recorded else STEP_NUMBERS
     description += OTHER_NUMBERS.format(start=spec.start) if spec.start else ""
     player = f"the player {spec.human}" if spec.together else "the first human"
     description += OF_HUMAN.format(player=player) if spec.players else ""
@@ -195,8 +199,11 @@ def _append(storage: Any, path: Path, dataset: Dataset) -> None:
 
 
 def _clean(value: Any) -> str:
-    """The value as text for HDF5, which takes no null characters; "" for None."""
-    return str(value or "").replace("\0", "")
+    """The value as text for HDF5; "" for None."""
+    return observations.as_text(str(value or ""))
+
+
+_MISSING = "an observation is missing, or not like the others"
 
 
 def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
@@ -212,27 +219,22 @@ def _buffer(rows: list[dict[str, Any]], dataset: Dataset) -> Any:
         return "an action that is no number from 0 on"
     if any(row["reward"] is None for row in steps):
         return "a reward that is no number"
-    if spec.dtype:
-        if first is None or any(
-            row["observation"] is None
-            or row["observationDtype"] != spec.dtype
-            or tuple(row["observationShape"]) != spec.shape
-            for row in rows
-        ):
-            return "an observation is missing, or not like the others"
-        dtype = np.dtype("uint8" if spec.dtype == "bool" else spec.dtype)
-        observations = np.empty((len(rows), *spec.shape), dtype)
-        for place, row in enumerate(rows):
-            observations[place] = np.frombuffer(row["observation"], dtype).reshape(spec.shape)
+    if spec.kind is None:
+        seen: Any = np.arange(len(steps) + 1, dtype=np.int64).reshape(-1, 1)
+    elif first is None:
+        return _MISSING
     else:
-        observations = np.arange(len(steps) + 1, dtype=np.int64).reshape(-1, 1)
+        try:
+            seen = observations.together(spec.kind, [row["seen"] for row in rows])
+        except observations.Unlike:
+            return _MISSING
     terminations = [bool(row["terminated"]) for row in steps]
     truncations = [bool(row["truncated"]) for row in steps]
     truncations[-1] = truncations[-1] or not terminations[-1]
     all_rows: list[dict[str, Any]] = [first or {}, *steps]
     return EpisodeBuffer(
         seed=first["seed"] if first else None,
-        observations=observations,
+        observations=seen,
         actions=np.array([row["action"] for row in steps], np.int64),
         rewards=np.array([row["reward"] for row in steps], np.float64),
         terminations=np.array(terminations),

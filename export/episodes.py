@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from export.recording_columns import as_number, as_whole, humans_of, players_of, unpack_array
+import numpy as np
+
+from export import observations
+from export.observations import Kind
+from export.recording_columns import as_number, as_whole, humans_of, players_of
 
 
 class Spec(NamedTuple):
@@ -19,19 +21,32 @@ class Spec(NamedTuple):
 
     step: str
     actions: tuple[str, ...]
-    dtype: str  # the type of the observations; "" if there are none
-    shape: tuple[int, ...]  # the shape of an observation
+    kind: Kind | None  # the kind of the observations; None if there are none, or if no space of Minari holds them
+    recorded: bool  # whether observations were recorded
     players: tuple[str, ...] = ()  # all players, if there are several
     human: str = ""  # the player whose steps these are, if there are several
     together: bool = False  # whether the participant played with others, in a session
     start: int = 0  # the environment's own number of action 0
 
 
-def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int]]:
-    """Yield the properties of a converted recording for each human, and the highest number of an action.
+class ObservedTexts:
+    """The texts in a dataset's observations."""
 
-    Only the file's metadata and its first rows are read. In a session, `people` has the participants' numbers by
-    player; a player whose participant was erased is left out.
+    def __init__(self) -> None:
+        self.characters: set[str] = set()
+        self.longest = 0
+
+    def add(self, observation: Any) -> None:
+        """Add the texts of an observation."""
+        for text in observations.texts_in(observation):
+            self.characters.update(text)
+            self.longest = max(self.longest, len(text))
+
+
+def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Iterator[tuple[Spec, int, ObservedTexts]]:
+    """Yield the properties of a converted recording for each human, the highest number of an action, and the texts.
+
+    In a session, `people` has the participants' numbers by player; a player whose participant was erased is left out.
     """
     import pyarrow.parquet as pq
 
@@ -41,30 +56,28 @@ def specs(path: Path, step: str, people: Mapping[str, str | None] | None) -> Ite
         actions = tuple(map(str, names)) if isinstance(names, list) else ()
         players, humans = players_of(header), humans_of(header)
         starts = header.get("actionStart") or {}
-        columns = ["kind", "observationDtype", "observationShape", "other"]
-        batch = next(file.iter_batches(batch_size=256, columns=columns), None)
-        rows = [row for row in batch.to_pylist() if row["kind"] in ("reset", "step")] if batch else []
         if people is None:
             human = humans[0] if humans else ""
-            dtype, shape = _observed(rows, "")
+            kind, recorded, texts = _observed(file, "")
             start = starts.get(human or "player_0", 0)
-            yield Spec(step, actions, dtype, shape, players, human, start=start), _highest(file, "action")
+            yield Spec(step, actions, kind, recorded, players, human, start=start), _highest(file, "action"), texts
             return
         if people and not any(people.values()):
             return  # all participants were erased
         for human in [human for human in humans if people.get(human)] or humans:
             own = header["players"][human].get("actionSpace")
             own_actions = tuple(map(str, own)) if isinstance(own, list) else actions
-            dtype, shape = _observed(rows, "" if human == humans[0] else human)
+            kind, recorded, texts = _observed(file, "" if human == humans[0] else human)
             highest = _highest(file, f"action.{human}")
             start = starts.get(human, 0)
-            yield Spec(step, own_actions, dtype, shape, players, human, together=True, start=start), highest
+            yield Spec(step, own_actions, kind, recorded, players, human, together=True, start=start), highest, texts
 
 
 def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
     """Yield for each episode of a recording its rows of the kinds `reset` and `step`, and why it ended.
 
-    Episodes that end before the first step are left out. The rows of a session have the values of `spec.human`.
+    Episodes that end before the first step are left out. The rows of a session have the values of `spec.human`. `seen`
+    in a row is its observation.
     """
     import pyarrow.parquet as pq
 
@@ -81,6 +94,7 @@ def read(path: Path, spec: Spec) -> Iterator[tuple[list[dict[str, Any]], str]]:
         for batch in file.iter_batches(batch_size=512, columns=columns):
             for line in batch.to_pylist():
                 row = line
+                row["seen"] = _seen(row, "")
                 if row["kind"] == "end" and rows and row["episode"] == rows[0]["episode"]:
                     why = row["why"] or why
                 if row["kind"] not in ("reset", "step"):
@@ -114,27 +128,39 @@ def _as_of(row: Mapping[str, Any], human: str, header: Mapping[str, Any]) -> dic
     action = part.get("action")
     if action is None and isinstance(idle, dict):  # it was not the human's turn: the environment took the idle action
         action = idle.get(human)
-    found = {
+    return {
         "action": as_whole(action),
         "by": part.get("by") or ("none" if row["kind"] == "step" else None),
         "human": as_whole(part.get("human")),
         "reward": as_number(part.get("reward")),
         "info": json.dumps(part["info"]) if "info" in part else None,
-        "observation": None,
-        "observationDtype": None,
-        "observationShape": None,
+        "seen": part.get("observation"),
     }
-    with contextlib.suppress(KeyError, TypeError, ValueError, zlib.error):
-        array = unpack_array(part["observation"])
-        found |= dict(zip(("observation", "observationDtype", "observationShape"), array, strict=True))
-    return found
+
+
+def _seen(row: Mapping[str, Any], player: str) -> Any:
+    """The observation in a row: an array, or as it was recorded. "" is the first human, or the only player."""
+    if player:
+        return _part(row, player).get("observation")
+    if row["observation"] is not None:
+        return np.frombuffer(row["observation"], row["observationDtype"]).reshape(row["observationShape"])
+    return _other(row).get("observation")
 
 
 def _part(row: Mapping[str, Any], player: str) -> dict[str, Any]:
     """The values of one player in a row, which are JSON in `other`."""
-    players = json.loads(row.get("other") or "{}").get("players")
+    players = _other(row).get("players")
     part = players.get(player) if isinstance(players, dict) else None
     return part if isinstance(part, dict) else {}
+
+
+def _other(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a row that have no column."""
+    try:
+        other = json.loads(row.get("other") or "{}")
+    except ValueError:  # the replacement of an id has made it invalid
+        return {}
+    return other if isinstance(other, dict) else {}
 
 
 def _header(file: Any) -> dict[str, Any]:
@@ -158,16 +184,32 @@ def _leaf(file: Any, column: str) -> int:
     return next(n for n in range(file.metadata.num_columns) if file.metadata.schema.column(n).path == column)
 
 
-def _observed(rows: list[dict[str, Any]], player: str) -> tuple[str, tuple[int, ...]]:
-    """The dtype and shape of the first observation: in the columns, or of another `player` than the first human."""
-    for row in rows:
-        if not player and row["observationDtype"] is not None:
-            return row["observationDtype"], tuple(row["observationShape"])
-        observation = _part(row, player).get("observation") if player else None
-        if isinstance(observation, dict):
-            try:
-                _, dtype, shape = unpack_array(observation)
-            except (KeyError, TypeError, ValueError, zlib.error):
+def _observed(file: Any, player: str) -> tuple[Kind | None, bool, ObservedTexts]:
+    """The kind of the observations in a recording, whether it has any, and their texts.
+
+    The kind is that of the first episode, and holds the observations of the others as far as it can. `player` is "", or
+    another player than the first human.
+    """
+    columns = ["kind", "episode", "observationDtype", "observationShape", "other"]
+    texts, kind, first = ObservedTexts(), None, None
+    for batch in file.iter_batches(batch_size=512, columns=columns):
+        for row in batch.to_pylist():
+            if row["kind"] not in ("reset", "step"):
                 continue
-            return dtype, tuple(shape)
-    return "", ()
+            is_array = not player and row["observationDtype"] is not None
+            seen = None if is_array else _seen(row | {"observation": None}, player)
+            if seen is None and not is_array:
+                continue
+            try:
+                found = (
+                    observations.array_kind(row["observationDtype"], row["observationShape"])
+                    if is_array
+                    else observations.kind_of(seen)
+                )
+                kind = found if kind is None else observations.common(kind, found)
+            except observations.Unlike:
+                if kind is None or first in (None, row["episode"]):
+                    return None, True, texts
+            first = row["episode"] if first is None else first
+            texts.add(seen)
+    return kind, kind is not None, texts

@@ -20,7 +20,7 @@ import msgspec
 
 from console import screen
 from console.problem import Problem
-from export import datasets, fetch, keys, listing, manifest, table_files, tables
+from export import fetch, keys, listing, manifest, table_files, tables
 from export.answers import StudyAnswers
 from export.fetch import Fetcher
 from export.listing import Tally, Wanted
@@ -31,6 +31,7 @@ from hippodrome.model.project import MASTER_LIST, Project, read_list
 
 PRIVATE = "private"
 _STATE = f"{PRIVATE}/state.sqlite"
+_DATASETS = 2  # the version of what datasets hold: those of an earlier version are made again
 _MAX_MASTER_LIST = 64 * 1024 * 1024  # bytes
 
 
@@ -197,7 +198,7 @@ def _run(
             path.chmod(0o600)
             private.append(manifest.entry(folder, path))
         progress(1, 1)
-    datasets = _datasets(folder, state, project_id, options)
+    made = _datasets(folder, state, project_id, options)
     _remove_stale(folder, written)
 
     counts = state.counts() | {"finished": finished, "problems": sum(1 for _ in state.problems())}
@@ -211,7 +212,7 @@ def _run(
         "counts": counts,
         "columns": [column.name for column in columns],
         "moved": [moved._asdict() for moved in answers.moved],
-        "minari": datasets,
+        "minari": made,
     }
     made_now = [*(manifest.entry(folder, path) for path in written), *_tree(folder, "minari")]
     manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.raw_files()])
@@ -222,13 +223,15 @@ def _run(
 def _datasets(folder: Path, state: ExportState, project_id: str, options: Options) -> list[dict[str, Any]]:
     """Make the Minari datasets if the options ask for them, and return their summaries. Datasets that no longer fit
     the recordings are removed."""
-    now, before = state.recordings_fingerprint(), state.fact("minari")
+    now, before = f"{_DATASETS} {state.recordings_fingerprint()}", state.fact("minari")
     if "minari" not in options.formats and before != now:
         shutil.rmtree(folder / "minari", ignore_errors=True)
         state.set_fact("minari", "")
     if "minari" not in options.formats or (before == now and _sound_minari(folder)):
         made: list[dict[str, Any]] = msgspec.json.decode(state.fact("datasets") or "[]")
         return made if state.fact("minari") == now else []
+    from export import datasets  # noqa: PLC0415 - imports numpy, which `--format csv` does without
+
     state.set_fact("minari", "")
     with _bar("Writing Minari datasets") as progress:
         made = datasets.build(folder, state, project_id, progress)

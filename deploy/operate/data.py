@@ -244,9 +244,14 @@ def _tell(made: dict[str, Any], target: Path) -> None:
     for dataset in made["minari"]:
         for why, count in dataset["leftOut"].items():
             screen.warning(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
-        if not dataset["observations"]:
+        if not dataset["observations"] and dataset["observationsRecorded"]:
+            screen.warning(
+                f"{dataset['id']}: observations were recorded, but Minari has no space for them: steps' numbers stand "
+                "in their place. The recordings' Parquet files have them, in the column `other`."
+            )
+        elif not dataset["observations"]:
             screen.warning(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
-    if not all(dataset["observations"] for dataset in made["minari"]):
+    if not all(dataset["observationsRecorded"] for dataset in made["minari"]):
         screen.info(
             "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
         )

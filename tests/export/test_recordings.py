@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import json
 import re
@@ -313,6 +314,72 @@ def test_observations_of_other_types(tmp_path: Path, monkeypatch: Any, dtype: st
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=lambda n: np.full((), n % 2, dtype))
     episode = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)[0]
     assert episode.observations.tolist() == [0, 1, 0, 1, 0, 1]
+
+
+def as_minari(observations: Any) -> Any:
+    """Return observations of Minari as plain values."""
+    if isinstance(observations, dict):
+        return {key: as_minari(part) for key, part in observations.items()}
+    if isinstance(observations, tuple):
+        return tuple(map(as_minari, observations))
+    return observations if isinstance(observations, list) else observations.tolist()
+
+
+@pytest.mark.parametrize(
+    ("look", "held", "space"),
+    [
+        (lambda n: n, list(range(6)), "Box(-9223372036854775808, 9223372036854775807, (), int64)"),
+        (lambda n: (12, n), [[12, n] for n in range(6)], "Box(-9223372036854775808, 9223372036854775807, (2,), int64)"),
+        (lambda n: [n / 2 if n else 0, 1], [[n / 2, 1] for n in range(6)], "Box(-inf, inf, (2,), float64)"),
+        (lambda n: np.full(2, n, ">f4"), [[n, n] for n in range(6)], "Box(-inf, inf, (2,), float32)"),
+        (lambda n: "grün"[:n], ["grün"[:n] for n in range(6)], "Text(0, 4, charset=gnrü)"),
+        (
+            lambda n: {"image": np.full((1, 2), n, np.uint8), "mission": "go", "at": (n, "b")},
+            {
+                "image": [[[n, n]] for n in range(6)],
+                "mission": ["go"] * 6,
+                "at": (list(range(6)), ["b"] * 6),
+            },
+            "Dict('at': Tuple(Box(-9223372036854775808, 9223372036854775807, (), int64), Text(0, 2, charset=bgo)), "
+            "'image': Box(0, 255, (1, 2), uint8), 'mission': Text(0, 2, charset=bgo))",
+        ),
+    ],
+)
+def test_observations_of_other_spaces_are_in_datasets(
+    tmp_path: Path, monkeypatch: Any, look: Any, held: Any, space: str
+) -> None:
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=look)
+    dataset = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)
+    assert as_minari(dataset[0].observations) == held
+    assert str(dataset.observation_space) == space
+
+
+def test_nan_in_a_list_of_numbers_is_nan_in_a_dataset(tmp_path: Path, monkeypatch: Any) -> None:
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=lambda n: [n, float("nan")])
+    episode = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)[0]
+    assert np.array_equal(episode.observations, [[n, np.nan] for n in range(6)], equal_nan=True)
+
+
+@pytest.mark.parametrize("look", [lambda n: [1] * n, lambda n: {"a/b": n}, lambda n: [n] if n % 2 else {"a": n}])
+def test_if_minari_has_no_space_the_run_and_the_dataset_say_that_observations_were_recorded(
+    tmp_path: Path, monkeypatch: Any, capsys: Any, look: Any
+) -> None:
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=look)
+    out = tmp_path / "out"
+    assert main(["data", str(out), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
+    dataset, told = load(out, "maze-3-v0", monkeypatch), capsys.readouterr().err
+    assert "maze-3-v0: observations were recorded, but Minari has no space for them: steps' numbers stand" in told
+    assert "recordObservations" not in told
+    assert dataset[0].observations.tolist() == [[0], [1], [2], [3], [4], [5]]
+    assert "The observations were recorded, but Minari has no space" in dataset.storage.metadata["description"]
+    rows = pyarrow.dataset.dataset(tmp_path / "out/recordings").to_table(columns=["kind", "other"]).to_pylist()
+    assert next(json.loads(row["other"])["observation"] for row in rows if row["kind"] == "step") == look(1)
+
+
+def test_an_array_of_another_byte_order_that_was_recorded_by_an_earlier_version_is_read() -> None:
+    data = np.arange(3, dtype=">f4")
+    packed = {"dtype": ">f4", "shape": [3], "zlib": base64.b64encode(zlib.compress(data.tobytes())).decode()}
+    assert recording_columns.unpack_array(packed) == (np.arange(3, dtype=np.float32).tobytes(), "float32", [3])
 
 
 def test_without_observations_a_dataset_holds_step_numbers_and_the_run_says_so(
