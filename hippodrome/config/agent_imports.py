@@ -172,6 +172,35 @@ def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]
     return hippo_requirements.adapt(text, file.relative_to(folder).as_posix(), present)
 
 
+def hidden_files(folder: Path) -> list[Diagnostic]:
+    """Return a mistake for each file beside agent.py that an import means and does not get.
+
+    The folder of agent.py is the last place where Python looks, so another module of the same name comes first: one of
+    Python, of Hippodrome, or of an installed package. Only the first import of each file is named.
+    """
+    code, found = layout.agent_folder(folder).resolve(), dict[str, Diagnostic]()
+    if code == _ROOT:  # the first example: Hippodrome's packages lie beside it
+        return []
+    for (file, line, module), own_files in _imports_and_files(folder, _all):
+        name = module.partition(".")[0]
+        whose = _also_has(name) if own_files else ""
+        if whose:
+            shown = name if (code / name).is_dir() else f"{name}.py"
+            message = f"import {name} finds a module of {whose}, and not {shown} beside {AGENT}; rename {shown}"
+            found.setdefault(name, Diagnostic(file, line, "", message))
+    return list(found.values())
+
+
+def _also_has(name: str) -> str:
+    """Who else has a module of this name; "" if nobody."""
+    if name in sys.stdlib_module_names:
+        return "Python"
+    if (_ROOT / name / "__init__.py").is_file():
+        return "Hippodrome"
+    distributions = sorted(set(_distributions().get(name, ())))
+    return f"the installed package {printable(distributions[0], 100)}" if distributions else ""
+
+
 def requirement_remarks(folder: Path) -> list[Diagnostic]:
     """Return remarks on the lines of the project's requirements.txt that are left out."""
     return project_requirements(folder, _text(layout.requirements_file(folder)))[1]
@@ -249,6 +278,13 @@ def _imports(folder: Path, chosen: ImportFilter | None = None) -> Iterator[Impor
 
     By default these are the imports that must succeed (`_needed`). Imports of the project's own files are left out.
     """
+    for found, own_files in _imports_and_files(folder, chosen or _needed):
+        if not own_files:
+            yield found
+
+
+def _imports_and_files(folder: Path, chosen: ImportFilter) -> Iterator[tuple[Import, set[Path]]]:
+    """The imports as in `_imports`, each with the project's own files that it names."""
     top, folder = folder.resolve(), layout.agent_folder(folder).resolve()
     waiting, seen = [folder / AGENT], set()
     while waiting:
@@ -256,11 +292,11 @@ def _imports(folder: Path, chosen: ImportFilter | None = None) -> Iterator[Impor
         if path in seen:
             continue
         seen.add(path)
-        for line, modules in _read(path, folder, chosen or _needed):
+        for line, modules in _read(path, folder, chosen):
             own_files = {file for module in modules for file in _beside(folder, module)}
             waiting += sorted(own_files)
-            if not own_files and modules:
-                yield Import(path.relative_to(top).as_posix(), line, modules[0])
+            if modules:
+                yield Import(path.relative_to(top).as_posix(), line, modules[0]), own_files
 
 
 def _read(path: Path, folder: Path, chosen: ImportFilter) -> list[tuple[int, list[str]]]:

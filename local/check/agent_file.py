@@ -10,8 +10,11 @@ from hippodrome.config import Config, Diagnostic, layout
 from hippodrome.config.layout import AGENT
 from hippodrome.model.matching import MATCH
 from local.check.wording import short
-from protocol.similar import did_you_mean
+from protocol.similar import SIMILAR, did_you_mean
 from trial.agent.callback_names import NAMES
+
+_METHODS = ("start", "step", "render", "reset", "close", "feedback", "to_act")
+_SIMILAR_METHODS = 0.8  # as similar as `rest` and `reset`: a class may have methods for itself
 
 
 def label_of(folder: Path) -> str | None:
@@ -52,7 +55,8 @@ def never_called(folder: Path, config: Config) -> list[Diagnostic]:
     used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)}
     classes = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
     methods = [method for each in classes for method in _unused_functions(each.body, used)]
-    found = [(method.lineno, _nearly_a_callback(method.name)) for method in methods]
+    members = {part.name for each in classes for part in each.body if isinstance(part, ast.FunctionDef)}
+    found = [(method.lineno, _nearly_called(method.name, members)) for method in methods]
     if config.project.has_sessions and config.project.matching != MATCH:
         sentence = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
         found += [(each.lineno, sentence) for each in _unused_functions(tree.body, used) if each.name == MATCH]
@@ -64,12 +68,14 @@ def _unused_functions(body: list[ast.stmt], used: set[str]) -> list[ast.Function
     return [part for part in body if isinstance(part, ast.FunctionDef) and part.name not in used]
 
 
-def _nearly_a_callback(name: str) -> str:
-    """The remark on a method whose name is similar to a callback's; otherwise empty."""
-    if name in NAMES or not name.startswith("on_"):
+def _nearly_called(name: str, members: set[str]) -> str:
+    """The remark on a method whose name is similar to one that is called, and that the class lacks; otherwise empty."""
+    if name in (*NAMES, *_METHODS) or name.startswith("__"):
         return ""
-    hint = did_you_mean(name, NAMES)
-    return f"{name} is no callback, so it is never called{hint}" if hint else ""
+    callback = name.startswith("on_")
+    known = NAMES if callback else tuple(set(_METHODS) - members)
+    hint = did_you_mean(name, known, SIMILAR if callback else _SIMILAR_METHODS)
+    return f"{name} is never called by Hippodrome{hint}" if hint else ""
 
 
 def line_of(path: Path, method: str) -> int | None:

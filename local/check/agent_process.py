@@ -91,7 +91,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     question = json.loads(os.environ.pop("MATCH", "null"))
     if question and not progress.call("match", lambda: _match(adapter, question, progress)):
         return
-    progress.known = _actions(player, config)
+    progress.known = {**_actions(player, config), "hears": adapter.hears}
     if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
         return
     players = progress.result
@@ -169,7 +169,10 @@ def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[
 
 
 def _note_idle(
-    joint: JointAdapter | OnePlayer, players: Sequence[Player], config: TrialSection, progress: AgentProgress
+    joint: JointAdapter | OnePlayer,
+    players: Sequence[Player],
+    config: TrialSection,
+    progress: AgentProgress,
 ) -> None:
     """Note which action the game takes without a key, and after how many steps this ends an episode, if it does soon.
 

@@ -24,6 +24,7 @@ from protocol import environment as variables
 from protocol.players import HUMAN
 from protocol.values import KeyPath, printable
 from trial.agent import environments
+from trial.core.messages import FEEDBACK
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
@@ -78,6 +79,7 @@ class AgentReport:
             *self._endless(),
             *self._idle(),
             *self._turns(),
+            *self._unheard(),
             *self._nobody_matched(),
             *self._not_on_aws(),
         ]
@@ -246,6 +248,17 @@ class AgentReport:
             seconds = f"{steps / config.trial.starting_frame_rate:.2g} s"
             found.append(Remark(("trial", "pace"), f"{message} ({seconds}); write pace: turns, unless that is meant"))
         return [self._in_config(*each, remark=True) for each in found]
+
+    def _unheard(self) -> list[Diagnostic]:
+        """A remark on controls of feedback that reach no method of the agent, for the first group only."""
+        ui, source = self._config.trial.ui, read_source(self._folder)
+        words = [
+            word for word in ui.shown() if (word in FEEDBACK or word in ui.own) and source.names((*remarks.UI, word))
+        ]
+        if not words or self._group or self._label is None or self._report.get("hears", True):
+            return []
+        message = f"class Agent has no feedback(word), so what participants say ({words[0]}) is only recorded"
+        return [self._in_config((*remarks.UI, words[0]), message, remark=True)]
 
     def _turns(self) -> list[Diagnostic]:
         """A remark on players who take turns in real time, for the first group only."""

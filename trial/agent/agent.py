@@ -17,6 +17,7 @@ import numpy as np
 
 from protocol.similar import nearest
 from trial.agent import callbacks, environments, signatures
+from trial.agent.callback_names import FEEDBACK
 from trial.agent.hippo_config import hippo_config
 from trial.agent.signatures import Signature, UnfitSignature
 from trial.core.players import PLAYER
@@ -258,6 +259,12 @@ class AgentAdapter:
     def renders_by_player(self) -> bool:
         """Whether `render` takes a player, and draws that player's view."""
         return signatures.PLAYER in self._signatures["render"].order
+
+    @property
+    def hears(self) -> bool:
+        """Whether a word of feedback reaches the agent: by `feedback`, `on_feedback`, or an argument of `step`."""
+        method = getattr(self._agent, "feedback", None)
+        return callable(method) or FEEDBACK in self.callbacks or signatures.WORD in self._signatures["step"].order
 
     def _call(self, method: str, *, action: Any = None, seed: int | None = None, player: Any = PLAYER) -> Any:
         """Call a method of the agent with the arguments that its signature names.

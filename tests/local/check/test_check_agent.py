@@ -191,7 +191,7 @@ def test_a_method_that_is_nearly_a_callback_is_remarked_on(folder: Path) -> None
     agent(folder, "    def close", "    def on_episode_over(self, session):\n        pass\n\n    def close")
     (line,) = looked(folder)
     assert re.fullmatch(
-        r"agent\.py:\d+: remark: on_episode_over is no callback, so it is never called; did you mean on_episode_end\?",
+        r"agent\.py:\d+: remark: on_episode_over is never called by Hippodrome; did you mean on_episode_end\?",
         line,
     )
     agent(
@@ -628,3 +628,46 @@ def test_an_agent_with_a_syntax_error_is_refused(folder: Path, source: bytes) ->
     (line,) = looked(folder)
     assert line.startswith("agent.py")
     assert "Python cannot read this" in line
+
+
+@pytest.mark.parametrize(
+    ("method", "near"),
+    [("feedbak(self, word)", "feedback"), ("rest(self, seed=None)", "reset"), ("rest(self)", None)],
+)
+def test_a_method_that_is_nearly_an_optional_one_is_remarked(folder: Path, method: str, near: str | None) -> None:
+    if near == "reset":
+        agent(folder, "def reset(self", "def begin(self")
+    agent(folder, "class Agent:", f"class Agent:\n    def {method}: pass\n")
+    found = [line for line in looked(folder) if "never called" in line]
+    assert [line.rpartition("did you mean ")[2] for line in found] == ([f"{near}?"] if near else found)
+
+
+@pytest.mark.parametrize("control", ["good", "trainOnline", "wave"])
+def test_words_that_reach_no_method_of_the_agent_are_remarked(folder: Path, control: str) -> None:
+    config(folder, "left: true", f"left: true, {control}: true")
+    (line,) = tried(folder)
+    assert line.endswith(
+        f"remark: trial.ui.{control}: class Agent has no feedback(word), so what participants say ({control}) is only recorded"
+    )
+    agent(folder, "class Agent:", "class Agent:\n    def on_feedback(self, session, record): pass\n")
+    assert tried(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "whose"),
+    [
+        ("console.py", "Hippodrome"), ("protocol.py", "Hippodrome"), ("export/__init__.py", "Hippodrome"),
+        ("local/maze.py", "Hippodrome"), ("random.py", "Python"), ("yaml.py", "the installed package PyYAML"),
+        ("maze.py", None),
+    ],
+)  # fmt: skip
+def test_a_file_that_an_import_does_not_get_is_named(folder: Path, file: str, whose: str | None) -> None:
+    name, _, inner = file.removesuffix(".py").partition("/")
+    (folder / file).parent.mkdir(exist_ok=True)
+    (folder / file).touch()
+    assert looked(folder) == [], "it is not imported"
+    agent(folder, "class Agent:", f"import {name}{'.maze' if inner == 'maze' else ''}\n\nclass Agent:")
+    found = [line.partition(": ")[2] for line in looked(folder)]
+    shown = name if inner else file
+    message = f"import {name} finds a module of {whose}, and not {shown} beside agent.py; rename {shown}"
+    assert found == ([message] if whose else [])
