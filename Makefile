@@ -10,7 +10,7 @@ PROJECT ?= .
 PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
 USER_ID ?=
-DATA_GIVEN = $(strip $(DATA))# an empty DATA= counts as none
+DATA_GIVEN = $(strip $(DATA))# DATA may be empty in the environment
 TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# TLS=1 and NAMES= count only on the command line
 NAMES_GIVEN = $(if $(filter command,$(origin NAMES)),$(NAMES))
 WITH_TLS = $(if $(TLS_GIVEN),--tls) $(if $(NAMES_GIVEN),--names "$(NAMES)")
@@ -33,6 +33,20 @@ AUDIT := .venv-audit
 KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
+
+# PROJECT=$STUDY with nothing in STUDY would be the example, and DATA= another folder than was meant.
+$(foreach name,PROJECT DATA USER_ID TEMPLATE PORT BOTS STACK DOMAIN EMAIL,$(if $(filter command,$(origin $(name))),$(if $(strip $($(name))),,\
+	$(error $(name)= has no value, and nothing was run: write one, or leave $(name)= out))))
+NUMBERS := PORT BOTS WORKERS TIMES SEED WITHIN SAMPLE JOBS
+DIGITS := 0 1 2 3 4 5 6 7 8 9
+without = $(if $(2),$(call without,$(subst $(firstword $(2)),,$(1)),$(wordlist 2,10,$(2))),$(1))# the text $(1) without the characters $(2)
+$(foreach name,$(NUMBERS),$(if $(call without,$($(name)),$(DIGITS)),\
+	$(error $(name)=$($(name)) is not a whole number, and nothing was run)))
+$(if $(filter 0,$(BOTS)),$(error BOTS=0 sends nobody, and nothing was run; write BOTS=1 or more))
+# make itself would run the other commands first: `make check ../my-study` would check the example.
+COMMANDS := $(if $(MAKECMDGOALS),$(shell sed -nE 's/^([a-z-]+):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST))))
+$(foreach goal,$(filter-out $(COMMANDS) $(VENV)/% $(MINISTACK)/% $(AUDIT)/%,$(MAKECMDGOALS)),\
+	$(error There is no command $(goal) here, and nothing was run; `make help` lists the commands. The folder of a study is given by PROJECT=$(goal)))
 
 .PHONY: help
 help: ## list these commands

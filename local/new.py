@@ -177,7 +177,7 @@ def main(
     if template not in known:
         problem = f"There is no template {template}." if template else f"Name a template: {usage}"
         sys.stdout.write(f"{problem}\n{listing(known)}\n")
-        raise typer.Exit(1)
+        raise typer.Exit(1 if template or folder else 0)
     if folder in ("", "."):
         sys.stdout.write(f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={template}\n")
         raise typer.Exit(1)

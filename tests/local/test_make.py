@@ -47,20 +47,53 @@ def test_variables_that_are_not_given_are_not_passed_on() -> None:
     assert "--from" not in make("data", "PROJECT=../a")
 
 
-@pytest.mark.parametrize("empty", ["DATA=", "DATA= ", "PORT=", "PROJECT="])
-def test_an_empty_variable_counts_as_not_given(empty: str) -> None:
+def test_a_variable_that_is_empty_in_the_environment_counts_as_not_given() -> None:
     """Otherwise the data would be in the current folder, or below the root."""
-    assert re.search(r'-m local "\.?" --data "\./data" --port 8000 ', make("run", empty))
-    assert "--data" not in make("try", empty)
-    assert "--from" not in make("data", empty)
+    for name in ("DATA", "PORT", "PROJECT"):
+        assert re.search(r'-m local "\.?" --data "\./data" --port 8000 ', make("run", **{name: ""}))
+    assert "--data" not in make("try", DATA="")
+    assert "--from" not in make("data", DATA="")
+
+
+def refused(*arguments: str) -> str:
+    """Run `make -n`, which must run nothing. Return what it says."""
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        make(*arguments)
+    assert failed.value.stdout == ""
+    return str(failed.value.stderr)
+
+
+@pytest.mark.parametrize("folder", ["../trust", "/studies/trust", "trust", "tests"])
+def test_a_folder_without_project_is_refused(folder: str) -> None:
+    """Else `make check ../trust` would find no mistakes in the example, and `make run ../trust` serve it."""
+    for command in ("check", "run"):
+        assert f"The folder of a study is given by PROJECT={folder}" in refused(command, folder)
+
+
+@pytest.mark.parametrize("name", ["PROJECT", "DATA", "USER_ID", "PORT", "BOTS", "STACK"])
+def test_a_variable_without_a_value_is_refused(name: str) -> None:
+    """Else `make erase DATA=$FOLDER` would look in another folder if FOLDER is not set."""
+    assert f"{name}= has no value, and nothing was run" in refused("data", f"{name}=")
+    assert f"{name}= has no value" in refused("data", f"{name}= ")
+
+
+@pytest.mark.parametrize(
+    "given", ["PORT=abc", "PORT=80 81", "PORT=8000x", "BOTS=abc", "BOTS=-3", "BOTS=2.5", "TIMES=ten"]
+)
+def test_a_number_that_is_none_is_refused(given: str) -> None:
+    assert f"{given} is not a whole number, and nothing was run" in refused("run", given)
+    assert "BOTS=0 sends nobody" in refused("try", "BOTS=0")
+
+
+def test_an_erasure_names_the_participant_after_all_options() -> None:
+    """An id may begin with a dash."""
+    erase = make("erase", "USER_ID=-a1", "PROJECT=../a", "DATA=/x", "ARGS=--yes").strip().splitlines()[-1]
+    assert re.search(r'-m deploy erase --project "\.\./a/" --from "/x" --yes -- "-a1"', erase)
 
 
 def test_an_unknown_variable_is_refused() -> None:
     """Nothing is run: else `make deploy PROJCT=../a` would put another study on AWS, and EMIAL= send alarms to nobody."""
-    with pytest.raises(subprocess.CalledProcessError) as refused:
-        make("run", "PROJCT=../a")
-    assert "There is no variable PROJCT here" in refused.value.stderr
-    assert not refused.value.stdout
+    assert "There is no variable PROJCT here" in refused("run", "PROJCT=../a")
     assert "There is no variable" not in make("run", "PROJECT=../a", "PYTHON=python3", "ARGS=--fresh")
     assert "There is no variable" not in make("hunt", "SEED=3", "TIMES=2", "WORKERS=1")
 
