@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import yaml
 
+from hippodrome.config import typography
 from hippodrome.config.diagnostics import Mistake
 from protocol.values import KeyPath, Plain, printable
 
@@ -107,7 +108,7 @@ def _compose(text: str) -> yaml.Node | None:
         line = text[: int(error.position)].count("\n") + 1
         raise UnreadableConfig("an invisible control character that YAML does not allow; delete it", line) from None
     except yaml.MarkedYAMLError as error:
-        raise _syntax(error, text) from None
+        raise _of_typography(error, text.splitlines()) or _syntax(error, text) from None
     except yaml.YAMLError:
         raise UnreadableConfig("the file is not valid YAML") from None
     except RecursionError:
@@ -117,7 +118,11 @@ def _compose(text: str) -> yaml.Node | None:
 
 
 def _check_text(root: yaml.Node | None) -> None:
-    """Raise UnreadableConfig for an escape such as "\\ud83d", half of a surrogate pair, which UTF-8 cannot hold."""
+    """Raise UnreadableConfig for a text that YAML reads and nobody can mean.
+
+    It is an escape such as "\\ud83d", half of a surrogate pair, which UTF-8 cannot hold; or a character of Word or
+    Slack that only looks like one of YAML's (`typography.py`).
+    """
     seen: set[int] = set()  # aliases stand for the same node
     nodes = [root] if root else []
     while nodes:
@@ -128,10 +133,34 @@ def _check_text(root: yaml.Node | None) -> None:
         if isinstance(node, yaml.ScalarNode) and _SURROGATE.search(node.value):
             message = "an escape of half a character; write the character itself instead, such as 😀"
             raise UnreadableConfig(message, node.start_mark.line + 1)
+        if isinstance(node, yaml.ScalarNode) and node.style is None and (message := typography.in_value(node.value)):
+            raise UnreadableConfig(message, node.start_mark.line + 1)
         if isinstance(node, yaml.SequenceNode):
-            nodes += node.value
+            nodes += reversed(node.value)
         elif isinstance(node, yaml.MappingNode):
-            nodes += [part for pair in node.value for part in pair]
+            for key, value in reversed(node.value):
+                nodes += [value, key]
+                _check_pair(key, value)
+
+
+def _check_pair(key: yaml.Node, value: yaml.Node) -> None:
+    if isinstance(key, yaml.ScalarNode) and key.style is None and (message := typography.in_key(key.value)):
+        raise UnreadableConfig(message, key.start_mark.line + 1)
+    below = value.start_mark.line > key.start_mark.line
+    if isinstance(value, yaml.ScalarNode) and value.style is None and below:
+        message = typography.below_key(value.value)
+        if message:
+            raise UnreadableConfig(message, value.start_mark.line + 1)
+
+
+def _of_typography(error: yaml.MarkedYAMLError, lines: list[str]) -> UnreadableConfig | None:
+    """The error for a character that only looks like one of YAML's, in one of the two lines before PyYAML's error."""
+    for mark in (error.problem_mark, error.context_mark):
+        at = mark.line if mark else 0
+        for near in range(at, max(at - 3, -1), -1):
+            if near < len(lines) and (message := typography.in_line(lines[near])):
+                return UnreadableConfig(message, near + 1)
+    return None
 
 
 def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:

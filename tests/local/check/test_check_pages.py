@@ -454,6 +454,12 @@ def of_codes(folder: Path, name: str = "end") -> list[str]:
 
 
 @pytest.fixture
+def on_aws(folder: Path) -> Path:
+    config(folder, "  maxRuntime: 5", "  maxRuntime: 5\n  useAWS: true\n  awsSetup: {cpu: 1, memory: 2}")
+    return folder
+
+
+@pytest.fixture
 def no_code(folder: Path) -> Path:
     page(folder, "<h1>end</h1>", "end")
     return folder
