@@ -114,9 +114,21 @@ def short(text: str, most: int) -> str:
 
 
 def reason(text: str) -> str:
-    """Cut the text to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5)."""
-    encoded = text.encode("utf-8", "replace")
-    return text if len(encoded) <= 123 else encoded[:120].decode("utf-8", "ignore") + "…"
+    """Shorten the text to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5).
+
+    Whole words are left out in the middle: the end of an error often says what to do.
+    """
+    if len(text.encode("utf-8", "replace")) <= 123:
+        return text
+    start = _first_words(text, 80)
+    rest = 123 - len(f"{start} … ".encode())
+    return f"{start} … {_first_words(text[::-1], rest)[::-1]}"
+
+
+def _first_words(text: str, most: int) -> str:
+    """Return the words that fit into so many bytes; if not even one does, its beginning."""
+    fitting = text.encode("utf-8", "replace")[:most].decode("utf-8", "ignore")
+    return fitting if text[len(fitting) :].startswith(" ") else fitting.rpartition(" ")[0] or fitting
 
 
 def unusable(error: OSError | UnicodeError) -> str:

@@ -39,6 +39,11 @@ def present(env_id: str) -> tuple[str, dict[str, Any]]:
     return _newest(env_id, list(gymnasium.registry)), {}
 
 
+def has_version(env_id: str) -> bool:
+    """Whether the id ends in a version, which every id of gym 0.17 does."""
+    return _ID.fullmatch(env_id) is not None
+
+
 def _newest(env_id: str, known: list[str]) -> str:
     """Return the newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
     given = _ID.fullmatch(env_id)

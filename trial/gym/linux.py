@@ -66,13 +66,16 @@ def runs(pid: int) -> bool:
     return False
 
 
-def private_megabytes(pid: int) -> float:
-    """Return the resident memory of a process without its shared pages (/proc/PID/statm); 0 if it has ended."""
+def used_megabytes(pid: int) -> float:
+    """Return the resident memory of a process without pages of files; 0 if it has ended.
+
+    RssAnon is its own memory, RssShmem memory that it shares with others (/proc/PID/status, proc(5)).
+    """
     try:
-        _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()
-    except (OSError, ValueError):
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
         return 0.0
-    return (int(resident) - int(shared)) * resource.getpagesize() / 2**20
+    return sum(int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "RssShmem:"))) / 2**10
 
 
 def _private_bytes() -> int:

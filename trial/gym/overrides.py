@@ -53,6 +53,7 @@ def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
     try:
         return gymnasium.make(now, **(more | options))
     except gymnasium.error.UnregisteredEnv as error:
-        raise EnvironmentNotFound(env_id, described(error)) from error
+        failed = EnvironmentNotFound if ids.has_version(env_id) else EnvironmentMalformed  # as in gym 0.17
+        raise failed(env_id, described(error)) from error
     except Exception as error:
         raise EnvironmentMalformed(env_id, described(error)) from error

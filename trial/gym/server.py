@@ -32,6 +32,7 @@ from trial.gym.wakeup import Wakeup
 
 PATH = "/gym"
 _HANDSHAKE_SECONDS = 10.0
+_SILENT_SECONDS = 60.0  # after the handshake, the time that a client has for its first request
 _HANDSHAKE_BYTES = 16 * 1024  # the most bytes of a handshake
 _CLOSE_SECONDS = 2.0  # the time that a client has to close its end
 _NO_FILES_SECONDS = 0.05  # the pause if no file can be opened
@@ -60,7 +61,7 @@ class ListeningSocket(Protocol):
 class _Connection:
     socket: socket.socket
     deadline: float | None
-    """The time when it is dropped, unless its handshake or the client's close has come before; None: no limit."""
+    """The time when it is dropped, unless its handshake, first request or close has come before; None: no limit."""
     received: bytes = b""
     form: str = ""
     """The name of the form of its messages; empty until the handshake is done."""
@@ -78,6 +79,7 @@ class GymServer:
         self._listener = listener
         self._control = control
         self._limits = limits
+        self._silent_seconds = min(_SILENT_SECONDS, limits.idle_seconds or _SILENT_SECONDS)
         self._origins = frozenset(origins)
         self._selector = selectors.DefaultSelector()
         self._connections: set[_Connection] = set()
@@ -109,7 +111,10 @@ class GymServer:
             if now - checked >= 0.5:
                 checked = now
                 for connection in [one for one in self._timed() if (one.deadline or now) < now]:
-                    self._drop(connection)
+                    if connection.form and not connection.closing:
+                        self._send_close(connection, 1001, f"There was no request for {self._silent_seconds:g} s.")
+                    else:
+                        self._drop(connection)
 
     def close(self) -> None:
         """Tell all clients that the server ends, and close their connections."""
@@ -181,7 +186,7 @@ class GymServer:
         if response.status_code != http.HTTPStatus.SWITCHING_PROTOCOLS:
             self._close_soon(connection)
             return
-        connection.deadline = None
+        connection.deadline = time.monotonic() + self._silent_seconds
         connection.form = (ARRAYS if protocol.subprotocol == SUBPROTOCOL else form or GYMIE).name
         if connection.socket.family != socket.AF_UNIX:
             connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -228,6 +233,7 @@ class GymServer:
 
     def _hand_over(self, connection: _Connection) -> None:
         self._selector.unregister(connection.socket)
+        connection.deadline = None
         self._last_number += 1
         connection.number = self._last_number
         self._with_worker[connection.number] = connection

@@ -72,7 +72,7 @@ class Spawner:
         linux.become_subreaper()
         gc.collect()
         gc.freeze()  # so that the collector does not write to pages that workers share
-        self._own_megabytes = linux.private_megabytes(os.getpid())
+        self._own_megabytes = linux.used_megabytes(os.getpid())
         try:
             while self._once(wakeup):
                 pass
@@ -201,7 +201,7 @@ class Spawner:
             sentence = f"The environments started more than {limits.processes} processes; all were ended."
             _kill_worker(pid, worker, _FAILED, sentence)
             return
-        used = sum(linux.private_megabytes(one) - self._own_megabytes for one in (pid, *started))
+        used = sum(linux.used_megabytes(one) - self._own_megabytes for one in (pid, *started))
         if used > limits.megabytes:
             sentence = f"The environments used more than {limits.megabytes} MB; their process was ended."
             _kill_worker(pid, worker, _FAILED, sentence)

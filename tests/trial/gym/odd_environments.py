@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import mmap
 import os
 import subprocess
 import sys
@@ -117,6 +118,15 @@ class Greedy(Calm):
         np.ones(400 * 2**20 // 8)
 
 
+class GreedyShared(Calm):
+    """Writes into shared memory, which its own limit does not count."""
+
+    def misbehave(self) -> None:
+        self.kept = mmap.mmap(-1, 400 * 2**20)
+        for _ in range(400):
+            self.kept.write(bytes(2**20))
+
+
 class GreedyTogether(Calm):
     """Each of its processes stays below the limit, and all together exceed it."""
 
@@ -134,7 +144,8 @@ class Lacking(Calm):
 
     def __init__(self, **_: Any) -> None:
         raise gymnasium.error.DependencyNotInstalled(
-            "Box2D is not installed, you can install it by run `pip install swig`"
+            "Box2D is not installed, you can install it by run `pip install swig` followed by "
+            '`pip install "gymnasium[box2d]"`'
         )
 
 

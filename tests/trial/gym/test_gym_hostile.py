@@ -221,8 +221,9 @@ def test_too_many_processes_of_an_environment_are_ended(asking: TextClient) -> N
     assert reason == "The environments started more than 4 processes; all were ended."
 
 
-def test_processes_that_use_too_much_memory_together_are_ended(asking: TextClient) -> None:
-    reason = step_until_closed(asking, "Odd/GreedyTogether-v0")
+@pytest.mark.parametrize("env_id", ["Odd/GreedyTogether-v0", "Odd/GreedyShared-v0"])
+def test_environments_that_use_too_much_memory_are_ended(asking: TextClient, env_id: str) -> None:
+    reason = step_until_closed(asking, env_id)
     assert reason == "The environments used more than 300 MB; their process was ended."
 
 
@@ -373,6 +374,14 @@ def test_a_connection_without_requests_is_closed() -> None:
     with gym_server("--idle-seconds", "1") as own, TextClient(own.url) as client:
         client.make("CartPole-v1")
         assert closed_within(client) == "There was no request for 1 s."
+
+
+def test_a_connection_whose_first_request_does_not_come_is_closed() -> None:
+    """Otherwise silent connections would keep everybody out."""
+    with gym_server("--idle-seconds", "1", "--connections", "1") as own, TextClient(own.url) as client:
+        assert closed_within(client) == "There was no request for 1 s."
+        with TextClient(own.url) as other:
+            other.make("CartPole-v1")
 
 
 def have_ended(pids: list[int]) -> bool:
