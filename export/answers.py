@@ -86,10 +86,12 @@ class StudyAnswers:
         links: dict[str, int] = {}
         steps: set[str] = set()
         pages: dict[str, Counter[str]] = {}
+        versioned = {step.key for step in project.steps if step.variants} if project else set()
         for participant, found in self._participants():
             self.in_sessions = self.in_sessions or bool(participant.membership)
             for step, answers in found.items():
                 steps.add(step)
+                versioned |= {step} if _has_version(answers) else set()
                 self._count_page(pages.setdefault(step, Counter()), step, answers)
                 for name, value in _fields(answers).items():
                     new = Field(len(fields), page_kind=page_kinds.get((step, name), FieldKind.TEXT))
@@ -101,6 +103,7 @@ class StudyAnswers:
             _only_common(fields)
         self.steps = self._in_order(steps)
         self._answerable = [step for step in self.steps if not (project and step == project.final.key)]
+        self.versioned = [step for step in self._answerable if step in versioned]
         self.moved = [
             ChangedPage(step, page, others)
             for step, page in self._present_pages.items()
@@ -163,6 +166,7 @@ class StudyAnswers:
             *([] if self._apart else [Column(f"link.{clean(name)}") for name in self.links]),
             *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
             *(Column(f"page.{moved.step}") for moved in self.moved),
+            *(Column(f"group.{step}", "whole") for step in self.versioned),
             *(Column(f"answered.{step}", "time") for step in self._answerable),
             *([Column("other")] if self.crowded else []),
         )
@@ -190,6 +194,7 @@ class StudyAnswers:
                 for (step, name), column in self.fields.items()
             ]
             row += [self._page(step, found[step]) if step in found else None for step, _, _ in self.moved]
+            row += [as_whole(found[step].get("group")) if step in found else None for step in self.versioned]
             row += [when(found[step].get("answered")) if step in found else None for step in self._answerable]
             if self.crowded:
                 row.append(self._rest(fields, {} if self._apart else link))
@@ -264,6 +269,12 @@ def _distinct(*columns: Column) -> list[Column]:
         names.add(name)
         made.append(column._replace(name=name))
     return made
+
+
+def _has_version(answers: Mapping[str, Any]) -> bool:
+    """Whether the page that a step's answer came from is the version of a group."""
+    page, group = answers.get("page"), answers.get("group")
+    return isinstance(page, str) and group is not None and page.endswith(f"-{group}")
 
 
 def _fields(answers: Mapping[str, Any]) -> Mapping[str, Any]:

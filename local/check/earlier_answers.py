@@ -32,8 +32,12 @@ class EarlierAnswers:
     They are answers to every question, or only to the required ones.
     """
 
-    def __init__(self, folder: Path, config: Config | None, steps: Sequence[StepFiles]) -> None:
-        """`steps` are the steps before the page; `folder` holds the pages."""
+    def __init__(self, folder: Path, config: Config | None, steps: Sequence[StepFiles], groups: int = 0) -> None:
+        """`steps` are the steps before the page; `folder` holds the pages. `groups`: the number of the page's versions.
+
+        A page without versions has as many `groups` as the study.
+        """
+        self._groups = groups or (config.groups if config else 0)
         self._folder = folder
         self._steps = steps
         self._all = config.steps if config else ()
@@ -57,7 +61,7 @@ class EarlierAnswers:
             ),
             0,
         )
-        return cls(folder, config, steps[:place])
+        return cls(folder, config, steps[:place], steps[place].variants if steps else 0)
 
     def fields(self) -> tuple[list[str], str]:
         """Return the names of the fields of all earlier pages, and the text of these pages."""
@@ -123,9 +127,12 @@ class EarlierAnswers:
             if not step.files:  # a type of step without a researcher's page: no fields to answer
                 most[step.key] = least[step.key] = {}
                 continue
-            file = step.files[(group or 0) if step.variants else 0]
-            most[step.key], least[step.key] = _answered(source_of(self._folder / file.name), person)
+            most[step.key], least[step.key] = _answered(self._source(step, group), person)
         return [most, least]
+
+    def _source(self, step: StepFiles, group: int | None) -> str:
+        """The text of the version that this group sees. If its number of versions is another one, it is any version."""
+        return source_of(self._folder / step.files[(group or 0) % len(step.files)].name)
 
     def variants(
         self, group: int | None, constants: Collection[str | float], named: Container[object]
@@ -138,14 +145,17 @@ class EarlierAnswers:
         most, least = self.answers(group)
         yield Variant(most)
         yield Variant(least, words="only the required answers")
+        for step in self._steps:
+            for number in range(step.variants if step.variants != self._groups else 0):
+                answers = _answered(self._source(step, number))[0]
+                yield Variant({**most, step.key: answers}, words=f"version {number} of step {step.key}")
         numbers = [n + d for n in constants if not isinstance(n, str | bool) for d in (-1, 0, 1)]
         texts = [text for text in constants if isinstance(text, str)]
         for step in self._steps:
             if step.type.on_server:
                 values: Mapping[str, Sequence[str | float]] = {"score": numbers, "outcome": texts}
             elif step.files:
-                file = step.files[(group or 0) if step.variants else 0]
-                values = _possible(source_of(self._folder / file.name), numbers, texts)
+                values = _possible(self._source(step, group), numbers, texts)
             else:
                 continue
             for name, possible in values.items():

@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow.parquet as pq
 import pytest
 
@@ -21,11 +22,13 @@ from export.fetch import Fetcher
 from export.page_fields import fields_of
 from export.source import FileGone, Folder
 from hippodrome.model import warm_pool
+from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import to_json
 from protocol.handover import Handover
 from protocol.keys import handover_key
+from testing.studies import study
 from tests.export import data_world as made_of
-from tests.export.data_world import GAME, answer, arrive, crowd, key, record, recording_key, server
+from tests.export.data_world import GAME, PROJECT, answer, arrive, crowd, key, record, recording_key, server
 from tests.export.place import Place, rows
 
 # What there is
@@ -73,6 +76,27 @@ def test_answers_from_an_earlier_page_of_a_step_are_marked(place: Place) -> None
     told = place.run().err
     assert "Step 2 is questionnaire now, and has 1 answer from about: column page.2 says which." in told
     assert "`finished` is by the steps as they are now." in told
+
+
+def test_each_step_whose_page_has_versions_has_a_column_with_the_version(place: Place) -> None:
+    """Two versions of consent and three of the survey are crossed: one column `group` cannot hold both."""
+    for registered in (True, False):
+        if registered:
+            steps = [
+                msgspec.structs.replace(step, variants={"1": 2, "4": 3}.get(step.key, 0)) for step in PROJECT.steps
+            ]
+            place.put(MASTER_LIST, to_json(MasterList([study(steps=steps)])))
+        else:
+            (place.data / MASTER_LIST).unlink()
+        for user, consent, survey in (("user-1", 1, 0), ("user-2", 0, 2)):
+            arrive(place.put, user, {"2": {"age": "20"}}, group=survey)
+            for step, page, group in (("1", "consent", consent), ("4", "survey", survey)):
+                given = answer(step, {"x": "1"}, page=f"{page}-{group}", group=group)
+                place.put(key(user, f"answers/{step}.json"), json.dumps(given).encode())
+        place.done()
+        columns = ("group", "group.1", "group.4")
+        assert [[row[column] for column in columns] for row in place.rows()] == [["0", "1", "0"], ["2", "0", "2"]]
+        assert "group.2" not in place.rows()[0]
 
 
 PAGE = """

@@ -112,6 +112,19 @@ def test_each_group_is_shown_its_page(folder: Path) -> None:
     assert [line.partition(": ")[0] for line in lines] == ["steps/hello-0.html:1", "steps/bye.html:2"]
 
 
+def test_crossed_versions_are_shown_with_each_version_of_the_earlier_page(folder: Path) -> None:
+    for old in ("hello", "bye"):
+        (folder / "steps" / f"{old}.html").unlink()
+    page(folder, "<input name=word aria-label=word>", "hello-0")
+    page(folder, "<p>Hello</p>", "hello-1")
+    for version in range(3):
+        page(folder, '{{ answers["1"].word + "!" }}' if version == 2 else "<p>Bye</p>", f"bye-{version}")
+    (line,) = looked(folder)
+    assert line.startswith("steps/bye-2.html:1: ")
+    page(folder, '{{ answers["1"].word | default("") }}', "bye-2")
+    assert looked(folder) == []
+
+
 # --- HTML --------------------------------------------------------------------------------------------
 
 
