@@ -25,8 +25,17 @@
     }
   }
 
+  // A field named "elements" or "addEventListener" hides that property of its form, so none is read from the form itself.
+  function inForm(selector) {
+    return [...document.querySelectorAll("form.page " + selector)];
+  }
+
+  function listen(type, work, capture = false) {
+    EventTarget.prototype.addEventListener.call(form, type, work, capture);
+  }
+
   function fields() {
-    return [...form.elements].filter((field) => field.name && !UNKEPT.has(field.type) && field.tagName !== "FIELDSET");
+    return inForm(":is(input, select, textarea)").filter((field) => field.name && !UNKEPT.has(field.type));
   }
 
   function valueOf(field) {
@@ -78,7 +87,7 @@
 
   // Sending
 
-  const status = form?.querySelector(".status:last-of-type");
+  const status = inForm(".status:last-of-type").at(0);
   let sending = false;
   let warnedOffline = false;
   let timers = [];
@@ -91,7 +100,7 @@
   function idle(text = "", warn = false) {
     sending = false;
     timers.forEach(clearTimeout);
-    form.querySelectorAll("[aria-disabled]").forEach((button) => button.removeAttribute("aria-disabled"));
+    inForm("[aria-disabled]").forEach((button) => button.removeAttribute("aria-disabled"));
     say(text, warn);
   }
 
@@ -221,10 +230,10 @@
   document.querySelectorAll(".code").forEach(addCopy);
   if (!form) return;
   restoreDraft();
-  form.querySelectorAll("input[type=range]").forEach(showNumber);
-  form.addEventListener("input", onInput);
-  form.addEventListener("change", onInput);
-  form.addEventListener("submit", onSubmit);
-  form.addEventListener("invalid", onInvalid, true);
+  inForm("input[type=range]").forEach(showNumber);
+  listen("input", onInput);
+  listen("change", onInput);
+  listen("submit", onSubmit);
+  listen("invalid", onInvalid, true);
   window.addEventListener("pageshow", (event) => { if (event.persisted) idle(); });
 })();

@@ -79,6 +79,39 @@ def test_answers_survive_a_reload_and_are_deleted_when_they_are_sent(world: Worl
     assert world.posts == [{"hippodrome-step": "1", "hippodrome-ticket": "T", **expected}]
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "elements",
+        "submit",
+        "action",
+        "length",
+        "name",
+        "reset",
+        "checkValidity",
+        "addEventListener",
+        "querySelectorAll",
+    ],
+)
+def test_a_field_may_have_the_name_of_a_property_of_forms(world: World, tab: Any, name: str) -> None:
+    world.source = f"<input name={name} class=field><input type=range name=slider>"
+    tab.goto(world.url)
+    tab.fill(".field", "words")
+    tab.reload()
+    assert tab.input_value(".field") == "words"
+    assert tab.text_content("output") == "50"
+    world.source = "<p id=second>Second</p>"
+    said = tab.evaluate(
+        """() => {
+            for (let i = 0; i < 2; i += 1) document.querySelector('.send button').click();
+            return document.querySelector('.send .status').textContent;
+        }"""
+    )
+    assert said == IN_ENGLISH["sending"]
+    tab.wait_for_selector("#second")
+    assert [post[name] for post in world.posts] == ["words"]
+
+
 def test_a_second_click_sends_nothing(world: World, tab: Any) -> None:
     world.may_answer.clear()
     sent: list[str] = []
