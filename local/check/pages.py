@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from jinja2 import meta
 
 from bots.page import leads_elsewhere, links
 from hippodrome.config import Config, Diagnostic
+from hippodrome.config.layout import PAGES
 from hippodrome.config.step_files import StepFileError, open_folder
 from hippodrome.participants import sandbox
 from hippodrome.participants.files import MAX_BYTES
@@ -33,6 +35,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
         steps = open_folder(folder)
     except StepFileError:
         return []
+    of_hippo = steps.path.name != PAGES[0]  # HIPPO shows its pages whatever is wrong in them, and so do we
     found: list[Diagnostic] = []
     for name, groups in _pages(steps.names, config).items():
         try:
@@ -45,7 +48,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
         here = [
             *check_template(label, source, config, Visitors(groups, earlier, send_it)),
             *Tags(label, steps.names, config).read(source),
-            *check_structure(label, source),
+            *(replace(problem, remark=problem.remark or of_hippo) for problem in check_structure(label, source)),
         ]
         found += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
     return found + (_of_all(steps.path, steps.names, config) if config else [])

@@ -454,6 +454,15 @@ def test_an_answer_with_which_a_page_fails_is_named(folder: Path) -> None:
     assert "ZeroDivisionError" in line
 
 
+def test_what_is_wrong_in_a_page_that_hippo_shows_is_a_remark(folder: Path) -> None:
+    (folder / "steps").rename(folder / "StepFiles")
+    question = '<fieldset><input type="radio" name="q" value="a"><input type="radio" name="q" value="b"></fieldset>'
+    (folder / "StepFiles" / "hello.html").write_text(f"{question}{question}")
+    (problem,) = check_pages(folder, read_project(folder))
+    assert problem.remark
+    assert "an earlier question has the name q too" in problem.message
+
+
 # --- the code that recruiters ask for -----------------------------------------------------------------
 
 NO_CODE = (
