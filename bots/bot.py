@@ -244,7 +244,8 @@ class Bot:
             raise Failed(f"there is no server: the last one was {state['state']} ({state.get('reason')})")
         self._restarts += 1
         self.report.troubles.append(f"the server was {state['state']} ({state.get('reason')}): started again")
-        await self.post(urljoin(page.address, form.action), form_filling.fill(form, self.random))
+        again = [*forms.hidden(form), ("hippodrome-action", "restart")]
+        await self.post(urljoin(page.address, form.action), again)
 
     async def _connect(self, state: dict[str, Any], play: PlayedStep) -> None:
         """Connect to the server and play until the connection ends. Raises Failed if the server refuses the bot."""

@@ -1,7 +1,8 @@
 """The answer to a step: `{projectId}/users/{userId}/answers/{step}.json`, created once and never written again.
 
 The control plane writes the answers to pages, and the trial server writes the answers to game steps. If the lobby finds
-no other participants, the control plane writes the answers to game steps, too. Both sides read answers.
+no other participants, or no server could run the game, the control plane writes the answers to game steps, too. Both
+sides read answers.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from protocol.times import time_text
 
 GAME = "game"
 """`page` in the answer to a game step."""
+FAILED = "failed"
+"""`outcome` in the answer to a game step whose agent kept failing, or for which no server could be started."""
 UNMATCHED = "unmatched"
 """`outcome` in the answer to a game step for which the lobby found no other participants."""
 

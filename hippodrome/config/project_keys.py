@@ -256,6 +256,8 @@ class ProjectKeys(Model):
     """The name of the study for people. Default: the id."""
     researcher: _Text = ""
     """The person who is responsible for the study."""
+    contact: _Text = ""
+    """How participants reach the researchers if something does not work, such as an e-mail address."""
     team_members: Annotated[
         tuple[_Text, ...], items("person", 200, single=True), Field(json_schema_extra={"type": ["array", "string"]})
     ] = ()

@@ -18,7 +18,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.model.records import Record
 from hippodrome.ports import Entry
-from protocol.answer import Answer
+from protocol.answer import FAILED, Answer
 from protocol.keys import participant_folder
 
 REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
@@ -61,6 +61,10 @@ class Progress:
         """Return the step that is due: the first without an answer, or the final one."""
         return next((step for step in project.steps[:-1] if step.key not in self.answered), project.final)
 
+    def answered_games(self, project: Project) -> list[str]:
+        """Return the keys of the game steps that are answered, in order."""
+        return [key for key in project.game_steps if key in self.answered]
+
     def recently_answered(self, project: Project, now: datetime) -> list[str]:
         """Return the keys of the pages answered within the last `REPEAT_WINDOW`: the latest first, at most
         `MAX_COMPARED`.
@@ -101,6 +105,15 @@ def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str,
         answered=now,
         answers=answers,
     )
+
+
+def failed_game(project: Project, user_id: str) -> dict[str, Any]:
+    """Return the answers of a game that no server could run: those of a trial that failed, before a step was played.
+
+    `completionCode` is a code of its own, so that the researchers see what it stands for.
+    """
+    code = ids.completion_code(project.secret, user_id, FAILED)
+    return {"episodes": 0, "score": 0, "frames": 0, "seconds": 0, "outcome": FAILED, "completionCode": code}
 
 
 def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

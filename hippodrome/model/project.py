@@ -93,6 +93,7 @@ class Project(Record, frozen=True):
     steps: list[Step]
     name: str = ""
     researcher: str = ""
+    contact: str = ""  # how participants reach the researchers
     team_members: list[str] = msgspec.field(default_factory=list)
     live: bool = False
     max_runtime: int = 60  # minutes

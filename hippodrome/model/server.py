@@ -56,6 +56,10 @@ class Reason(StrEnum):
     ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
 
 
+CANNOT_START = ("cannot begin", "ended at once", "never ready", "no port")
+"""The causes (`servers.causes.Cause`) of a server on which the game cannot even begin. After two such servers, no
+further one is started without a request: it would fail in the same way."""
+FAILED = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY)  # the reasons that leave no hope for the game
 REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which the next attempt is started automatically
 
 
@@ -259,6 +263,8 @@ def next_attempt(closed: Server) -> int | None:
     """Return the attempt that replaces a closed server without a request; None if none does, as for a warm server."""
     if closed.is_warm_server or not closed.is_closed or closed.attempt >= AUTOMATIC_ATTEMPTS:
         return None
+    if closed.earlier and closed.cause in CANNOT_START and closed.earlier[-1].cause in CANNOT_START:
+        return None
     return closed.attempt + 1 if closed.reason in REPLACED else None
 
 
@@ -277,6 +283,16 @@ def requestable_attempt(record: Server) -> int | None:
     if record.reason is Reason.FULL:
         return record.attempt
     return record.attempt + 1 if record.attempt < MAX_ATTEMPTS else None
+
+
+def may_go_without(record: Server) -> bool:
+    """Return whether the participant may go on without the game, because no server could run it.
+
+    They may not while another server starts by itself, nor while the project's limits leave no slot: that passes.
+    """
+    if not record.is_closed or next_attempt(record) is not None:
+        return False
+    return record.reason in FAILED or requestable_attempt(record) is None
 
 
 def replacing(before: Server, wanted: Server) -> Server:

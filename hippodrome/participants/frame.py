@@ -178,7 +178,9 @@ $named$content
 <fieldset class="page answered" disabled>
 $content
 </fieldset>""",
-    "restart": '<input type="hidden" name="hippodrome-action" value="restart">\n',
+    "action": '<input type="hidden" name="hippodrome-action" value="$action">\n',
+    "over": '<button type="submit" name="hippodrome-action" value="$action">$text</button>\n',
+    "report": "<p>$text</p>\n",
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n</div>',
     "reading": """
 <section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>

@@ -61,6 +61,7 @@ class Journey:
         """Respond to one HTTP request."""
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
+        contact = ""
         try:
             if request.method not in ("GET", "HEAD", "POST"):
                 raise PageError(405, "This address is only for reading and answering", "Please open your study link.")
@@ -68,11 +69,13 @@ class Journey:
                 return self._files.respond(request)
             request = respelled(request)
             project = self._project(request)
+            if project.contact:
+                contact = Texts(project.texts).say("contact", contact=project.contact)
             if (kind := previews.preview_kind(request)) is not None:
                 return _preview_response(request, project, kind)
             return self._dispatch(request, project)
         except PageError as error:
-            return error.response(request)
+            return error.response(request, contact)
 
     def _dispatch(self, request: Request, project: Project) -> Response:
         """Identify the participant, and call the method for this kind of request."""

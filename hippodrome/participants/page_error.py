@@ -48,13 +48,16 @@ class PageError(Exception):
         title, text = texts[name], texts.say(f"{name}Text", **values)
         return cls(status, title, text, hippo, texts.language)
 
-    def response(self, request: Request) -> Response:
-        """Return the response to this request: the page, or JSON for a program."""
+    def response(self, request: Request, contact: str = "") -> Response:
+        """Return the response to this request: the page, or JSON for a program.
+
+        `contact` is the sentence that says how the researchers can be reached.
+        """
         if request.wants_json:
             answer = self.hippo or HippoAnswer(self.status)
             status = answer.status if answer.status in ACTED_ON or not request.is_front_end else 200
             return program_message(status, self.title, self.text, answer.page)
-        page = frame.message_page(self.title, self.text, lang=self.lang)
+        page = frame.message_page(self.title, f"{self.text} {contact}".strip(), lang=self.lang)
         return http.html(self.status, page.html, page.headers)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.model.texts import Texts
 from hippodrome.participants import fragments, game_modules
@@ -22,6 +23,7 @@ from hippodrome.participants.frame import (
     script,
     script_json,
 )
+from protocol.answer import FAILED
 
 STAGES = ("queued", "starting", "naming", "ready")  # the states of a server that the waiting page shows, in this order
 LOBBY = "lobby"
@@ -141,9 +143,9 @@ def game_page(view: GameView) -> Page:
         over=Html() if over else Html(" hidden"),
         over_title=over_title,
         over_text=over_text,
-        button=_button(state, texts),
-        again=Html() if view.state.get("again") else Html(" hidden"),
-        gone=Html(" hidden") if view.state.get("again") else Html(),
+        again=Html() if over and (view.state.get("again") or view.state.get("without")) else Html(" hidden"),
+        buttons=_buttons(view.state, texts) if over else Html(),
+        report=_report(view, texts),
         action=view.page,
         step=view.step.key,
         ticket=view.ticket,
@@ -182,8 +184,10 @@ def game_message(view: GameView) -> str:
     texts = Texts(view.project.texts)
     moved = texts["movedProgramTitle"], texts["movedProgram"]
     title, text = _over_texts(view.state, texts, below=True) if is_over(view.state) else moved
-    if is_over(view.state) and view.state.get("again"):
-        return form_message(title, text, step=view.step.key, ticket=view.ticket, also=fill("restart"))
+    action = "restart" if view.state.get("again") else "without" if view.state.get("without") else ""
+    if is_over(view.state) and action:
+        also = fill("action", action=action)
+        return form_message(title, text, step=view.step.key, ticket=view.ticket, also=also)
     return form_message(title, text)
 
 
@@ -220,12 +224,33 @@ def _over_texts(state: Mapping[str, Any], texts: Texts, *, below: bool = False) 
     reason, ending = str(state.get("reason")), str(state["state"])
     title = texts[_TITLES.get(reason, f"{ending}Title")]
     sentences = [texts[_REASONS.get(reason, "computerGone")], texts["kept"]]
-    if state.get("again"):
+    if state.get("without") and not (below and state.get("again")):
+        sentences.append(texts["withoutOrAgain" if state.get("again") else "without"])
+    elif state.get("again"):
         go_on = texts["goOnBelow"] if below else texts.say("goOnWith", button=_button(ending, texts))
         sentences.append(texts["tryLater"] if reason in _TRANSIENT else go_on)
         if reason in _TO_REPORT:
             sentences.append(texts["tellIfAgain"])
     return title, " ".join(sentences)
+
+
+def _buttons(state: Mapping[str, Any], texts: Texts) -> Html:
+    """The buttons with which a participant goes on after their server has ended. The first one is the usual way."""
+    names = {"without": texts["goWithoutGame"], "restart": _button(str(state["state"]), texts)}
+    offered = [action for action in names if state.get("again" if action == "restart" else action)]
+    return Html("".join(fill("over", action=action, text=names[action]) for action in offered))
+
+
+def _report(view: GameView, texts: Texts) -> Html:
+    """Whom the participant may ask, and what to quote, below the text on a server that has ended. Empty if they need
+    not ask anybody.
+    """
+    if not is_over(view.state) or (view.state.get("again") and not view.state.get("without")):
+        return Html()
+    contact = view.project.contact
+    whom = texts.say("contact", contact=contact) if contact else texts["tell"]
+    code = ids.completion_code(view.project.secret, view.user_id, FAILED)
+    return fill("report", text=f"{whom} {texts.say('quote', user=view.user_id, code=code)}")
 
 
 def _button(state: str, texts: Texts) -> str:

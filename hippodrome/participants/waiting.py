@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Any
 
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Reason, Server, ServerState, next_attempt, requestable_attempt
+from hippodrome.model.server import Reason, Server, ServerState, may_go_without, next_attempt, requestable_attempt
 from hippodrome.ports import Dns, Settings
 from hippodrome.storage.secret import SecretCache
 
@@ -42,6 +42,7 @@ class ServerStates:
             "state": ServerState.QUEUED,
             "attempt": 1,
             "again": False,
+            "without": False,
             "reason": None,
             "replaces": False,
             "userId": user_id,
@@ -77,7 +78,8 @@ def _closed(record: Server) -> dict[str, Any]:
     if next_attempt(record) is not None:
         return {"state": ServerState.QUEUED, "attempt": record.attempt + 1, "replaces": record.reason is Reason.LOST}
     over = "failed" if record.reason in FAILURES else "ended"
-    return {"state": over, "again": requestable_attempt(record) is not None, "replaces": False}
+    again, without = requestable_attempt(record) is not None, may_go_without(record)
+    return {"state": over, "again": again, "without": without, "replaces": False}
 
 
 def _replaces(record: Server) -> bool:

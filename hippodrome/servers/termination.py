@@ -217,7 +217,7 @@ class Termination:
         for _, one in closing:
             record = one.stored.server
             if record.counted and not record.is_closed:
-                closed = server.close(record, one.reason, self._platform.now())
+                closed = server.close(record, one.reason, self._platform.now(), one.cause or "")
                 release = Release(record, one.reason, keep=next_attempt(closed) is not None)
                 projects.setdefault(record.project_id, []).append(release)
         _, failed = for_each(

@@ -41,6 +41,13 @@ _REASONS = {
     "no capacity": "there was no room",
     "full": "the project's limits are reached",
 }
+_CAUSES = {
+    "ended at once": "its program ended before the game began",
+    "never ready": "its agent was not ready in time",
+    "crashed": "its program ended with an error",
+    "killed": "its process was killed",
+}
+"""What is said of some lost servers instead, by the cause in their record (`hippodrome/servers/causes.py`)."""
 
 
 class ActivityLog:
@@ -56,6 +63,7 @@ class ActivityLog:
         self._lock = threading.Lock()
         self._states: dict[str, tuple[int, str]] = {}
         self._shown: set[str] = set()  # the keys of answers and the ids of sessions that were shown
+        self._failing: set[str] = set()  # whose present server has written an error before it was ready
         self._last_step = ""
         self._held: dict[str, tuple[threading.Timer, str]] = {}  # lines that are held back, by participant
         self._looking = threading.RLock()
@@ -187,19 +195,23 @@ class ActivityLog:
             return
         if ids.is_warm_id(user_id):
             self._warm_server(record, state)
-        elif state == "starting" and attempt == 1:
-            self._hold_back(user_id, "server starting")
         elif state == "starting":
-            self.participant(user_id, f"server starting, attempt {attempt}")
+            self._failing.discard(user_id)
+            if attempt == 1:
+                self._hold_back(user_id, "server starting")
+            else:
+                self.participant(user_id, f"server starting, attempt {attempt}")
         elif state == "ready":
             self._show_held(user_id)
+            if user_id in self._failing:
+                return  # it listens, but no game will begin on it
             which = "has a warm server" if record.get("spare") else "server ready"
             # A server's name may be a participant's id, so it is not shown.
             where = "its name, port " if self.named else f"ws://{record.get('host')}:"
             self.participant(user_id, f"{which} at {where}{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
-            text = f"server gone ({_REASONS.get(reason, reason)})"
+            text = f"server gone ({_CAUSES.get(str(record.get('cause'))) or _REASONS.get(reason, reason)})"
             if reason == "stopped" and not self._closed.is_set():
                 self._hold_back(user_id, text)
                 return
@@ -274,6 +286,7 @@ class ActivityLog:
         for key, body in watched.answers():
             self._answer(key, key.split("/")[2], _json(body))
         for text in watched.errors():
+            self._failing.add(watched.user_id)
             self.participant(watched.user_id, text, "yellow")
 
 

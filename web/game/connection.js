@@ -10,12 +10,12 @@ const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms for a connection to open; some firewalls neither let it through nor refuse it
 const ACK_EVERY = 8; // ms between acknowledgements; at high frame rates there would be too many
 const ACK_WAIT = 50; // ms for which an acknowledgement waits for another picture, if they come that quickly
-const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved" }; // why the connection ended, by close code
+const ENDS = { 1000: "done", 4409: "elsewhere", 4404: "moved", 1011: "failed" }; // why the connection ended, by close code
 
 let link = null; // the present connection; messages of earlier ones are ignored
 
 // Plays until the connection ends; `hear` gets each message. Resolves to `{ why, welcome, result }`: `why` is "done",
-// "elsewhere", "moved" or "lost", `welcome` whether the server let us in, `result` its last message after "done".
+// "elsewhere", "moved", "failed" (the game cannot begin on this server) or "lost", `welcome` whether the server let us in, `result` its last message after "done".
 export function play(server, hear) {
   return new Promise((resolve) => {
     const socket = new WebSocket(server.url, canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : []);
@@ -33,7 +33,7 @@ export function play(server, hear) {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step });
     socket.onmessage = (event) => link === own && receive(own, event.data, hear);
-    socket.onclose = (event) => own.end(ENDS[event.code] ?? "lost");
+    socket.onclose = (event) => own.end(own.welcome && event.code === 1011 ? "lost" : ENDS[event.code] ?? "lost");
   });
 }
 

@@ -106,7 +106,7 @@ clearDrafts();
 setInterval(() => find("wait").hidden || beat(), 1_000);
 setInterval(checkForHang, 1_000);
 setInterval(countDown, 200);
-find("again").addEventListener("submit", noteRestart);
+find("again").addEventListener("submit", (event) => event.submitter?.value === "restart" && noteRestart());
 find("overlay-button").addEventListener("click", () => {
   if (["ready", "paused", "break"].includes(game.state)) start();
   find("screen").focus({ preventScroll: true });

@@ -12,7 +12,7 @@ from hippodrome.http import Response
 from hippodrome.model import ids, participant, server
 from hippodrome.model.messages import StartServer, StopServer, to_message
 from hippodrome.model.project import Project, Step
-from hippodrome.model.server import Server, ServerState, next_attempt, requestable_attempt
+from hippodrome.model.server import Server, ServerState, may_go_without, next_attempt, requestable_attempt
 from hippodrome.participants import frame, pages
 from hippodrome.participants.forms import PostedForm
 from hippodrome.participants.steps.services import StepServices
@@ -23,10 +23,16 @@ from hippodrome.ports import Topic
 
 ASK_AGAIN = timedelta(seconds=30)  # if there is no server after this time, the next GET sends the start message again
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
+RESTART, WITHOUT = "restart", "without"
+"""The values of `hippodrome-action` in the forms by which a participant asks for another server, and goes on without
+the game."""
 
 
 class GameStep:
-    """Implements `StepHandler`. The trial stores the answer; a form only requests another server."""
+    """Implements `StepHandler`. The trial stores the answer.
+
+    A form requests another server, or goes on without the game if no server could run it.
+    """
 
     def __init__(self, services: StepServices) -> None:
         self._services = services
@@ -79,14 +85,21 @@ class GameStep:
         return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
 
     def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
-        """Request another server, if the form asks for a restart and the participant may have one."""
-        if form.action != "restart":
+        """Request another server, or store the answer of a game that no server could run, as the form asks.
+
+        Nothing happens if the server's record does not allow it, perhaps because another page has asked before.
+        """
+        if form.action not in (RESTART, WITHOUT):
             return
         repository = self._services.repository
         owner = repository.session_id(project, user_id) if project.has_sessions else user_id
         record = repository.server_of(project.id, owner) if owner else None
-        attempt = requestable_attempt(record) if record else None
-        if owner and attempt is not None:
+        if owner is None or record is None:
+            return
+        if form.action == WITHOUT:
+            if may_go_without(record):
+                self._services.answers.store(project, user_id, step, participant.failed_game(project, user_id))
+        elif (attempt := requestable_attempt(record)) is not None:
             self._request_server(project, owner, attempt)
 
     def _state_alone(self, visit: Visit) -> dict[str, Any]:

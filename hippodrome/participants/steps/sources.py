@@ -69,6 +69,10 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
         membership = repository.membership(project.id, user_id) or Membership()
         values["participant"] |= {"unmatched": membership.unmatched, "members": membership.members}
         values["completion_code"] = membership.completion_code or values["completion_code"]
+    if "completion_code" in text:
+        games = [services.answers.read(project.id, user_id, key) for key in visit.progress.answered_games(project)]
+        codes = (str(game["completionCode"]) for game in games if "completionCode" in game)
+        values["completion_code"] = next(codes, values["completion_code"])
     named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
     values["answers"] = {key: services.answers.read(project.id, user_id, key) for key in named}
     return values

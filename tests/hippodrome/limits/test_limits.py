@@ -250,7 +250,7 @@ def test_beyond_max_servers_no_server_starts_and_the_page_says_so_until_there_is
     platform.wait(seconds=31)
     alice.get()  # they come back
     assert platform.bus.sent.pop() == (Topic.START, {"projectId": "maze", "userId": "alice"})
-    alice.answer(page)  # or press the button
+    alice.answer(page, **{"hippodrome-action": "restart"})  # or press the button
     assert platform.bus.sent.pop(0) == (Topic.START, {"projectId": "maze", "userId": "alice"})
     assert start_and_run(platform, "alice") == ""
     Servers(platform).stop([StopServer("maze", "bob")])

@@ -82,6 +82,7 @@ def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
         "steps": [],
         "name": "",
         "researcher": "",
+        "contact": "",
         "team_members": [],
         "live": False,
         "max_runtime": 60,

@@ -13,6 +13,7 @@ from hippodrome.model.project import AwsSetup
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server, ServerState, TaskStopped
 from hippodrome.ports import Address, DnsRecord
+from hippodrome.servers.causes import Cause
 from testing.fake_platform import FakePlatform
 from testing.studies import study
 
@@ -237,6 +238,10 @@ def test_a_lost_server_is_replaced_twice_by_itself_and_then_on_request(
     closed = server.close(new_record(attempt=attempt), reason, LATER)
     assert (server.next_attempt(closed), server.requestable_attempt(closed)) == (automatic, on_request)
     assert server.plays_on(closed) is (automatic is not None)
+
+
+def test_the_causes_after_which_one_more_server_is_tried_are_causes() -> None:
+    assert set(server.CANNOT_START) <= set(Cause)
 
 
 def test_an_open_server_plays_on_and_has_no_next_attempt() -> None:

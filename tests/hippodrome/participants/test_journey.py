@@ -321,7 +321,7 @@ def test_a_server_from_before_the_steps_were_renumbered_is_stopped_and_may_be_re
     state = poll(alice, "4")
     assert (state["state"], state["again"]) == ("ended", True)
     platform.bus.sent.clear()
-    alice.answer(alice.get())
+    alice.post(**hidden(alice.get()), **{"hippodrome-action": "restart"})
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
@@ -375,12 +375,69 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
     platform.tasks.fail = [Refused("no")]
     Servers(platform).start(StartServer("maze", "alice"))
     assert poll(alice) | {"seconds": 0} == {
-        "state": "failed", "attempt": 1, "again": True, "reason": "refused", "userId": "alice", "step": "3",
+        "state": "failed", "attempt": 1, "again": True, "without": True, "reason": "refused", "userId": "alice", "step": "3",
         "seconds": 0, "typical": None, "replaces": False,
     }  # fmt: skip
     platform.bus.sent.clear()
-    alice.answer(alice.get())
+    alice.post(**hidden(alice.get()), **{"hippodrome-action": "restart"})
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
+
+
+def answer_of(platform: FakePlatform, step: str) -> dict[str, Any]:
+    """Return alice's stored answers at this step."""
+    found: dict[str, Any] = json.loads(platform.documents.kept[f"maze/users/alice/answers/{step}.json"][0])["answers"]
+    return found
+
+
+def failed(platform: FakePlatform, alice: Browser) -> None:
+    """Let alice come to the game, for which no server can be started."""
+    to_game(alice)
+    platform.tasks.fail = [Refused("no")]
+    Servers(platform).start(StartServer("maze", "alice"))
+
+
+def test_a_participant_whose_game_failed_goes_on_without_it(platform: FakePlatform, alice: Browser) -> None:
+    failed(platform, alice)
+    page = alice.get()
+    alice.post(**hidden(page), **{"hippodrome-action": "without"})
+    code = ids.completion_code("secret", "alice", "failed")
+    assert answer_of(platform, "3") == {
+        "episodes": 0, "score": 0, "frames": 0, "seconds": 0, "outcome": "failed", "completionCode": code
+    }  # fmt: skip
+    assert code in page
+    after = alice.get()
+    assert "over-title" not in after, "the step after the game is due"
+
+
+def test_the_last_page_shows_the_code_of_a_game_that_failed(platform: FakePlatform, alice: Browser) -> None:
+    failed(platform, alice)
+    platform.documents.put("maze/steps/bye.html", b"<p>code: {{ completion_code }}</p>")
+    alice.post(**hidden(alice.get()), **{"hippodrome-action": "without"})
+    for _ in range(3):
+        page = alice.get()
+        if "code: " in page:
+            break
+        alice.answer(page)
+    assert f"code: {ids.completion_code('secret', 'alice', 'failed')}" in page
+
+
+def test_the_answer_that_the_trial_has_stored_stays(platform: FakePlatform, alice: Browser) -> None:
+    failed(platform, alice)
+    page = alice.get()
+    played = json.dumps({"answers": {"score": 7, "outcome": "finished"}}).encode()
+    platform.documents.before_write.append(lambda: platform.documents.put("maze/users/alice/answers/3.json", played))
+    alice.post(**hidden(page), **{"hippodrome-action": "without"})
+    assert answer_of(platform, "3") == {"score": 7, "outcome": "finished"}
+
+
+def test_nobody_goes_on_without_a_game_that_another_server_runs(platform: FakePlatform, alice: Browser) -> None:
+    """The participant has asked for another server in a second tab, and the first still shows the old page."""
+    failed(platform, alice)
+    page = alice.get()
+    Servers(platform).start(StartServer("maze", "alice", 2))
+    alice.post(**hidden(page), **{"hippodrome-action": "without"})
+    assert "maze/users/alice/answers/3.json" not in platform.documents.kept
+    assert poll(alice)["state"] == "starting"
 
 
 def test_a_participant_whose_server_was_lost_sees_that_another_replaces_it(
@@ -450,6 +507,8 @@ def test_a_program_that_gets_no_more_servers_gets_a_page_that_says_so(platform: 
         page = program(alice, form)["page"]
         assert "<h1>" in page
         assert "restart" not in page
+    program(alice, hidden(page))
+    assert answer_of(platform, "3")["outcome"] == "failed"
 
 
 def test_a_participant_gets_at_most_eight_servers(platform: FakePlatform, alice: Browser) -> None:

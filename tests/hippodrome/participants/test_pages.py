@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from hippodrome.model.server import Reason
 from hippodrome.model.texts import ENGLISH, IN_ENGLISH, SAID
@@ -421,16 +422,40 @@ def test_the_state_reaches_the_script_unchanged_and_escaped(more: dict[str, str]
 
 
 @pytest.mark.parametrize("state", ["ended", "failed"])
-@pytest.mark.parametrize("again", [True, False])
-def test_a_page_whose_game_is_over_has_a_form_for_another_server(state: str, again: bool) -> None:
-    found = Elements(game(state=state, again=again).html)
+@pytest.mark.parametrize(
+    ("offered", "actions"),
+    [
+        ({"again": True}, ["restart"]),
+        ({"without": True}, ["without"]),
+        ({"again": True, "without": True}, ["without", "restart"]),
+        ({}, []),
+    ],
+)
+def test_a_page_whose_game_is_over_has_a_form_to_go_on(
+    state: str, offered: dict[str, bool], actions: list[str]
+) -> None:
+    found = Elements(game(state=state, **offered).html)
     sections = {attrs["id"]: attrs for attrs in found.named("section")}
     assert "hidden" in sections["wait"]
     assert "hidden" not in sections["over"]
     (form,) = found.named("form")
-    assert ("hidden" in form) is not again
+    assert ("hidden" in form) is not bool(offered)
     fields = {attrs["name"]: attrs["value"] for attrs in found.named("input")}
-    assert fields == {"hippodrome-step": "3", "hippodrome-ticket": "TICKET", "hippodrome-action": "restart"}
+    assert fields == {"hippodrome-step": "3", "hippodrome-ticket": "TICKET"}
+    buttons = [attrs["value"] for attrs in found.named("button") if attrs.get("name") == "hippodrome-action"]
+    assert buttons == actions
+
+
+def test_a_participant_whose_game_failed_reads_how_to_go_on_and_whom_to_ask() -> None:
+    project = msgspec.structs.replace(PROJECT, contact="study@example.org <b>")
+    failed: dict[str, Any] = {"state": "failed", "reason": Reason.LOST, "without": True}
+    code = ids.completion_code(PROJECT.secret, "P1", "failed")
+    for again, way in ((True, "without this game, or try once more."), (False, "with the study without this game.")):
+        text = Elements(game(project=project, again=again, **failed).html).text
+        assert way in text
+        assert "The researchers can be reached here: study@example.org <b>" in text
+        assert f"your id P1 and the code {code}." in text
+    assert "Please tell whoever invited you to this study." in Elements(game(**failed).html).text
 
 
 @pytest.mark.parametrize("reason", [*Reason, None])
@@ -467,10 +492,10 @@ def test_the_page_of_a_closed_server_says_what_happened_and_whom_to_tell(
     again = game(state=state, reason=reason, again=True).html
     assert f'<h1 id="over-title">{title}</h1>' in again
     assert ("If this happens again, please tell" in again) is report
-    assert "<p hidden>" in again
+    assert "Please tell whoever invited you" not in again
     last = game(state=state, reason=reason).html
     assert "If this happens again" not in last
-    assert "<p hidden>" not in last
+    assert "Please tell whoever invited you" in last
 
 
 @pytest.mark.parametrize(
@@ -488,7 +513,9 @@ def test_each_reason_has_its_sentence(reason: str, words: str) -> None:
 
 @pytest.mark.parametrize(("state", "says"), [("failed", "Try again"), ("ended", "Start again")])
 def test_the_button_of_a_closed_server_names_what_it_does(state: str, says: str) -> None:
-    assert re.search(r'<button type="submit">(.*)</button>', game(state=state, again=True).html)[1] == says  # type: ignore[index]
+    page = game(state=state, again=True, without=True).html
+    buttons = re.findall(r'<button type="submit" name="hippodrome-action" value="(\w+)">(.*)</button>', page)
+    assert buttons == [("without", "Go on without the game"), ("restart", says)]
 
 
 @pytest.mark.parametrize("replaces", [False, True])

@@ -44,6 +44,7 @@ def test_before_there_is_a_server_the_state_is_queued_since_the_participant_came
         "state": "queued",
         "attempt": 1,
         "again": False,
+        "without": False,
         "reason": None,
         "replaces": False,
         "userId": "alice",
@@ -110,7 +111,9 @@ def test_a_closed_server_has_failed_or_ended_and_may_be_asked_for_again(reason: 
     failed = reason in (Reason.LOST, Reason.NO_CAPACITY, Reason.REFUSED, Reason.FULL)
     assert (state["state"], state["reason"]) == ("failed" if failed else "ended", reason)
     assert (state["again"], state["replaces"], reason in FAILURES) == (True, False, failed)
-    assert state_of(server.close(started(8), reason, NOW))["again"] is (reason is Reason.FULL)
+    assert state["without"] is (failed and reason is not Reason.FULL)
+    last = state_of(server.close(started(8), reason, NOW))
+    assert (last["again"], last["without"]) == (reason is Reason.FULL, reason is not Reason.FULL), "nobody is stuck"
 
 
 @pytest.mark.parametrize(("reason", "replaces"), [(Reason.LOST, True), (Reason.STOPPED, False)])

@@ -12,11 +12,12 @@ from hippodrome.model import ids, messages, server
 from hippodrome.model.messages import DnsChanged, StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, MasterList
 from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, ServerState, requestable_attempt
+from hippodrome.model.server import Reason, Server, ServerState, may_go_without, requestable_attempt
 from hippodrome.ports import NoCapacity, Refused, Topic
 from hippodrome.servers.causes import Cause
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.secret import SecretCache
+from protocol import exits
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
@@ -412,7 +413,6 @@ def test_a_trial_that_ended_by_itself_is_cleaned_up_and_not_replaced(platform: F
         ("SpotInterruption", None),
         ("TerminationNotice", None),
         ("TaskFailedToStart", None),
-        ("EssentialContainerExited", 1),
     ],
 )
 def test_a_lost_server_is_replaced_up_to_three_times(
@@ -427,6 +427,22 @@ def test_a_lost_server_is_replaced_up_to_three_times(
     wanted = [m["attempt"] for topic, m in platform.bus.sent if topic is Topic.START]
     assert wanted == [2, 3]
     assert requestable_attempt(record(platform)) is not None
+
+
+@pytest.mark.parametrize("exit_code", [1, exits.NO_AGENT, exits.LATE_AGENT, exits.NO_PORT])
+def test_a_server_on_which_the_game_cannot_begin_is_replaced_once(
+    platform: FakePlatform, servers: Servers, exit_code: int
+) -> None:
+    """The next server would fail in the same way, and the participant would wait for it."""
+    for attempt in (1, 2):
+        servers.start(StartServer("maze", "alice", attempt))
+        platform.tasks.running.clear()
+        stopped = event(platform, "STOPPED", attempt, stop_code="EssentialContainerExited", exit_code=exit_code)
+        servers.tasks_changed([stopped])
+        assert nothing_left(platform)
+    assert [m["attempt"] for topic, m in platform.bus.sent if topic is Topic.START] == [2]
+    assert may_go_without(record(platform))
+    assert requestable_attempt(record(platform)) == 3
 
 
 def test_a_replacement_has_its_own_token(platform: FakePlatform, servers: Servers) -> None:
