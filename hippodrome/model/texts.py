@@ -93,7 +93,7 @@ _WAITING = {
 _ENDED = {
     "endedTitle": "The game has ended",
     "failedTitle": "The game could not be started",
-    "lostTitle": "The game could not go on",
+    "lostTitle": "The game could not be played",
     "fullTitle": "The study is full just now",
     "stopped": "The computer for your game was switched off by the researchers.",
     "deadline": "The time for it was over.",

@@ -179,7 +179,7 @@ $named$content
 $content
 </fieldset>""",
     "action": '<input type="hidden" name="hippodrome-action" value="$action">\n',
-    "over": '<button type="submit" name="hippodrome-action" value="$action">$text</button>\n',
+    "over": '<p><button type="submit" name="hippodrome-action" value="$action">$text</button></p>\n',
     "report": "<p>$text</p>\n",
     "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n</div>',
     "reading": """

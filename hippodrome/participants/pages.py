@@ -250,7 +250,8 @@ def _report(view: GameView, texts: Texts) -> Html:
     contact = view.project.contact
     whom = texts.say("contact", contact=contact) if contact else texts["tell"]
     code = ids.completion_code(view.project.secret, view.user_id, FAILED)
-    return fill("report", text=f"{whom} {texts.say('quote', user=view.user_id, code=code)}")
+    quote = texts.say("quote", user=view.user_id, code=code)
+    return Html(fill("report", text=whom) + fill("report", text=quote))
 
 
 def _button(state: str, texts: Texts) -> str:

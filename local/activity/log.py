@@ -177,6 +177,8 @@ class ActivityLog:
         step, page = str(record.get("step", "?")), str(record.get("page", ""))
         kind = type_of(page)
         done = "played" if kind.on_server else "answered"
+        if isinstance(answers := record.get("answers"), dict) and "completionCode" in answers and kind.on_server:
+            done = "went on without the game of"
         self.participant(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
         if step == self._last_step:
             self.participant(user_id, "came to the end of the study", "green")

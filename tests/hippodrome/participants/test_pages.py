@@ -478,7 +478,7 @@ def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> 
 @pytest.mark.parametrize(
     ("reason", "title", "report"),
     [
-        (Reason.LOST, "The game could not go on", True),
+        (Reason.LOST, "The game could not be played", True),
         (Reason.FULL, "The study is full just now", False),
         (Reason.REFUSED, "The game could not be started", True),
         (Reason.NO_CAPACITY, "The game could not be started", False),
