@@ -805,6 +805,23 @@ def test_the_page_of_a_game_that_failed_for_good_offers_to_try_again(
     shot(tab, f"{width}-3-{reason.replace(' ', '-')}")
 
 
+@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("again", [True, False])
+def test_a_participant_goes_on_without_a_game_that_failed(world: World, tab: Any, width: int, again: bool) -> None:
+    tab.set_viewport_size({"width": width, "height": 740})
+    world.step = 2
+    world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": again, "without": True, "reason": "lost"}
+    tab.goto(world.url)
+    buttons = ["Go on without the game", "Try again"] if again else ["Go on without the game"]
+    assert tab.locator("main button:visible").all_inner_texts() == buttons
+    assert tab.evaluate(FLAWS) == []
+    shot(tab, f"{width}-3-without{'-or-again' if again else ''}")
+    with tab.expect_navigation():
+        tab.click("button:text('Go on without the game')")
+    assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "without"}]
+    assert tab.locator("#over").count() == 0, "the next step is shown"
+
+
 def test_the_button_of_a_failed_game_asks_for_it_again(world: World, tab: Any) -> None:
     world.step = 2
     world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": True}
