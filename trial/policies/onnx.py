@@ -53,8 +53,8 @@ class _Port:
 class _Ports:
     """The inputs and outputs of a file by their purpose."""
 
-    observation: tuple[_Port, ...]
-    """The input for the whole observation, or an input for each of its parts, which has the part's name."""
+    observation: tuple[tuple[_Port, Encoding], ...]
+    """The input for the whole observation, or inputs with the names of its parts; and the encoding of each."""
     states: Mapping[str, _Port]
     """The recurrent states: by the name of an output, the input that gets its value at the next call."""
     constants: Mapping[str, Array]
@@ -66,11 +66,9 @@ class _Ports:
 class OnnxPolicy:
     """Takes the action with the highest value; with `sample`, a random action by the softmax of the values."""
 
-    def __init__(
-        self, spec: str, session: Any, ports: _Ports, count: int, encode: Encoding, *, sha256: str, sample: bool
-    ) -> None:
+    def __init__(self, spec: str, session: Any, ports: _Ports, count: int, *, sha256: str, sample: bool) -> None:
         self._spec, self._session, self._ports, self._count = spec, session, ports, count
-        self._encode, self._sha256, self._sample = encode, sha256, sample
+        self._sha256, self._sample = sha256, sample
         self._random = Random(0)  # noqa: S311 - a game
         self._fetched = [ports.action, *ports.states]
         self._state: dict[str, Array] = {}
@@ -112,13 +110,10 @@ class OnnxPolicy:
     def _inputs(self, observation: Any) -> dict[str, Array]:
         """Return the values of the inputs that take the observation, by the names of the inputs."""
         observation = without_mask(observation)
-        if len(self._ports.observation) == 1:
-            port = self._ports.observation[0]
-            if isinstance(observation, Mapping) and set(observation) == {port.name}:
-                observation = observation[port.name]
-            return {port.name: _fit(self._spec, self._encode(observation), port)}
-        parts = self._ports.observation
-        return {port.name: _fit(self._spec, np.asarray(observation[port.name]), port) for port in parts}
+        return {
+            port.name: _fit(self._spec, encode(_part(observation, port)), port)
+            for port, encode in self._ports.observation
+        }
 
     def _mask_input(self, port: _Port, mask: Mask | None) -> Array:
         allowed = np.ones(self._count) if mask is None else np.asarray(mask)
@@ -162,14 +157,13 @@ def load(spec: str, file: Path, count: int, space: Any, *, sample: bool) -> Onnx
     actions.
     """
     session = _session(spec, file)
-    inputs, outputs = ([_port(spec, port) for port in ports] for ports in (session.get_inputs(), session.get_outputs()))
+    inputs, outputs = [_port(spec, port) for port in session.get_inputs()], session.get_outputs()
     try:
         first = None if space is None else without_mask(zero(space))
     except MemoryError as error:
         raise PolicyError(f"{spec} cannot be tried: an observation of the environment needs more memory") from error
-    ports = _read(spec, inputs, outputs, first)
-    encode = _encoding(spec, ports, space, first)
-    policy = OnnxPolicy(spec, session, ports, count, encode, sha256=_sha256(file), sample=sample)
+    ports = _read(spec, inputs, outputs, space, first)
+    policy = OnnxPolicy(spec, session, ports, count, sha256=_sha256(file), sample=sample)
     if first is not None:
         policy.act(first, {}, None)
         policy.reset(0)
@@ -198,8 +192,8 @@ def _port(spec: str, port: Any) -> _Port:
     return _Port(port.name, _TYPES[port.type], tuple(port.shape))
 
 
-def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _Ports:
-    """Find out what each input and output is for. `first` is an observation, or None.
+def _read(spec: str, inputs: list[_Port], outputs: list[Any], space: Any, first: Any) -> _Ports:
+    """Find out what each input and output is for. `space` is that of the observations, `first` one of them, or None.
 
     Raises PolicyError for an input of unknown purpose.
     """
@@ -214,7 +208,7 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
     state_inputs = [port for port in rest if port is not mask and port.name not in constants]
     states = _states(spec, state_inputs, outputs)
     return _Ports(
-        observation=observation,
+        observation=tuple((port, _encoding(port, space, first)) for port in observation),
         states=states,
         constants=constants,
         mask=mask,
@@ -223,16 +217,18 @@ def _read(spec: str, inputs: list[_Port], outputs: list[_Port], first: Any) -> _
 
 
 def _observation_inputs(inputs: list[_Port], first: Any) -> tuple[_Port, ...]:
-    """Return the inputs for the observation: one for each part, by its name; or one with a usual name; or the first."""
-    if isinstance(first, Mapping):
-        parts = tuple(port for port in inputs if port.name in first)
-        if len(parts) == len(first):
-            return parts
+    """Return the inputs for the observation: those with the names of its parts; or one with a usual name; or the first.
+
+    A file may take only some parts.
+    """
+    parts = tuple(port for port in inputs if isinstance(first, Mapping) and port.name in first)
+    if parts:
+        return parts
     named = [port for name in _OBSERVATION for port in inputs if port.name == name]
     return ((named or inputs)[0],)
 
 
-def _states(spec: str, inputs: list[_Port], outputs: list[_Port]) -> dict[str, _Port]:
+def _states(spec: str, inputs: list[_Port], outputs: list[Any]) -> dict[str, _Port]:
     """Pair the recurrent states: return, by an output's name, the input that gets its value at the next call.
 
     Names decide, and for the others the shapes, in their order. Raises PolicyError for an input
@@ -278,17 +274,18 @@ def _same_shape(one: Shape, other: Shape) -> bool:
     )
 
 
-def _encoding(spec: str, ports: _Ports, space: Any, first: Any) -> Encoding:
-    """Choose the encoding with which observations fit the file's one input. Raises PolicyError if there is none."""
-    possible = encodings(_without_mask_space(space))
-    if first is None or len(ports.observation) > 1:
-        return possible[0]
-    port = ports.observation[0]
-    for encode in possible:
-        if fitted(encode(first), port.shape) is not None:
-            return encode
-    _fit(spec, possible[0](first), port)
-    raise AssertionError("unreachable")
+def _part(observation: Any, port: _Port) -> Any:
+    """Return the part of an observation that has the input's name; the whole observation if it has no such part."""
+    return observation[port.name] if isinstance(observation, Mapping) and port.name in observation else observation
+
+
+def _encoding(port: _Port, space: Any, first: Any) -> Encoding:
+    """Choose the encoding with which observations fit an input; the usual one if none fits, or if none was tried."""
+    space, value = _without_mask_space(space), _part(first, port)
+    parts = getattr(space, "spaces", None)
+    possible = encodings(parts[port.name] if isinstance(parts, Mapping) and port.name in parts else space)
+    fitting = (each for each in possible if first is not None and fitted(each(value), port.shape) is not None)
+    return next(fitting, possible[0])
 
 
 def _without_mask_space(space: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, save
 
 from protocol.players import ONNXRUNTIME
 from testing import onnx_files
@@ -224,6 +224,46 @@ def test_parts_of_an_observation_go_to_the_inputs_of_their_names(tmp_path: Path)
     onnx_files.save(tmp_path / "p.onnx", nodes, [("left", (1, 1)), ("right", (1, 2))], [("output", (1, 3))])
     policy = load_policy("p.onnx", tmp_path, 3, Dict(right=Box(0, 9, (2,)), left=Box(0, 9, (1,))))
     assert policy.act({"left": [1], "right": [0, 4]}, {}, None) == 2
+
+
+MAP = Dict(right=Box(0, 9, (2,)), left=Box(0, 9, (1,)), direction=Discrete(3, start=1))
+
+
+def test_a_file_need_not_take_all_parts_of_an_observation(tmp_path: Path) -> None:
+    nodes = [helper.make_node("Identity", ["right"], ["output"])]
+    onnx_files.save(tmp_path / "p.onnx", nodes, [("right", (1, 2))], [("output", (1, 2))])
+    policy = load_policy("p.onnx", tmp_path, 2, MAP)
+    assert policy.act({"left": [1], "right": [0, 4], "direction": 1}, {}, None) == 1
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_a_discrete_part_becomes_one_hot_if_its_input_takes_that(tmp_path: Path, wide: bool) -> None:
+    nodes = [helper.make_node("Concat", ["right", "direction"], ["output"], axis=1)]
+    size = 3 if wide else 1
+    inputs = [("right", (1, 2)), ("direction", (1, size))]
+    onnx_files.save(tmp_path / "p.onnx", nodes, inputs, [("output", (1, 2 + size))])
+    policy = load_policy("p.onnx", tmp_path, 2 + size, MAP)
+    seen = {"left": [9], "right": [0, 0], "direction": 3}
+    assert policy.act(seen, {}, None) == (4 if wide else 2)
+
+
+def test_an_output_that_is_not_used_may_be_of_any_type(tmp_path: Path) -> None:
+    """As scikit-learn's classifiers are exported: the label, and a list of maps with the probabilities."""
+    nodes = [
+        helper.make_node("ArgMax", ["x"], ["output_label"], axis=1, keepdims=0),
+        helper.make_node("ZipMap", ["x"], ["output_probability"], domain="ai.onnx.ml", classlabels_int64s=[0, 1]),
+    ]
+    maps = helper.make_sequence_type_proto(
+        helper.make_map_type_proto(TensorProto.INT64, helper.make_tensor_type_proto(TensorProto.FLOAT, []))
+    )
+    outputs = [
+        helper.make_tensor_value_info("output_label", TensorProto.INT64, [1]),
+        helper.make_value_info("output_probability", maps),
+    ]
+    graph = helper.make_graph(nodes, "g", [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 2])], outputs)
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("ai.onnx.ml", 3)]
+    save(helper.make_model(graph, opset_imports=opsets, ir_version=9), tmp_path / "p.onnx")
+    assert load_policy("p.onnx", tmp_path, 2).act([0, 1], {}, None) == 1
 
 
 def test_a_file_may_choose_the_action_itself(tmp_path: Path) -> None:
