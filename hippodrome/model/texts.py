@@ -72,7 +72,10 @@ _WAITING = {
     "waiting": "Waiting for {time}.",
     "usually": "Usually it takes about {time}.",
     "takesLonger": "This takes longer than usual. Please stay on this page.",
-    "noConnection": "No connection – trying again…",
+    "noConnection": (
+        "No connection – trying again… Your answers are kept. Please stay on this page: it continues by itself. "
+        "If this lasts for minutes, try another network, or tell whoever invited you to this study."
+    ),
     "needsScript": (
         "The game needs JavaScript, which is switched off in this browser. "
         "Please switch it on, or open your study link in another browser."
@@ -168,9 +171,10 @@ _GAME = {
     "yourTurnLeft": "Your turn ({seconds} s)",
     "otherTurn": "The other player’s turn",
     "othersTurn": "The others’ turn",
-    "thisGameOver": "This game is over",
+    "youChose": "You chose “{action}”.",
+    "timeUp": "Time was up: “{action}” was chosen for you.",
+    "timeUpEnds": "The time for a choice was up, so this game has ended.",
     "gameOver": "Game {game} of {games} is over",
-    "nextSoon": "The next one begins in a moment.",
     "nextGameIn": "The next game begins in {time}.",
     "goOnNow": "Go on now",
     "instructions": "Instructions",
@@ -179,10 +183,9 @@ _GAME = {
     "nextGame": "Next game",
     "hangs": "The connection hangs. Please stay on this page.",
     "lost": "Connection lost – trying again…",
-    "lostNote": "Your game is kept. Please stay on this page.",
-    "unreachable": "Your game cannot be reached – trying again…",
-    "unreachableNote": (
-        "Your game is kept. If this lasts for minutes, try another network, or tell whoever invited you to this study."
+    "lostNote": (
+        "Your game is kept. Please stay on this page: it continues by itself. "
+        "If this lasts for minutes, try another network, or tell whoever invited you to this study."
     ),
     "elsewhere": "The game was opened in another tab or on another device",
     "elsewhereNote": "If you have closed it there, go on here.",
@@ -191,7 +194,10 @@ _GAME = {
     "over": "The game is over",
     "thanksForPlaying": "Thank you for playing!",
     "savedMoment": "Your game is saved. One moment, please…",
-    "savedOffline": "Your game is saved. There is no connection at the moment – trying again…",
+    "savedOffline": (
+        "Your game is saved. There is no connection at the moment – trying again… Please stay on this page: it continues "
+        "by itself. If this lasts for minutes, try another network."
+    ),
 }
 _LOBBY = {
     "lobbyTitleOther": "Waiting for another participant",
@@ -262,15 +268,11 @@ _TOGETHER = {
     "theirTurn": "{names}: their turn",
     "otherSees": (
         "The other participant can see that you are away, and the game waits for a short while. "
-        "Please stay on this page."
+        "What you have played is kept. Please stay on this page. If this lasts, try another network."
     ),
     "othersSee": (
         "The other participants can see that you are away, and the game waits for a short while. "
-        "Please stay on this page."
-    ),
-    "unreachableTogether": (
-        "What you have played is kept. If this lasts for minutes, try another network, or tell whoever invited you to "
-        "this study."
+        "What you have played is kept. Please stay on this page. If this lasts, try another network."
     ),
     "endForAll": "End the game for everybody",
     "hasEnded": "The game has ended",

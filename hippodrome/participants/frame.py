@@ -211,7 +211,7 @@ def fill(name: str, texts: Texts = IN_ENGLISH, /, **values: Any) -> Html:
     return Html(_template(name, texts).substitute(safe))
 
 
-_SECTION = re.compile(r"^/\* (step|game) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
+_SECTION = re.compile(r"^/\* (step|game|message) pages: \*/$(.*?)^/\* all pages: \*/$", re.DOTALL | re.MULTILINE)
 
 
 @cache

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from protocol.trial import TrialSection
-from trial.core.actions import Action
+from trial.core.actions import Action, By
 from trial.core.controls import Controls
 from trial.core.messages import CommandRefused
 from trial.core.players import NOOP, Mask, Player, View, is_legal, legal_or_idle, random_action
@@ -227,16 +227,18 @@ class Choices:
         for name in self.waits_for:
             player, mask = self._players[name], self._mask(name)
             advice = self._advice.get(name)
+            by: By = "none"
             if advice is not None and is_legal(advice, mask):
-                turns.choose(name, Action(advice, player.action_space[advice], "advice"))
+                index, by = advice, "advice"
             elif self._config.turn_ends == "episode":
+                turns.timed_out = dict.fromkeys(self._humans, "")
                 return True
             elif self._config.turn_ends == "random":
-                index = random_action(player, mask, policy_seed(self.seed, f"{name}/{steps}"))
-                turns.choose(name, Action(index, player.action_space[index], "random"))
+                index, by = random_action(player, mask, policy_seed(self.seed, f"{name}/{steps}")), "random"
             else:
                 index = legal_or_idle(player.idle, player, mask)
-                turns.choose(name, Action(index, player.action_space[index]))
+            turns.choose(name, Action(index, player.action_space[index], by))
+            turns.timed_out[name] = player.action_space[index]
         return False
 
     def _waiting(self) -> tuple[str, ...]:

@@ -146,8 +146,8 @@ class Clients:
     def state_of(self, progress: TrialProgress, player: str) -> tuple[object, ...]:
         """Return the state, the episode, the score and others: if one changes, a client is sent the state again."""
         score, to_act = progress.scores[player], progress.turns is not None and progress.to_act(player)
-        frozen = progress.shows_first_picture
-        return progress.state, progress.episode, score, progress.frame_rate, frozen, self._members, to_act
+        frozen, choice = progress.shows_first_picture, progress.choice_of(player)
+        return progress.state, progress.episode, score, progress.frame_rate, frozen, self._members, to_act, choice
 
     def show(self, pictures: Pictures) -> None:
         """Send each client its new picture, under a new frame id."""
@@ -168,6 +168,7 @@ def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) ->
     arguments = times._asdict()
     if progress.turns is not None:
         arguments["to_act"] = progress.to_act(player)
+        arguments["chosen"], arguments["time_up"] = progress.choice_of(player)
         if not arguments["to_act"]:
             arguments["turn_ends_in"] = None
     if times.session is not None:

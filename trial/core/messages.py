@@ -234,6 +234,8 @@ def controls(
     players: Collection[str] = (),
     to_act: bool | None = None,
     turn_ends_in: float | None = None,
+    chosen: str | None = None,
+    time_up: str | None = None,
     scene: Mapping[str, Any] | None = None,
     starts_in: float | None = None,
     time_left: float | None = None,
@@ -262,7 +264,7 @@ def controls(
             **({"words": list(words)} if words else {}),
             **({"player": player, "players": list(players)} if len(players) > 1 else {}),
             **({"pace": "turns"} if to_act is not None else {}),
-            **_turn(to_act, turn_ends_in),
+            **_turn(to_act, turn_ends_in, chosen, time_up),
             **(scene or {}),
             **(input_of_project or {}),
             **seconds(startsIn=starts_in, timeLeft=time_left),
@@ -281,6 +283,8 @@ def state(
     next_in: float | None = None,
     to_act: bool | None = None,
     turn_ends_in: float | None = None,
+    chosen: str | None = None,
+    time_up: str | None = None,
     starts_in: float | None = None,
     time_left: float | None = None,
     session: Mapping[str, Any] | None = None,
@@ -289,11 +293,12 @@ def state(
 
     `starts_in`: the time for which the episode's first picture is still shown before the game goes on. `time_left`: the
     time of play that is left in the episode. `next_in`: the time until the break ends. `to_act`: turn by turn, whether
-    it is the client's turn; `turn_ends_in`: the time until that turn ends. `session`: in a session, the fields about
-    its members.
+    it is the client's turn; `turn_ends_in`: the time until that turn ends; `chosen`, `time_up`: the action that is
+    chosen for the client's player, and what was chosen because the time was up (`TrialProgress.choice_of`). `session`:
+    in a session, the fields about its members.
     """
     scores = _scores(score, episode_score, next_in)
-    turn, times = _turn(to_act, turn_ends_in), seconds(startsIn=starts_in, timeLeft=time_left)
+    turn, times = _turn(to_act, turn_ends_in, chosen, time_up), seconds(startsIn=starts_in, timeLeft=time_left)
     fields = {"state": state, "episode": episode, "frameRate": frame_rate, **scores, **turn, **times}
     return json.dumps({**fields, **session} if session else fields)
 
@@ -303,9 +308,9 @@ def seconds(**times: float | None) -> dict[str, float]:
     return {name: round(time, 3) for name, time in times.items() if time is not None and time < math.inf}
 
 
-def _turn(to_act: bool | None, ends_in: float | None) -> dict[str, Any]:
-    fields: dict[str, Any] = {} if to_act is None else {"toAct": to_act}
-    return fields | seconds(turnEndsIn=ends_in)
+def _turn(to_act: bool | None, ends_in: float | None, chosen: str | None, time_up: str | None) -> dict[str, Any]:
+    fields = {"toAct": to_act, "chosen": chosen, "timeUp": time_up}
+    return {name: value for name, value in fields.items() if value is not None} | seconds(turnEndsIn=ends_in)
 
 
 def _scores(score: float, episode_score: float, next_in: float | None) -> dict[str, float]:

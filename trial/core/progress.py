@@ -229,6 +229,16 @@ class TrialProgress:
         """Turn by turn: whether the game waits for this player's choice now."""
         return self.playing and self.turns is not None and self.turns.waits_for(player)
 
+    def choice_of(self, player: str) -> tuple[str | None, str | None]:
+        """Turn by turn: return the action that is chosen for this player in the present turn, and `Turns.timed_out`.
+
+        None for each that there is not.
+        """
+        if self.turns is None:
+            return None, None
+        chosen = self.turns.chosen.get(player)
+        return None if chosen is None else chosen.name, self.turns.timed_out.get(player)
+
     # ---- steps
 
     def began(self) -> None:

@@ -19,6 +19,9 @@ class Turns:
         """The players who are to act in this turn."""
         self.chosen: dict[str, Action] = {}
         """By player, the choices of this turn."""
+        self.timed_out: dict[str, str] = {}
+        """By player, what was chosen for a human whose time was up: the action's name, or "" if the episode ended
+        instead. It stays until the human chooses again."""
 
     def begin(self, to_act: frozenset[str]) -> None:
         """Begin a turn. Its time does not run before `run` is called."""
@@ -39,6 +42,8 @@ class Turns:
         """Choose a player's action. It changes nothing if the player has chosen in this turn, or is not to act."""
         if self.waits_for(player):
             self.chosen[player] = action
+            if action.human:
+                self.timed_out.pop(player, None)
 
     def run(self, now: float) -> None:
         """Let the time of the turn run, because the game goes on."""

@@ -5,7 +5,7 @@ import { hooks } from "./hooks.js";
 import { data } from "./page.js";
 
 export const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the last has no lossy frames
-const SILENCE = 2_500; // ms without a message; then the page asks whether the server is there
+const SILENCE = 1_500; // ms without a message; then the page asks whether the server is there
 const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms for a connection to open; some firewalls neither let it through nor refuse it
 const ACK_EVERY = 8; // ms between acknowledgements; at high frame rates there would be too many
@@ -94,14 +94,14 @@ export function ask() {
   send({ command: "requestUI" });
 }
 
-// Gives up a connection that does not answer. `talks`: messages are expected; if none comes for SILENCE, it asks.
-// Returns the milliseconds since its last message; 0 without a connection.
-export function watch(talks) {
+// Asks after SILENCE, and gives up a connection that does not answer. Returns the milliseconds since its last message; 0
+// without a connection.
+export function watch() {
   if (!link) return 0;
   const now = performance.now();
   const silent = now - link.heard;
   const unreachable = link.socket.readyState === WebSocket.CONNECTING && silent > CONNECTING;
   if ((link.asked && now - link.asked > PATIENCE) || unreachable) link.end("lost");
-  else if (talks && silent > SILENCE) ask();
+  else if (silent > SILENCE) ask();
   return silent;
 }

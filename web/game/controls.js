@@ -19,7 +19,7 @@ export function buildControls(message) {
   const actions = own ? [] : singleActions(message.actionSpace);
   const space = own?.space ?? actions.includes("fire");
   const directions = Object.keys(DIRECTIONS).filter((name) => shown.has(name) && actions.includes(name));
-  const buttonOf = (name) => actionButton(name, message.labels?.[name] ?? DIRECTIONS[name]?.label ?? nice(name), DIRECTIONS[name]?.sign);
+  const buttonOf = (name) => actionButton(name, labelOf(name, message.labels), DIRECTIONS[name]?.sign);
   const others = actions.filter((name) => !(name in DIRECTIONS));
   game.directions = own?.arrows ?? directions.length > 0;
   game.offered = shown;
@@ -46,8 +46,11 @@ function singleActions(actionSpace) {
 }
 
 export function groupOf(className, buttons) {
-  return buttons.length ? followFingers(make("div", { className }, ...buttons)) : null;
+  const letters = buttons.map((each) => each.textContent.length);
+  return buttons.length ? followFingers(make("div", { className, style: `--letters:${Math.max(...letters)}` }, ...buttons)) : null;
 }
+
+export const labelOf = (action, labels = {}) => labels[action] ?? DIRECTIONS[action]?.label ?? nice(action);
 
 // "trainOnline" as "Train online"
 export function nice(name) {

@@ -11,10 +11,10 @@ let startsAt = null; // when the first picture begins to move
 let endsAt = null; // when the time is over, if the game is not held before
 let saidSoon = false;
 
-overlays.freeze = { title: TEXT.getReady, band: true };
+overlays.freeze = { title: TEXT.getReady };
 // One line at the top, so that the picture below can be seen.
 hooks.overlay.push((name) => {
-  find("overlay").style.cssText = name === "freeze" ? "inset: 0 0 auto; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
+  find("overlay").style.cssText = name === "freeze" ? "min-height: 0; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
 });
 document.querySelector(".hud").append(timeLeft);
 

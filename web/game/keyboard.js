@@ -52,12 +52,19 @@ function codeOf({ code, key }) {
   return /^[0-9]$/.test(key) ? `Digit${key}` : key;
 }
 
+// Keys play the game. A control that was reached with the Tab key keeps those that operate it; after a click or a touch,
+// controls keep none.
+const OPERATE = { BUTTON: /^( |Enter)$/, INPUT: /^(Arrow|Page|Home|End)/ }; // the only input is the slider for the speed
+let tabbed = false;
+
+window.addEventListener("pointerdown", () => { tabbed = false; }, true);
+
 export function onKeyDown(event) {
   if (event.key === "Meta") releaseAll(); // macOS sends no keyup of other keys while Cmd is held
   const does = hooks.key(event) ?? keys.get(codeOf(event));
+  if (!does && event.key === "Tab") tabbed = true;
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
-  const { target } = event;
-  if (target.matches("input, select, textarea") || (target.matches("button") && event.code === "Space")) return;
+  if (tabbed && OPERATE[event.target.tagName]?.test(event.key)) return;
   event.preventDefault(); // the page must not scroll
   if (event.repeat) return;
   if (!does.action) return command(does.command);

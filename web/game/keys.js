@@ -1,5 +1,5 @@
 // Keys and buttons of a project whose config.yml defines keys (`keys` in the server's message with `UI`).
-import { groupOf, nice } from "./controls.js";
+import { groupOf, labelOf } from "./controls.js";
 import { hooks } from "./hooks.js";
 import { DIRECTIONS } from "./keyboard.js";
 import { actionButton } from "./touch.js";
@@ -37,7 +37,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
   const single = new Map(all.filter(({ parts }) => parts.length === 1).map(({ parts, action }) => [parts[0], action]));
   bound = new Map(all.flatMap(({ parts }) => parts).map((key) => [nameOfKey(key), key]));
   const pad = Object.keys(ARROWS).filter((key) => bound.has(nameOfKey(key)));
-  const label = (action) => labels[action] ?? nice(action);
+  const label = (action) => labelOf(action, labels);
   const ofPad = ({ parts }) => parts.every((key) => pad.includes(key));
   const ofButtons = ({ parts }) => parts.every((key) => pad.includes(key) || single.has(key));
 

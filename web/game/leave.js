@@ -7,7 +7,7 @@ import { loadPage, pageAnswers, pause } from "./requests.js";
 // The parts of the server's last message: it lacks the score if the game was not played; `error` says why it went wrong.
 export async function leave({ score, episodes, error } = {}) {
   const text = score === undefined ? "" : episodes > 1 ? TEXT.totalScore(episodes, points(score)) : TEXT.yourScore(points(score));
-  if (error) Object.assign(overlays.over, { note: error, band: false });
+  if (error) Object.assign(overlays.over, { note: error, aside: false });
   const { note } = overlays.over;
   showOverlay("over");
   hideMessage();

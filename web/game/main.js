@@ -1,7 +1,7 @@
 // The game page: it waits for the participant's server, then plays. docs/wire.md describes the messages of the WebSocket,
 // docs/pages.md the answers to polls. The page carries these modules as one script (hippodrome/participants/scripts.py):
 // no top-level name may occur in two of them.
-import { isRunning, releaseAll, start } from "./actions.js";
+import { releaseAll, start } from "./actions.js";
 import { countDown } from "./breaks.js";
 import { ask, play, watch } from "./connection.js";
 import { buildControls } from "./controls.js";
@@ -17,8 +17,8 @@ import { clearDrafts } from "./storage.js";
 import { beat, isOver, noteRestart, pollDelay, restartedFor, showWaiting } from "./waiting.js";
 
 const HANGS = TEXT.hangs;
-const SILENT = 4_500; // ms without a message in a game, although the server was asked
-const LONG = 20_000; // after so many ms of trouble the page says more about it
+const SILENT = 2_200; // ms without a message, although the server was asked
+const LONG = 20_000; // ms without a message while the game is loaded
 const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may be lost, and a reload repeats it
 
 const title = document.title;
@@ -26,14 +26,12 @@ const title = document.title;
 async function main() {
   let state = data.state;
   let losses = 0;
-  let lostSince = null;
   let waitsSince = performance.now();
   for (let polls = 0; ; polls += 1) {
     if (state.state === "ready" && state.url) {
       const { why, welcome, result } = await playOn(state);
       losses = welcome ? 0 : losses + 1;
-      lostSince = welcome ? performance.now() : lostSince ?? performance.now();
-      if (why === "lost") showOverlay(performance.now() - lostSince < LONG ? "lost" : "unreachable");
+      if (why === "lost") showOverlay("lost");
       if (why === "done") return leave(result);
       if (why === "moved") await loadPage();
       if (why === "elsewhere") await playHere();
@@ -42,7 +40,6 @@ async function main() {
       waitsSince = performance.now();
     } else {
       document.title = data.title ?? title;
-      lostSince = null;
       await showServer(state);
       if (performance.now() - waitsSince > RELOAD_AFTER && !isOver(state)) await loadPage();
       await pause(pollDelay(state, polls));
@@ -96,15 +93,15 @@ function playHere() {
 }
 
 function checkForHang() {
-  const silent = watch(isRunning());
-  if (silent > SILENT && isRunning()) setText(find("trouble"), HANGS);
+  const silent = watch();
+  if (silent > SILENT && game.state !== "loading") setText(find("trouble"), HANGS);
   else if (find("trouble").textContent === HANGS) hideMessage();
   if (game.state === "loading" && silent > LONG) setText(find("overlay-hint"), TEXT.takesLonger);
 }
 
 clearDrafts();
 setInterval(() => find("wait").hidden || beat(), 1_000);
-setInterval(checkForHang, 1_000);
+setInterval(checkForHang, 500);
 setInterval(countDown, 200);
 find("again").addEventListener("submit", (event) => event.submitter?.value === "restart" && noteRestart());
 find("overlay-button").addEventListener("click", () => {

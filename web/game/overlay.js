@@ -1,4 +1,4 @@
-// The overlay that covers the picture while the game does not run, and short messages of the server.
+// The overlay that covers the picture, or at the end the controls, while the game does not run, and short messages of the server.
 import { hooks } from "./hooks.js";
 import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
@@ -7,19 +7,19 @@ export const overlays = {
   loading: { title: TEXT.loading },
   ready: { title: TEXT.ready, button: TEXT.start, hint: TEXT.orArrow },
   paused: { title: TEXT.paused, button: TEXT.goOn, hint: TEXT.orArrow },
-  break: { title: TEXT.thisGameOver, button: TEXT.goOnNow, band: true, note: TEXT.nextSoon },
+  break: { button: TEXT.goOnNow, aside: true }, // breaks.js has its words
   lost: { title: TEXT.lost, note: TEXT.lostNote },
-  unreachable: { title: TEXT.unreachable, note: TEXT.unreachableNote },
   elsewhere: { title: TEXT.elsewhere, button: TEXT.playHere, note: TEXT.elsewhereNote },
-  ended: { title: TEXT.saving, band: true },
-  over: { title: TEXT.over, button: TEXT.goOn, band: true },
+  ended: { title: TEXT.saving, aside: true },
+  over: { title: TEXT.over, button: TEXT.goOn, aside: true },
 };
 
 // Shows the overlay with that name; no overlay for names without one, such as "playing".
 export function showOverlay(name) {
   const overlay = Object.hasOwn(overlays, name) && overlays[name];
   find("overlay").hidden = !overlay;
-  find("overlay").classList.toggle("band", Boolean(overlay.band)); // the last picture stays visible
+  if (overlay.aside) find("controls").after(find("overlay")); // in their place: the last picture stays visible
+  else find("trouble").before(find("overlay"));
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
   find("mode").dataset.state = name;
   setText(find("mode"), { playing: TEXT.playing, paused: TEXT.paused }[name] ?? "");

@@ -24,7 +24,6 @@ find("reading-button")?.after(toGoOn);
 overlays.gathering = { title: waitsForAll };
 Object.assign(overlays, { held: {}, begins: {} });
 overlays.lost.note = pair ? TEXT.otherSees : TEXT.othersSee;
-overlays.unreachable.note = TEXT.unreachableTogether;
 // By outcome: the reason of an early end, if the server has sent none.
 const ENDINGS = {
   left: TEXT.youLeft,
@@ -88,9 +87,11 @@ function tellOf(name, before, now) {
 }
 
 // Turn by turn: says whose turn it is, if it is not the participant's.
-function sayWhoseTurn({ state, toAct, turnOf }) {
+function sayWhoseTurn({ state, toAct, turnOf, chosen }) {
   const names = Array.isArray(turnOf) ? turnOf.slice(0, MAX_NAMES).map((name) => playerName(String(name))) : [];
-  if (state === "playing" && !toAct && names.length) setText(find("turn"), TEXT.theirTurn(names.join(", ")));
+  if (state !== "playing" || toAct || !names.length) return;
+  const who = names.join(", ");
+  setText(find("turn"), chosen ? TEXT.waitingForNames(who) : TEXT.theirTurn(who));
 }
 
 // What covers the picture
@@ -156,7 +157,7 @@ function showWhoReads() {
 function noteEnd(message) {
   if (!Object.hasOwn(ENDINGS, message.outcome)) return;
   if (!message.episodes) delete message.score; // no game was played, so there is no score
-  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), band: false });
+  Object.assign(overlays.over, { title: TEXT.hasEnded, note: String(presence.reason || ENDINGS[message.outcome]), aside: false });
   setText(find("leave-title"), TEXT.thanks);
 }
 

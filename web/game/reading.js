@@ -10,6 +10,7 @@ const LAST_PICTURE = 2_500; // ms for which the last picture and the score are s
 
 const texts = { instructions: find("text-instructions"), between: find("text-betweenEpisodes") };
 const noted = `read-${data.step}`;
+const trouble = make("p", { className: "status warn", role: "status" });
 const again = make("button", { type: "button", id: "instructions-button", textContent: TEXT.instructions, hidden: true });
 
 let reading = ""; // the name of the text that is shown
@@ -50,14 +51,16 @@ hooks.waits = () => {
 
 hooks.overlay.push((name) => {
   clearTimeout(opening);
+  setText(trouble, name === "lost" ? `${TEXT.lost} ${overlays.lost.note}` : "");
   again.hidden = !texts.instructions || !["ready", "paused"].includes(name);
   if (name === "ready" && unread()) openText("instructions", TEXT.toGame);
   else if (name === "break" && texts.between) opening = setTimeout(openBetween, LAST_PICTURE);
-  else if (reading && name !== "lost" && name !== "unreachable") closeText();
+  else if (reading && name !== "lost") closeText();
 });
 
-if (texts.between) Object.assign(overlays.break, { button: TEXT.goOn, note: "" });
+if (texts.between) overlays.break.button = TEXT.goOn;
 find("overlay").append(again);
+find("reading").append(trouble);
 again.addEventListener("click", () => openText("instructions", TEXT.backToGame));
 find("reading-button").addEventListener("click", () => {
   if (reading === "between" && game.state === "break") return start();

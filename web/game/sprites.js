@@ -109,7 +109,7 @@ hooks.waits = () => loading() || othersWait();
 hooks.overlay.push((name) => {
   bar.hidden = true;
   progressShown = false;
-  if (["lost", "unreachable", "elsewhere"].includes(name)) {
+  if (["lost", "elsewhere"].includes(name)) {
     arrived = new Map(); // the next connection sends them anew
     asked = underWay = 0;
   } else if (loading()) showProgress();

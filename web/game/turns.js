@@ -1,32 +1,55 @@
-// Games that are played turn by turn: shows whose turn it is, and how much time is left.
+// Games that are played turn by turn: shows whose turn it is, how much time is left, what the participant has chosen, and
+// what was chosen for them because the time was up.
+import { labelOf } from "./controls.js";
 import { hooks } from "./hooks.js";
 import { find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const MINE = TEXT.yourTurn;
 const turn = make("span", { id: "turn" });
+const choice = make("span", { id: "choice" });
+let labels = {};
 let turnEndsAt = null;
 let wasMine = false;
 
-document.querySelector(".hud").append(turn);
+document.querySelector(".hud").append(turn, choice);
 const turnSheet = new CSSStyleSheet(); // only these games' pages need it
 turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
-.hud #turn { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
+.hud :is(#turn, #choice) { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
+.hud #choice { font-size: .875rem; line-height: 1.2; color: var(--ink); }
+#choice:empty { display: none; }
 #turn.mine { color: var(--ink); font-weight: 600; }
-@media (min-aspect-ratio: 5/4) { .hud #turn { flex: none; text-align: inherit; } }`);
+.hold[aria-pressed=true] { color: #fff; background: var(--accent); }
+@media (min-aspect-ratio: 5/4) { .hud :is(#turn, #choice) { flex: none; text-align: inherit; } }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, turnSheet];
 // A press that starts or resumes the game is no action.
 hooks.starts = () => true;
 
 hooks.message.push((message) => {
+  if (message.UI) labels = message.labels ?? {};
   if (!message.state) return;
   turnEndsAt = typeof message.turnEndsIn === "number" ? performance.now() + 1000 * message.turnEndsIn : null;
   showTurn();
+  showChoice(message);
   const mine = isMine();
-  const announced = find("announce").textContent === MINE;
-  if (mine ? !wasMine : announced) setText(find("announce"), mine ? MINE : "");
+  const announced = find("announce").textContent.endsWith(MINE);
+  if (mine ? !wasMine : announced) setText(find("announce"), mine ? `${message.timeUp === undefined ? "" : choice.textContent} ${MINE}`.trim() : "");
   wasMine = mine;
 });
+
+function showChoice({ chosen, timeUp }) {
+  const name = chosen && labelOf(chosen, labels);
+  let shown = false; // whether a button shows it
+  for (const button of document.querySelectorAll(".hold")) {
+    const is = name === button.getAttribute("aria-label");
+    shown ||= is;
+    if (is) button.setAttribute("aria-pressed", "true");
+    else button.removeAttribute("aria-pressed");
+  }
+  if (timeUp) setText(choice, TEXT.timeUp(labelOf(timeUp, labels)));
+  else if (timeUp === "") setText(choice, TEXT.timeUpEnds);
+  else setText(choice, chosen && !shown ? TEXT.youChose(name) : "");
+}
 
 const isMine = () => game.state === "playing" && Boolean(game.toAct);
 

@@ -28,6 +28,7 @@ NO_WORDS = {
     "ArrowRight",
     "ArrowDown",
     "Digit",
+    "Tab",
     "Key",
     "Space",
     "Meta",

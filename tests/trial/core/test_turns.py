@@ -210,6 +210,22 @@ def test_when_turn_seconds_are_over_the_action_of_turn_ends_is_taken(ends: str, 
     assert game.actions == {"me": expected}
 
 
+@pytest.mark.parametrize(("ends", "name"), [("idle", "noop"), ("random", "up")])
+def test_a_human_is_told_what_was_chosen_for_them_until_they_choose_again(ends: str, name: str) -> None:
+    masks = {"me": [ends == "idle", True, False]}
+    game = game_in_turns(turnSeconds=5, turnEnds=ends).playing(view_for("me", masks=masks))
+    assert not game.states[-1].keys() & {"chosen", "timeUp"}
+    game.wait(5.1)
+    game.stepped(view_for("me"))
+    assert game.states[-1] | {"toAct": True, "timeUp": name} == game.states[-1]
+    assert "chosen" not in game.states[-1]
+    game.say(action="up")
+    assert game.states[-1] | {"toAct": False, "chosen": "up"} == game.states[-1]
+    assert "timeUp" not in game.states[-1]
+    game.stepped(view_for("me"))
+    assert not game.states[-1].keys() & {"chosen", "timeUp"}
+
+
 def test_when_turn_seconds_are_over_the_episode_may_end() -> None:
     game = game_in_turns(turnSeconds=5, turnEnds="episode", maxEpisodes=1).playing(view_for("me"))
     game.say(action="up")
@@ -219,6 +235,7 @@ def test_when_turn_seconds_are_over_the_episode_may_end() -> None:
     assert (end["why"], end["scores"]) == ("turnSeconds", {"me": 1, "it": 2})
     assert game.trial.phase is Phase.FINISHED
     assert game.trial.progress.outcome == "finished"
+    assert game.states[-1] | {"state": "ended", "timeUp": ""} == game.states[-1]
 
 
 def test_a_pause_stops_the_clock_of_the_turn() -> None:

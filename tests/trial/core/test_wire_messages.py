@@ -219,6 +219,8 @@ def test_the_message_about_the_controls_has_a_further_field_only_if_there_is_som
     [
         ({"to_act": False}, {"toAct": False}),
         ({"to_act": True, "turn_ends_in": 1.5}, {"toAct": True, "turnEndsIn": 1.5}),
+        ({"to_act": False, "chosen": "up"}, {"toAct": False, "chosen": "up"}),
+        ({"to_act": True, "time_up": ""}, {"toAct": True, "timeUp": ""}),
         ({"starts_in": 0.0, "time_left": 2.0004}, {"startsIn": 0.0, "timeLeft": 2.0}),
         ({"next_in": math.inf}, {}),
         ({"session": {"you": "a"}}, {"you": "a"}),
