@@ -217,7 +217,7 @@ def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
 HANGS = "The connection hangs. Please stay on this page."
 
 
-def fall_silent(world: World, heard: list[dict[str, Any]]) -> None:
+def fall_silent(world: World, heard: list[dict[str, Any]], state: str = "playing") -> None:
     """Make the trial server send its first message and nothing more."""
 
     def speak(connection: Any) -> None:
@@ -225,7 +225,7 @@ def fall_silent(world: World, heard: list[dict[str, Any]]) -> None:
         for text in connection:
             heard.append(json.loads(text))
             if "token" in heard[-1] and len(world.connections) == 1:
-                said = {"UI": ["start"], "actionSpace": ["noop"], "state": "playing", "episode": 1, "maxEpisodes": 1}
+                said = {"UI": ["start"], "actionSpace": ["noop"], "state": state, "episode": 1, "maxEpisodes": 1}
                 connection.send(json.dumps({**said, "score": 0, "frameRate": 30}))
 
     world.play = speak  # type: ignore[method-assign]
@@ -233,18 +233,21 @@ def fall_silent(world: World, heard: list[dict[str, Any]]) -> None:
     world.ready()
 
 
-def test_within_six_seconds_the_page_says_that_the_connection_hangs(world: World, stopped_clock_tab: Any) -> None:
+@pytest.mark.parametrize("state", ["playing", "paused"])
+def test_within_three_seconds_the_page_says_that_the_connection_hangs(
+    world: World, stopped_clock_tab: Any, state: str
+) -> None:
     heard: list[dict[str, Any]] = []
-    fall_silent(world, heard)
+    fall_silent(world, heard, state)
     stopped_clock_tab.goto(world.url)
-    stopped_clock_tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    stopped_clock_tab.clock.run_for(6_000)
+    stopped_clock_tab.wait_for_selector(f"#mode[data-state={state}]", state="attached")
+    stopped_clock_tab.clock.run_for(3_000)
     assert stopped_clock_tab.inner_text("#trouble") == HANGS
     shot(stopped_clock_tab, "360-hangs")
     stopped_clock_tab.evaluate(
         """() => {
             const title = document.getElementById("overlay-title"), trouble = document.getElementById("trouble");
-            const note = () => title.textContent && (window.beside ??= trouble.textContent);
+            const note = () => title.textContent.includes("lost") && (window.beside ??= trouble.textContent);
             new MutationObserver(note).observe(title, { childList: true });
         }"""
     )
@@ -258,7 +261,7 @@ def test_a_message_of_the_server_clears_the_sentence_about_the_connection(world:
     fall_silent(world, heard)
     stopped_clock_tab.goto(world.url)
     stopped_clock_tab.wait_for_selector("#mode[data-state=playing]", state="attached")
-    stopped_clock_tab.clock.run_for(6_000)
+    stopped_clock_tab.clock.run_for(3_000)
     assert stopped_clock_tab.inner_text("#trouble") == HANGS
     tell(world, state="playing", episodeScore=30)
     stopped_clock_tab.wait_for_selector("#score:text('30')")

@@ -1,0 +1,98 @@
+"""The game page without a network: in each phase it says so, that what was done is kept, and what to do. Then it recovers."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.browser.test_together_browser import LOBBY
+from tests.browser.world import World, play, shot, tell
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+
+def waiting(world: World, page: Any) -> None:
+    world.step = 2
+    page.goto(world.url)
+    page.wait_for_selector("#wait:visible")
+
+
+def in_lobby(world: World, page: Any) -> None:
+    world.more, world.state = {"players": 2}, dict(LOBBY)
+    waiting(world, page)
+
+
+def playing(world: World, page: Any) -> None:
+    play(world, page)
+    tell(world, state="playing")
+    page.wait_for_selector("#mode[data-state=playing]", state="attached")
+
+
+def paused(world: World, page: Any) -> None:
+    play(world, page)
+    tell(world, state="paused")
+    page.wait_for_selector("#overlay-title:text('Paused')")
+
+
+def on_a_break(world: World, page: Any) -> None:
+    play(world, page)
+    tell(world, state="break", nextIn=60)
+    page.wait_for_selector("#overlay-hint:text('The next game begins')")
+
+
+def reading(world: World, page: Any) -> None:
+    world.trial, world.texts = {"betweenEpisodes": "pause"}, {"betweenEpisodes": "<h2>Have a rest</h2>"}
+    play(world, page)
+    tell(world, state="break")
+    page.wait_for_selector("h2:visible:text('Have a rest')")
+
+
+def saving(world: World, page: Any) -> None:
+    play(world, page)
+    tell(world, state="ended")
+    page.wait_for_selector("#overlay-title:text('Saving')")
+
+
+def over(world: World, page: Any) -> None:
+    play(world, page)
+    page.route("**/*", lambda route: route.abort() if route.request.method == "HEAD" else route.continue_())
+    world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1}))
+    page.click("#overlay-button:text('Go on')")
+    page.wait_for_selector("#leave:visible")
+    page.unroute("**/*")
+
+
+PHASES = [waiting, in_lobby, playing, paused, on_a_break, reading, saving, over]
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+@pytest.mark.parametrize("phase", PHASES, ids=lambda phase: phase.__name__)
+def test_without_a_network_the_page_says_what_is_kept_and_what_to_do_and_it_recovers(
+    world: World, lone_tab: Any, phase: Callable[[World, Any], None], width: int
+) -> None:
+    lone_tab.set_viewport_size({"width": width, "height": 740})
+    phase(world, lone_tab)
+    lone_tab.context.set_offline(True)
+    for connection in world.connections:
+        connection.socket.close()  # Chromium keeps a WebSocket to this machine
+    lone_tab.wait_for_function(
+        "() => ['connection', 'trying again', 'stay on this page', 'another network'].every(each => document.body.innerText.toLowerCase().includes(each))"
+    )
+    assert re.search(r"Your (answers are|game is) (kept|saved)", lone_tab.inner_text("main"))
+    assert lone_tab.evaluate("[document.documentElement.scrollWidth - innerWidth]") == [0]
+    shot(lone_tab, f"{width}-no-network-{phase.__name__}")
+    requests = len(world.polls)
+    lone_tab.context.set_offline(False)
+    if phase is over:
+        world.step, world.source = 3, "<h1>Next page</h1>"
+        lone_tab.wait_for_selector("h1:text('Next page')")
+    elif world.connections:
+        lone_tab.wait_for_selector("#overlay-title:text('Ready?')")
+        assert len(world.connections) == 2
+    else:
+        lone_tab.wait_for_selector("#wait-status:empty", state="attached")
+        assert len(world.polls) > requests
