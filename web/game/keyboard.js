@@ -54,7 +54,7 @@ function codeOf({ code, key }) {
 
 // Keys play the game. A control that was reached with the Tab key keeps those that operate it; after a click or a touch,
 // controls keep none.
-const OPERATE = { BUTTON: /^( |Enter)$/, INPUT: /^(Arrow|Page|Home|End)/ }; // the only input is the slider for the speed
+const OPERATE = { BUTTON: /^(\s|Enter)$/, INPUT: /^(Arrow|Page|Home|End)/ }; // the only input is the slider for the speed
 let tabbed = false;
 
 window.addEventListener("pointerdown", () => { tabbed = false; }, true);

@@ -10,7 +10,7 @@ const LAST_PICTURE = 2_500; // ms for which the last picture and the score are s
 
 const texts = { instructions: find("text-instructions"), between: find("text-betweenEpisodes") };
 const noted = `read-${data.step}`;
-const trouble = make("p", { className: "status warn", role: "status" });
+const trouble = make("p", { className: "problem", role: "status", hidden: true });
 const again = make("button", { type: "button", id: "instructions-button", textContent: TEXT.instructions, hidden: true });
 
 let reading = ""; // the name of the text that is shown
@@ -52,6 +52,7 @@ hooks.waits = () => {
 hooks.overlay.push((name) => {
   clearTimeout(opening);
   setText(trouble, name === "lost" ? `${TEXT.lost} ${overlays.lost.note}` : "");
+  trouble.hidden = name !== "lost";
   again.hidden = !texts.instructions || !["ready", "paused"].includes(name);
   if (name === "ready" && unread()) openText("instructions", TEXT.toGame);
   else if (name === "break" && texts.between) opening = setTimeout(openBetween, LAST_PICTURE);

@@ -29,6 +29,7 @@ NO_WORDS = {
     "ArrowDown",
     "Digit",
     "Tab",
+    "Numpad",
     "Key",
     "Space",
     "Meta",
