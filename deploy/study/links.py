@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
+import re
 import secrets
 import sys
 from collections.abc import Iterable, Sequence
@@ -19,6 +21,14 @@ from deploy.core import options, participants, register_function
 from hippodrome.model import ids
 from hippodrome.model.project import Project
 from hippodrome.registry import MAX_SIGNED
+
+_AROUND = " \u00a0\u200b\u2060\ufeff\"'"
+_HEADING = re.compile(
+    r"(?:.+[_ -])?(?i:p?ids?|codes?|names?|users?|workers?|participants?|subjects?|respondents?)"
+    r"|.*[a-z]I[Dd]s?|(?i:(?:user|worker|participant|prolific|subject|respondent|survey)(?:p?id|code)s?)"
+)
+"""The heading of a column of ids, such as `PROLIFIC_PID`, `Participant id` or `userId`."""
+_ROUNDED = re.compile(r"[0-9][.,]?[0-9]*[Ee]\+?[0-9]+|[0-9]+\.0*")
 
 
 def command(
@@ -82,19 +92,29 @@ def link(site: str, project: Project, user_id: str, signature: str) -> str:
 def _read(file: Path) -> list[str]:
     """Read the ids in a file, in their order, each once. Raises `Problem` if a line is neither an id nor empty."""
     try:
-        text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8-sig")
+        data = sys.stdin.buffer.read() if str(file) == "-" else file.read_bytes()
+        text = data.decode("utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise Problem(f"{file} cannot be read.", "It must be a UTF-8 text file with an id on each line.") from error
     return _checked(text.splitlines(), str(file))
 
 
 def _checked(lines: Iterable[str], name: str) -> list[str]:
+    """The ids in these lines, without what spreadsheets add: a heading, quotes, empty cells, invisible characters."""
     found: dict[str, None] = {}
-    for number, line in enumerate(lines, 1):
-        user = line.strip()
-        if user and not ids.is_user_id(user):
+    cells = [[cell.strip(_AROUND) for cell in re.split(r"[,;\t]", line)] for line in lines]
+    rows = [(number, [cell for cell in row if cell]) for number, row in enumerate(cells, 1) if any(row)]
+    for at, (number, row) in enumerate(rows):
+        if len(row) > 1:
+            raise Problem(f"{name}:{number}: there is more than an id.", "Keep only the column with the ids.")
+        if at == 0 and _HEADING.fullmatch(row[0]):
+            screen.warning(f"{name}:{number}: this line is taken as the heading of the ids, and gets no link.")
+        elif ids.is_user_id(row[0]):
+            found[row[0]] = None
+        elif _ROUNDED.fullmatch(row[0]):
+            advice = "Give the column the format Text, and enter the ids again: the digits of this one are lost."
+            raise Problem(f"{name}:{number}: a spreadsheet has made a number of this id.", advice)
+        else:
             advice = "An id has letters, digits, dashes and underscores, 64 at most; one on each line, nothing else."
             raise Problem(f"{name}:{number}: that is no participant's id.", advice)
-        if user:
-            found[user] = None
     return list(found)

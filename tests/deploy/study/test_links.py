@@ -67,6 +67,85 @@ def test_an_invalid_id_is_reported_with_its_line(world: RegisterWorld, capsys: A
     assert text.strip() not in ran.err
 
 
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "PROLIFIC_PID",
+        "participant",
+        "Participant id",
+        "userId",
+        "workerid",
+        "id",
+        "PID",
+        "sona_id",
+        "SubjectID",
+        "Code",
+    ],
+)
+def test_a_heading_is_not_invited_and_the_researcher_is_told(
+    world: RegisterWorld, capsys: Any, tmp_path: Path, heading: str
+) -> None:
+    (tmp_path / "ids.csv").write_text(f"{heading}\r\nP01\r\n")
+    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    assert [one["userId"] for one in ran.json] == ["P01"]
+    assert "ids.csv:1: this line is taken as the heading" in " ".join(ran.err.split())
+
+
+@pytest.mark.parametrize("first", ["david", "ann", "P01", "5f3c", "astrid", "userid7"])
+def test_an_id_in_the_first_line_is_no_heading(world: RegisterWorld, capsys: Any, tmp_path: Path, first: str) -> None:
+    (tmp_path / "ids.csv").write_text(f"{first}\nP02\n")
+    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    assert [one["userId"] for one in ran.json] == [first, "P02"]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        "\ufeffP01\r\nP02\r\n".encode("utf-16-le"),
+        "\ufeffP01\nP02".encode("utf-16-be"),
+        b'"P01"\n"P02"\n',
+        b"P01,\nP02,\n",
+        b";P01;;\nP02\n",
+        "P01\u00a0\nP02\u200b\n".encode(),
+        b"P01\rP02\r",
+        b"\n\nP01\t\nP01\nP02\n",
+    ],
+)
+def test_ids_are_read_as_spreadsheets_write_them(
+    world: RegisterWorld, capsys: Any, tmp_path: Path, data: bytes
+) -> None:
+    (tmp_path / "ids.csv").write_bytes(data)
+    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    assert [one["userId"] for one in ran.json] == ["P01", "P02"]
+
+
+def test_ids_from_stdin_may_begin_with_a_byte_order_mark(
+    world: RegisterWorld, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"\xef\xbb\xbfP01\n")))
+    assert [one["userId"] for one in run(world, capsys, "-", "--json").json] == ["P01"]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("P02;1", "there is more than an id. → Keep only the column with the ids."),
+        ("P02,group a", "there is more than an id."),
+        ("5.99E+23", "a spreadsheet has made a number of this id."),
+        ("5,99E+23", "there is more than an id."),
+        ("1001.0", "a spreadsheet has made a number of this id."),
+        ("participant id", "that is no participant's id."),
+    ],
+)
+def test_a_line_with_more_or_less_than_an_id_is_refused(
+    world: RegisterWorld, capsys: Any, tmp_path: Path, line: str, said: str
+) -> None:
+    (tmp_path / "ids.csv").write_text(f"P01\n{line}\n")
+    ran = run(world, capsys, str(tmp_path / "ids.csv"))
+    assert (ran.code, ran.out) == (Exit.FAILED, "")
+    assert f"ids.csv:2: {said}" in " ".join(ran.err.split())
+
+
 def test_links_needs_participants_and_a_known_project_and_says_if_links_are_not_signed(
     world: RegisterWorld, capsys: Any, tmp_path: Path
 ) -> None:
