@@ -11,8 +11,9 @@ import secrets
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,18 @@ class Options:
         return Wanted(bool(self.formats & {"parquet", "minari"}), self.raw, self.apart)
 
 
+def _with_those_here(folder: Path, options: Options) -> Options:
+    """Add the formats that the folder has from earlier runs: another format removes none, and none goes out of date.
+
+    Formats whose packages are not installed are left out.
+    """
+    here = {name for name in ("csv", "parquet") if (folder / f"answers.{name}").exists()}
+    here |= {"minari"} if (folder / "minari").is_dir() else set()
+    missing = {name for name, package in (("parquet", "pyarrow"), ("minari", "minari")) if find_spec(package) is None}
+    long = options.long or any(folder.glob("answers-long.*"))
+    return replace(options, formats=options.formats | (here - missing), long=long)
+
+
 def find_project(source: Source, project_id: str) -> Project | None:
     """Return the registered study, which has the order of its steps; None if it cannot be read, or is not there."""
     try:
@@ -68,6 +81,7 @@ def find_project(source: Source, project_id: str) -> Project | None:
 
 def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:
     """Return what a run would do. Changes nothing. Raises `Problem`."""
+    options = _with_those_here(folder, options)
     with _checked(folder, source, project_id, options) as (state, damaged):
         tally, known = Tally(damaged=len(damaged)), 0
         for unit in listing.units(project_id, listing.lines(source, project_id, state)):
@@ -127,6 +141,7 @@ def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Op
     except OSError as error:
         raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
     with _locked(folder):
+        options = _with_those_here(folder, options)
         try:
             state = ExportState(folder / _STATE)
         except sqlite3.DatabaseError:
@@ -209,6 +224,7 @@ def _run(
         "source": source.where,
         "identities": "apart" if options.apart else "together",
         "identitiesReplacedInAnswers": scrubbed,
+        "formats": sorted(options.formats),
         "counts": counts,
         "columns": [column.name for column in columns],
         "moved": [moved._asdict() for moved in answers.moved],

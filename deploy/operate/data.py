@@ -261,8 +261,11 @@ def _tell(made: dict[str, Any], target: Path) -> None:
         screen.warning(f"{problems} on files that are not as they should be: {target / 'problems.csv'}")
     if target.stat().st_mode & 0o077:
         screen.warning(f"Other users of this machine can read {target}/. To change that: chmod -R go-rwx {target}")
-    rows = [(name, f"{counts[name]:,}") for name in ("participants", "finished", "answers", "episodes", "frames")]
-    screen.table(["", "count"], rows, right=["count"])
+    has_recordings = made["formats"] != ["csv"]
+    counted = ("participants", "finished", "answers", *(("episodes", "frames") if has_recordings else ()))
+    screen.table(["", "count"], [(name, f"{counts[name]:,}") for name in counted], right=["count"])
+    if not has_recordings:
+        screen.info("  Recordings were not fetched. --format csv,parquet makes their tables, such as episodes.csv.")
     screen.success(
         f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {target}/"
     )

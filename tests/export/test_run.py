@@ -18,6 +18,7 @@ import pytest
 from console.problem import Exit
 from deploy.__main__ import main
 from export import fetch, manifest
+from export import run as export_run
 from export.fetch import Fetcher
 from export.page_fields import fields_of
 from export.source import FileGone, Folder
@@ -218,16 +219,43 @@ def test_documents_of_warm_servers_count_as_no_participants(place: Place) -> Non
     assert not [p for p in place.out.rglob("*") if p.is_file() and name.encode() in p.read_bytes()]
 
 
-def test_csv_alone_fetches_no_recordings_and_removes_earlier_tables_of_them(place: Place) -> None:
+def test_csv_alone_fetches_no_recordings_and_the_run_says_so(place: Place) -> None:
     crowd(place.put, place.tmp, 3)
     assert place.done("--format", "csv")["run"]["new"] == 3 * 3 + 2 * 2  # without the two recordings
     assert not (place.out / "recordings").exists()
     assert not (place.out / "answers.parquet").exists()
+    ran = place.run("--format", "csv")
+    assert "Recordings were not fetched" in ran.err
+    assert "episodes  " not in ran.out + ran.err
     assert place.done("--format", "csv,parquet")["run"]["new"] == 2
     assert (place.out / "answers.parquet").exists()
+    assert "Recordings were not fetched" not in place.run().err
+
+
+@pytest.mark.parametrize("formats", ["csv", "parquet", "minari"])
+def test_another_format_removes_nothing_and_leaves_nothing_out_of_date(place: Place, formats: str) -> None:
+    users = crowd(place.put, place.tmp, 3)
+    place.done("--format", "csv,parquet,minari", "--long")
+    before = set(place.listed())
+    record_of_one = key(users[0], "")
+    shutil.rmtree(place.data / record_of_one)
+    place.done("--format", formats)
+    assert set(place.listed()) == {path for path in before if users[0] not in path}
+    assert users[0] not in pq.read_table(place.out / "answers.parquet")["participant"].to_pylist()
+    for name in ("answers", "answers-long", "episodes"):
+        assert place.rows(name)
+        assert users[0] not in {row["participant"] for row in place.rows(name)}
+    hdf5 = (place.out / "minari/maze-3-v0/data/main_data.hdf5").read_bytes()
+    assert users[0].encode() not in hdf5
+    assert users[1].encode() in hdf5
+
+
+def test_a_format_whose_package_is_gone_is_removed_as_it_would_be_out_of_date(place: Place, monkeypatch: Any) -> None:
+    crowd(place.put, place.tmp, 1)
+    place.done("--format", "csv,parquet")
+    monkeypatch.setattr(export_run, "find_spec", lambda name: None)
     place.done("--format", "csv")
-    assert not (place.out / "answers.parquet").exists()  # it would be out of date
-    assert place.rows("answers")
+    assert not (place.out / "answers.parquet").exists()
 
 
 def test_raw_files_are_copied_byte_by_byte(place: Place) -> None:
