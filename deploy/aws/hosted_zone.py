@@ -105,6 +105,24 @@ def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
     return None
 
 
+def leading_away(account: Account, zone: Zone, name: str) -> tuple[str, str] | None:
+    """Return the name and type of a record by which nobody can see a TXT record of this name; None if there is none.
+
+    It is an NS record of the name, or of a name above it: those who ask for the name are sent to other name servers. Or
+    it is a CNAME record of the name, beside which Route 53 takes no other record.
+    """
+    labels = name.removesuffix(f".{zone.domain}").split(".")
+    for above in (f"{'.'.join(labels[n:])}.{zone.domain}" for n in range(len(labels))):
+        found = account.client("route53").list_resource_record_sets(
+            HostedZoneId=zone.id, StartRecordName=f"{above}.", MaxItems="10"
+        )
+        for record in found["ResourceRecordSets"]:
+            types = {"NS", "CNAME"} if above == name else {"NS"}
+            if record["Name"].rstrip(".").lower() == above and record["Type"] in types:
+                return above, record["Type"]
+    return None
+
+
 def exists(account: Account, zone: Zone, name: str) -> bool:
     """Whether a name in the zone exists: it or a name below it has records, or a wildcard record matches it.
 

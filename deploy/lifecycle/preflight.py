@@ -17,7 +17,7 @@ from console.formatting import count
 from console.problem import Problem
 from deploy.aws import caa, concurrency, quotas, regions
 from deploy.aws.account import Account, other_installations, servers_domain, site_host
-from deploy.aws.hosted_zone import delegation, exists, read_zone, record_in
+from deploy.aws.hosted_zone import delegation, exists, leading_away, read_zone, record_in
 from deploy.core.finding import Finding, Mark, bad, examine, look, show
 from deploy.stack import domain_change, inventory
 from deploy.stack.changes import Prepared
@@ -69,7 +69,7 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
         checks |= _OF_ADDRESSES
     if domain_change.moves(prepared):
-        checks |= {"CAA": _authorities, "servers' names": _servers_names}
+        checks |= {"CAA": _authorities, "proof": _proof, "servers' names": _servers_names}
     if (before.get("VpcId") or "") != after["VpcId"]:
         checks["servers"] = _servers_that_run
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
@@ -198,6 +198,20 @@ def _delegation(prepared: Prepared) -> Iterator[Finding]:
         yield look("domain", found.problem, f"Its name servers have to be {servers}.")
 
 
+def _proof(prepared: Prepared) -> Iterator[Finding]:
+    """Check that Let's Encrypt can see the zone's TXT record, by which an installation proves its servers' domain."""
+    zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
+    proof = f"_acme-challenge.{servers_domain(prepared.parameters)}"
+    if away := leading_away(prepared.account, zone, proof):
+        name, kind = away
+        yield bad(
+            "domain",
+            f"The zone has a record {kind} of {name}, so no authority can see the proof that the servers' domain is "
+            f"yours: the TXT record {proof}.",
+            "Remove that record from the zone, or take another --servers.",
+        )
+
+
 def _authorities(prepared: Prepared) -> Iterator[Finding]:
     """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
     after = prepared.parameters
@@ -271,6 +285,7 @@ def _other_stacks(prepared: Prepared) -> Iterator[Finding]:
 _OF_ADDRESSES: Mapping[str, Callable[[Prepared], Iterable[Finding]]] = {
     "domain": _delegation,
     "CAA": _authorities,
+    "proof": _proof,
     "site": _site,
     "servers": _servers_that_run,
     "other stacks": _other_stacks,

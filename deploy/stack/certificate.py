@@ -18,7 +18,7 @@ from console import screen
 from console.problem import Exit, Problem
 from deploy.aws import caa
 from deploy.aws.account import STACK, Account, Installation, find_installation, open_account
-from deploy.aws.hosted_zone import delegation, exists, read_zone
+from deploy.aws.hosted_zone import delegation, exists, leading_away, read_zone
 from deploy.core import options
 from deploy.stack import certificate_transfer
 from hippodrome.certificates.rules import (
@@ -215,7 +215,7 @@ def renewal_of(
 
 
 def check(account: Account, installation: Installation, directory: str, own: bool = False) -> None:
-    """Raise `Problem` if the domain is not in the zone, the zone is not delegated, or a CAA record forbids the order.
+    """Raise `Problem` if the domain is not in the zone, the zone is not delegated, or a record forbids the order.
 
     `own` says that the directory belongs to an authority of one's own, which may use another DNS. Then only the zone is
     checked. If DNS cannot be asked about the delegation, this only warns.
@@ -238,6 +238,15 @@ def check(account: Account, installation: Installation, directory: str, own: boo
             f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers; then wait until "
             "that is known, which may take some hours.",
             zone.name_servers,
+        )
+    proof = f"_acme-challenge.{domain}"
+    if away := leading_away(account, zone, proof):
+        name, kind = away
+        raise Problem(
+            f"The hosted zone {zone.id} has a record {kind} of {name}, so no authority can see the proof, which is the "
+            f"TXT record {proof}.",
+            "Remove that record from the zone, or let the servers' names lie elsewhere: `python -m deploy apply "
+            "--servers …`.",
         )
     if authorities := CAA_NAMES.get(directory):
         _check_caa(domain, authorities, partial(exists, account, zone))

@@ -42,7 +42,8 @@ class Route53Challenges:
             if errors.code(error) == "NoSuchHostedZone":
                 raise OrderFailed(FailureReason.DNS, "the hosted zone does not exist any more") from error
             if errors.code(error) == "InvalidChangeBatch":  # such as: a CNAME has that name already
-                raise OrderFailed(FailureReason.DNS, f"Route 53 refuses the TXT record {name}") from error
+                reason = error.response["Error"].get("Message") or "it does not say why"
+                raise OrderFailed(FailureReason.DNS, f"Route 53 refuses the TXT record {name}: {reason}") from error
             raise
         while self._client().get_change(Id=change)["ChangeInfo"]["Status"] != "INSYNC":
             if time.monotonic() + POLL_PAUSE > deadline:

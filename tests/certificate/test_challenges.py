@@ -1,7 +1,9 @@
 """The challenge's TXT record in Route 53 (moto, with `MotoWorld`'s strictness about what a DELETE must say)."""
 
+import boto3
 import pytest
 from botocore.exceptions import ClientError
+from botocore.stub import Stubber
 
 from hippodrome.aws.challenges import Route53Challenges
 from hippodrome.certificates.rules import FailureReason, OrderFailed
@@ -76,6 +78,14 @@ def test_a_refused_record_is_a_failure_of_dns(moto_world, code):
     with pytest.raises(OrderFailed) as failed:
         moto_world.platform.challenges.put(NAME, [VALUE], 60)
     assert failed.value.reason is FailureReason.DNS
+
+
+def test_the_reason_why_route_53_refuses_a_record_is_told():
+    client, sentence = boto3.client("route53", region_name="eu-central-1"), "a conflicting RRSet of type CNAME exists"
+    with Stubber(client) as stub:
+        stub.add_client_error("change_resource_record_sets", "InvalidChangeBatch", f"[{sentence}]")
+        with pytest.raises(OrderFailed, match=rf"refuses the TXT record {NAME}: .*{sentence}"):
+            Route53Challenges(lambda: client, lambda _: "Z1").put(NAME, [VALUE], 60)
 
 
 def test_a_missing_right_is_raised_unchanged(moto_world):

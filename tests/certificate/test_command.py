@@ -243,6 +243,27 @@ def test_caa_records_that_forbid_the_authority_are_reported(world, delegated, ca
         assert '0 issuewild "letsencrypt.org"' in ran.err
 
 
+@pytest.mark.parametrize(
+    ("name", "kind", "reported"),
+    [
+        ("_acme-challenge.servers.example.org", "NS", True),
+        ("_acme-challenge.servers.example.org", "CNAME", True),
+        ("servers.example.org", "NS", True),
+        ("_acme-challenge.servers.example.org", "TXT", False),
+        ("_acme-challenge.www.example.org", "CNAME", False),
+        ("www.example.org", "NS", False),
+    ],
+)
+def test_a_record_that_hides_the_proof_is_reported_before_an_order(world, delegated, capsys, name, kind, reported):
+    value = '"earlier"' if kind == "TXT" else "elsewhere.example.net"
+    record = {"Name": name, "Type": kind, "TTL": 60, "ResourceRecords": [{"Value": value}]}
+    batch = {"Changes": [{"Action": "CREATE", "ResourceRecordSet": record}]}
+    world.client("route53").change_resource_record_sets(HostedZoneId=world.ids["zone"], ChangeBatch=batch)
+    ran = world.run(capsys, "certificate", "--production", "--dry-run")
+    assert ran.code == (1 if reported else 3), ran.err
+    assert (f"has a record {kind} of {name}, so no authority can see the proof" in ran.err) == reported
+
+
 def test_a_zone_of_another_domain_is_reported(internet, capsys):
     with Installed(RootDomain="example.com") as world:
         ran = world.run(capsys, "certificate", "--dry-run")

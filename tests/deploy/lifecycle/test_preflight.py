@@ -257,10 +257,10 @@ def test_a_used_up_quota_of_vpcs_is_a_problem(world: World) -> None:
 # -- the addresses -----------------------------------------------------------------------------------------------------
 
 
-def record(world: World, name: str) -> None:
+def record(world: World, name: str, kind: str = "A", value: str = "192.0.2.1") -> None:
     change = {
         "Action": "CREATE",
-        "ResourceRecordSet": {"Name": name, "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "192.0.2.1"}]},
+        "ResourceRecordSet": {"Name": name, "Type": kind, "TTL": 60, "ResourceRecords": [{"Value": value}]},
     }
     batch = {"Changes": [change]}
     world.account.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=batch)
@@ -274,6 +274,14 @@ def test_a_domain_that_is_not_delegated_is_a_problem_with_the_name_servers_to_se
     servers = world.account.client("route53").get_hosted_zone(Id=world.zone)["DelegationSet"]["NameServers"]
     assert len(servers) == 4
     assert all(one in found.advice for one in servers)
+
+
+@pytest.mark.parametrize("kind", ["CNAME", "NS"])
+def test_a_record_that_hides_the_proof_of_the_servers_domain_is_a_problem(world: World, kind: str) -> None:
+    record(world, f"_acme-challenge.{DOMAIN}", kind, "elsewhere.example.net")
+    found = only(findings(world))
+    assert found.mark is Mark.BAD
+    assert f"The zone has a record {kind} of _acme-challenge.{DOMAIN}, so no authority can see the proof" in found.text
 
 
 def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
