@@ -119,12 +119,13 @@ class Greedy(Calm):
 
 
 class GreedyShared(Calm):
-    """Writes into shared memory, which its own limit does not count."""
+    """Each step takes 20 MB more of shared memory, which the limit of a process does not count."""
+
+    kept: ClassVar[list[mmap.mmap]] = []
 
     def misbehave(self) -> None:
-        self.kept = mmap.mmap(-1, 400 * 2**20)
-        for _ in range(400):
-            self.kept.write(bytes(2**20))
+        self.kept.append(mmap.mmap(-1, 20 * 2**20))
+        self.kept[-1].write(bytes(20 * 2**20))
 
 
 class GreedyTogether(Calm):

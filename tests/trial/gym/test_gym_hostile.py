@@ -221,9 +221,18 @@ def test_too_many_processes_of_an_environment_are_ended(asking: TextClient) -> N
     assert reason == "The environments started more than 4 processes; all were ended."
 
 
-@pytest.mark.parametrize("env_id", ["Odd/GreedyTogether-v0", "Odd/GreedyShared-v0"])
-def test_environments_that_use_too_much_memory_are_ended(asking: TextClient, env_id: str) -> None:
-    reason = step_until_closed(asking, env_id)
+def test_processes_that_use_too_much_memory_together_are_ended(asking: TextClient) -> None:
+    reason = step_until_closed(asking, "Odd/GreedyTogether-v0")
+    assert reason == "The environments used more than 300 MB; their process was ended."
+
+
+def test_memory_that_processes_may_share_counts_too(asking: TextClient) -> None:
+    made = asking.make("Odd/GreedyShared-v0")
+    asking.ask("reset", instance_id=made)
+    with contextlib.suppress(ConnectionClosed):
+        for _ in range(20):
+            asking.ask("step", instance_id=made, action=1)
+    reason = closed_within(asking)
     assert reason == "The environments used more than 300 MB; their process was ended."
 
 
