@@ -85,11 +85,7 @@ def test_the_agent_is_told_its_game_and_options(recipe: Recipe, folder: Path, tm
 def test_a_project_without_an_agent_is_tried_with_its_game(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     (folder / "agent.py").unlink()
     status, said = tried(recipe, folder, tmp_path, game="nosuch/Game-v1")
-    assert (status, "NamespaceNotFound" in said, "import it in agent.py, or correct its name" in said) == (
-        1,
-        True,
-        True,
-    )
+    assert (status, "NamespaceNotFound" in said, "(module:Id-v0), or correct its name" in said) == (1, True, True)
 
 
 DRAWS = "        return self.env.render()\n"
