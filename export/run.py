@@ -79,8 +79,34 @@ def find_project(source: Source, project_id: str) -> Project | None:
     return found
 
 
+def _refuse_unknown(source: Source, project_id: str, folder: Path, project: Project | None) -> None:
+    """Raise `Problem` if a new folder would be filled from a source that holds no participant of this project."""
+    if (folder / _STATE).exists() or any(True for _ in source.list(keys.prefix(project_id))):
+        return
+    if project:
+        raise Problem(f"No participant has begun {project_id} yet.", f"Answers will be in the {source.where}.")
+    here = _registered(source)
+    raise Problem(
+        f"There is no project {project_id} in the {source.place}.",
+        f"It holds: {', '.join(here)}. Name the right one with --project: its id, or its folder (with make: "
+        "PROJECT=../my-study)."
+        if here
+        else "Name the right project with --project (with make: PROJECT=../my-study), or the right data: the folder "
+        "data/ of a study, or data-try/try-… of one rehearsal, with --from (with make: DATA=).",
+    )
+
+
+def _registered(source: Source) -> list[str]:
+    """Return the ids of the projects that are registered in the source, as far as their list can be read."""
+    try:
+        return sorted(project.id for project in read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST)).projects)
+    except (FileGone, TooLarge, ValueError, RecursionError):
+        return []
+
+
 def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:
     """Return what a run would do. Changes nothing. Raises `Problem`."""
+    _refuse_unknown(source, project_id, folder, find_project(source, project_id))
     options = _with_those_here(folder, options)
     with _checked(folder, source, project_id, options) as (state, damaged):
         tally, known = Tally(damaged=len(damaged)), 0
@@ -127,13 +153,7 @@ def run(source: Source, project_id: str, folder: Path, options: Options) -> dict
 def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
     project = find_project(source, project_id)
     _refuse_foreign(folder)
-    if not (folder / _STATE).exists() and not any(True for _ in source.list(keys.prefix(project_id))):
-        if project:
-            raise Problem(f"No participant has begun {project_id} yet.", f"Answers will be in the {source.where}.")
-        raise Problem(
-            f"There is no project {project_id} in the {source.where}.",
-            "Name the right one with --project: its id, or its folder (with make: PROJECT=../my-study).",
-        )
+    _refuse_unknown(source, project_id, folder, project)
     try:
         private = folder / PRIVATE
         private.mkdir(parents=True, exist_ok=True)

@@ -314,6 +314,19 @@ def test_a_second_run_fetches_only_what_is_new_or_changed(place: Place) -> None:
     assert len(place.rows("episodes")) == 4
 
 
+@pytest.mark.parametrize("more", [(), ("--dry-run",)])
+def test_a_project_that_the_folder_does_not_hold_is_refused_and_those_that_it_holds_are_named(
+    place: Place, more: tuple[str, ...]
+) -> None:
+    place.put(MASTER_LIST, to_json(MasterList([PROJECT])))
+    crowd(place.put, place.tmp, 1)
+    ran = place.run("--project", "mase", *more)
+    assert (ran.code, f"There is no project mase in the folder {place.data}" in ran.err) == (Exit.FAILED, True)
+    assert "It holds: maze." in ran.err
+    assert "data-try/try-…" in place.run("--from", str(place.tmp), *more).err
+    assert not place.out.exists()
+
+
 def test_a_dry_run_says_what_there_is_to_do_and_makes_nothing(place: Place) -> None:
     crowd(place.put, place.tmp, 3)
     size = sum(path.stat().st_size for path in (place.data / "maze").rglob("*") if path.is_file())
