@@ -88,6 +88,9 @@ def test_choices_are_equally_large_and_a_choice_is_shown(dilemma: World, phone: 
     phone.wait_for_selector("#turn:text('Your turn')")
     one, two = (box(phone, f"[data-action={each}]") for each in CHOICES)
     assert (one["width"], one["height"]) == (two["width"], two["height"])
+    column = box(phone, "#controls")
+    ends = (one["x"] - column["x"], column["x"] + column["width"] - two["x"] - two["width"])
+    assert abs(ends[0] - ends[1]) < 2, "they stand in the middle"
     picture = box(phone, ".stage")
     tell(dilemma, state="playing", toAct=False, chosen="defect")
     phone.wait_for_selector("[data-action=defect][aria-pressed=true]")

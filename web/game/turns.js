@@ -19,6 +19,7 @@ turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
 .hud #choice { font-size: .875rem; line-height: 1.2; color: var(--ink); }
 #choice:empty { display: none; }
 #turn.mine { color: var(--ink); font-weight: 600; }
+.others:first-child { min-width: 100%; }
 .hold[aria-pressed=true] { color: #fff; background: var(--accent); }
 @media (min-aspect-ratio: 5/4) { .hud :is(#turn, #choice) { flex: none; text-align: inherit; } }`);
 document.adoptedStyleSheets = [...document.adoptedStyleSheets, turnSheet];
