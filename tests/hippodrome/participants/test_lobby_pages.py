@@ -249,6 +249,26 @@ def test_a_form_for_another_server_asks_for_the_sessions_next_server(platform: F
     assert [m["userId"] for topic, m in platform.bus.sent if topic is Topic.START] == [membership.session]
 
 
+def test_a_member_goes_on_without_a_game_that_failed_and_the_others_may_still_try_again(platform: FakePlatform) -> None:
+    ann, bob = matched_pair(platform)
+    serve(platform)
+    membership = Repository(platform.documents).membership("maze", "ann")
+    assert membership
+    stored = Repository(platform.documents).server(ids.server_label("maze", str(membership.session)))
+    assert stored
+    lost = msgspec.structs.replace(server.close(stored.server, Reason.LOST, platform.now()), attempt=3)
+    platform.documents.put(server.key(lost.label), to_json(lost))
+    form = "&".join(f"{k}={v}" for k, v in hidden(ann.get()).items())
+    ann.send("POST", f"{form}&hippodrome-action=without", content_type=FORM)
+    answers = [key.split("/")[2] for key in platform.documents.kept if key.endswith("/answers/3.json")]
+    assert answers == ["ann"]
+    platform.bus.sent.clear()
+    form = "&".join(f"{k}={v}" for k, v in hidden(bob.get()).items())
+    bob.send("POST", f"{form}&hippodrome-action=restart", content_type=FORM)
+    started = [(m["userId"], m["attempt"]) for topic, m in platform.bus.sent if topic is Topic.START]
+    assert started == [(membership.session, 4)]
+
+
 def test_a_program_in_the_lobby_gets_the_page_wait_as_from_hippo(platform: FakePlatform) -> None:
     ann = Player(platform, "ann").to_game()
     answer = json.loads(ann.send(accept="application/json")["body"])
