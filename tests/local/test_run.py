@@ -120,7 +120,7 @@ def test_a_server_that_was_lost_between_two_runs_is_replaced(local: Make) -> Non
     here.kill()
     os.killpg(_group(here), signal.SIGKILL)
     here.run()
-    here.wait_for_text(r"server gone \(it was lost\)")
+    here.wait_for_text(r"server gone \(its process was killed\)")
     again = Walker(here.url, "quick", "P1")
     state = again.until("ready")
     assert state["attempt"] == 2
