@@ -22,6 +22,9 @@ from export.scrub import Scrub
 from protocol.players import MAX_PLAYERS
 
 SCHEMA = 1
+RECORDED = 1
+"""The version of recordings' lines (`v`) that is converted."""
+_MAX_VERSIONS = 10  # that are named
 
 
 @dataclass
@@ -64,8 +67,12 @@ def convert(
         constants = {**constants, **{f"participant.{name}": number for name, number in playing.items()}}
     rows = Rows(constants, scrub, players_of(head), None if playing is None else tuple(playing))
     with pq.ParquetWriter(target, rows.schema, compression="zstd") as writer:
+        versions: set[int] = set()
         for line in itertools.chain(first, read):
             kind = line.get("kind")
+            version = as_whole(line.get("v"))
+            if version not in (None, RECORDED) and len(versions) < _MAX_VERSIONS:
+                versions.add(version)
             if kind == "header" and not header:
                 header = line
                 rows.trial = as_text(line.get("trial"))
@@ -79,7 +86,11 @@ def convert(
         done.rows = rows.written + rows.waiting
         if rows.waiting or not done.rows:
             writer.write_table(rows.table())
-        if not header:
+        done.problems += (
+            f"lines of the form {version} were read as those of the form {RECORDED}; a newer Hippodrome may read more"
+            for version in sorted(versions)
+        )
+        if not header and done.rows:
             done.problems.append("there is no header")
         hidden = set() if shown else {"user", "server", "session"}
         metadata = {

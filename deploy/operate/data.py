@@ -114,6 +114,7 @@ def command(
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
     source: Source
     if local:
+        _refuse_outer(local, name)
         source = Folder(local)
     else:
         source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
@@ -154,6 +155,18 @@ def _local(study: StudySelection) -> Path | None:
         local = study.folder / DATA
         screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {local}")
     return found
+
+
+def _refuse_outer(folder: Path, project: str) -> None:
+    """Raise `Problem` for a folder that has the project's data in folders below it, as `make try` leaves them."""
+    inner = [] if (folder / project).exists() else sorted(path.parent for path in folder.glob(f"*/{project}/users"))
+    if inner:
+        last = inner[-1].parent
+        raise Problem(
+            f"The data of {project} are not in {folder}, but in a folder below it.",
+            f"Name that: --from {last} (with make: DATA={last}).",
+            [f"{path.parent} has data of {project}." for path in inner[:20]] if len(inner) > 1 else [],
+        )
 
 
 def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:

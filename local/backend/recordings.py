@@ -25,8 +25,14 @@ def unfinished(spool: Path, task: TaskRecord) -> Sequence[Path]:
 
 
 def move_to_data(spool: Path, data: Path, task: TaskRecord) -> None:
-    """Move the task's unfinished recordings to the data folder. Raises OSError; it may then be called again."""
+    """Move the task's unfinished recordings to the data folder; delete those in which nothing was written.
+
+    Raises OSError; it may then be called again.
+    """
     for recording in unfinished(spool, task):
+        if recording.stat().st_size == 0:  # the disk was full, or the server was killed in the first half second
+            recording.unlink()
+            continue
         place = data / recording.relative_to(spool)
         _move(recording, place.with_name(place.name.removesuffix(".part")))
 

@@ -137,6 +137,22 @@ def _first_header(lines: list[dict[str, Any]]) -> int:
     return next(number for number, line in enumerate(lines) if line.get("kind") == "header")
 
 
+def test_a_recording_of_another_version_is_read_and_remarked(tmp_path: Path) -> None:
+    lines = recording.read(record(tmp_path, "user-1"))
+    body = b"".join(json.dumps({**line, "v": 99}).encode() + b"\n" for line in lines)
+    done, _ = convert(tmp_path, gzip.compress(body))
+    assert done.frames == 5
+    assert done.problems == ["lines of the form 99 were read as those of the form 1; a newer Hippodrome may read more"]
+
+
+def test_an_empty_recording_is_one_remark(tmp_path: Path) -> None:
+    assert convert(tmp_path, b"")[0].problems == ["the file is empty"]
+
+
+def test_the_form_that_is_converted_is_the_one_that_is_recorded() -> None:
+    assert converted.RECORDED == recording.SCHEMA
+
+
 def test_bombs_and_false_sizes_of_observations_are_refused(tmp_path: Path) -> None:
     big = recording.observation(np.zeros(50_000_000, np.uint8))
     lies = [

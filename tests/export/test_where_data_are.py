@@ -59,6 +59,17 @@ def test_a_local_study_without_participants_says_so(tmp_path: Path, capsys: Any)
     assert "try-20260101-000000" in told(capsys, "--project", f"{folder}/").err
 
 
+def test_a_folder_of_rehearsals_is_refused_with_the_folder_to_name(tmp_path: Path, capsys: Any) -> None:
+    tried = tmp_path / "data-try"
+    for name in ("try-20260101-000000", "try-20260102-000000"):
+        crowd(into_folder(tried / name), tmp_path, 1)
+        ran = told(capsys, str(tmp_path / "out"), "--project", "maze", "--from", str(tried))
+        assert ran.code == Exit.FAILED
+        assert f"--from {tried / name} (with make: DATA={tried / name})" in " ".join(ran.err.split())
+    assert "try-20260101-000000 has data of maze." in ran.err
+    assert told(capsys, str(tmp_path / "out"), "--project", "maze", "--from", str(tried / name)).code == Exit.DONE
+
+
 def test_a_study_that_leaves_open_where_it_runs_and_has_no_data_on_a_machine_without_aws(
     tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:

@@ -47,9 +47,17 @@ class Spool:
         raise FileExistsError(key)
 
     def leftovers(self, prefix: str) -> list[tuple[str, Path]]:
-        """Return the recordings with this prefix that a killed process has left here: their keys and paths."""
-        paths = sorted((self.folder / prefix).glob("*.jsonl.gz.part"))
-        return [(f"{prefix}/{path.name.removesuffix('.part')}", path) for path in paths]
+        """Return the recordings with this prefix that a killed process has left here: their keys and paths.
+
+        Those in which nothing was written are deleted.
+        """
+        left = []
+        for path in sorted((self.folder / prefix).glob("*.jsonl.gz.part")):
+            if path.stat().st_size == 0:  # the disk was full, or the process was killed in its first half second
+                path.unlink()
+            else:
+                left.append((f"{prefix}/{path.name.removesuffix('.part')}", path))
+        return left
 
 
 async def store_file(store: Store, key: str, path: Path) -> None:

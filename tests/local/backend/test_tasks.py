@@ -354,9 +354,12 @@ def test_a_recording_of_a_killed_server_is_kept(here: Here) -> None:
     here.wait("RUNNING")
     (here.state / "spool" / folder).mkdir(parents=True)
     (here.state / "spool" / folder / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
+    (here.state / "spool" / folder / "5-trial.jsonl.gz.part").touch()  # nothing was written: the disk was full
     tasks.stop(arn, "hippodrome", "hippodrome: enough")
     here.wait("STOPPED")
     assert (here.data / folder / "3-trial.jsonl.gz").read_bytes() == b"half a game"
+    assert [path.name for path in (here.data / folder).iterdir()] == ["3-trial.jsonl.gz"]
+    assert not list((here.state / "spool").rglob("*.part"))
 
 
 def test_a_recording_of_a_killed_server_of_a_session_is_kept_with_the_session(here: Here) -> None:

@@ -102,6 +102,16 @@ def test_a_recording_never_takes_the_name_of_a_finished_one(tmp_path: Path, keep
     assert sorted(path.name for path in (tmp_path / "p").iterdir()) == ["3-trial-2.jsonl.gz", "3-trial.jsonl.gz"]
 
 
+def test_a_recording_in_which_nothing_was_written_is_not_stored(tmp_path: Path) -> None:
+    written = spool(tmp_path, keep=True)
+    written.open("p/2-trial.jsonl.gz")
+    recorded = written.open("p/3-trial.jsonl.gz")
+    recorded.add(line("header"))
+    recorded.flush()
+    assert written.leftovers("p") == [("p/3-trial.jsonl.gz", recorded.path)]
+    assert [path.name for path in (tmp_path / "p").iterdir()] == [recorded.path.name]
+
+
 def test_an_open_recording_is_synced_every_few_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[tuple[float, int]] = []
     clock = [0.0]
