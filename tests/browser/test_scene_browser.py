@@ -145,6 +145,32 @@ def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -
     assert seen == sorted(seen)
 
 
+COLORS = """() => {
+    const { width, height } = document.querySelectorAll('.stage canvas')[1];
+    const { data } = document.querySelectorAll('.stage canvas')[1].getContext('2d').getImageData(1, 1, width - 2, height - 2);
+    return [...new Set(new Uint32Array(data.buffer))].length;
+}"""
+
+
+@pytest.mark.parametrize("width", [360, 411, 1280])
+@pytest.mark.parametrize("kind", [{"type": "rectangle", "color": "#336699"}, {"type": "sprite", "image": "missing"}])
+def test_between_the_tiles_of_a_grid_there_are_no_lines(
+    world: World, tab: Any, kind: dict[str, Any], width: int
+) -> None:
+    scene = {"width": 585, "height": 315, "background": "#ffffff", "coordinates": "pixels"}
+    world.subprotocol, world.trial = "hippodrome.3", {"scene": scene}
+    world.controls |= {"scene": scene, "assets": []}
+    tab.set_viewport_size({"width": width, "height": 740})
+    open_game(world, tab)
+    tiles = {
+        f"{x},{y}": {**kind, "x": 45 * x, "y": 45 * y, "width": 45, "height": 45} for x in range(13) for y in range(7)
+    }
+    world.connections[0].send(b"\x04" + struct.pack("!I", 3) + json.dumps({"new": True, "set": tiles}).encode())
+    world.wait_for({"ack": 3})
+    shot(tab, f"{width}-grid-{kind['type']}")
+    assert tab.evaluate(COLORS) == 1
+
+
 COUNT_DRAWINGS = """(() => {
     const { fillRect } = CanvasRenderingContext2D.prototype;
     window.drawings = 0; // each begins with the background

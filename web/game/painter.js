@@ -75,9 +75,9 @@ const draws = {
     fill(fields);
   },
   rectangle(fields) {
-    const [left, top] = turned(fields, fields.width, fields.height);
+    const box = exact(...turned(fields, fields.width, fields.height), fields.width, fields.height);
     brush.beginPath();
-    brush.rect(left, top, fields.width, fields.height);
+    brush.rect(...box);
     fill(fields);
   },
   polygon(fields) {
@@ -115,12 +115,12 @@ const draws = {
     const box = name === undefined ? image && [0, 0, image.bitmap.width, image.bitmap.height] : image?.frames.get(name);
     const width = fields.width ?? (box ? (fields.height ? fields.height * box[2] / box[3] : box[2]) : 32);
     const height = fields.height ?? (box ? width * box[3] / box[2] : 32);
-    const [left, top] = turned(fields, width, height);
+    const place = exact(...turned(fields, width, height), width, height);
     brush.imageSmoothingEnabled = !picture.pixelArt;
-    if (box) brush.drawImage(image.bitmap, ...box, left, top, width, height);
+    if (box) brush.drawImage(image.bitmap, ...box, ...place);
     else {
       brush.fillStyle = MISSING;
-      brush.fillRect(left, top, width, height);
+      brush.fillRect(...place);
     }
     return Boolean(animation);
   },
@@ -131,6 +131,15 @@ function turned({ x, y, angle = 0, origin = [0, 0] }, width, height) {
   brush.translate(x * unitX, y * unitY);
   brush.rotate(angle * Math.PI / 180);
   return [-origin[0] * width, -origin[1] * height];
+}
+
+// Moves the edges of a box that is not turned to whole pixels of the screen: between the tiles of a grid there is no gap.
+function exact(left, top, width, height) {
+  const { a, b, d, e, f } = brush.getTransform();
+  if (b) return [left, top, width, height];
+  const x = (each) => (Math.round(a * each + e) - e) / a;
+  const y = (each) => (Math.round(d * each + f) - f) / d;
+  return [x(left), y(top), x(left + width) - x(left), y(top + height) - y(top)];
 }
 
 function trace(points) {
