@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from export import scrub
 from export.page_fields import FieldKind
 from export.recording_columns import as_number, as_whole, when
-from export.scrub import clean, texts
+from export.scrub import clean
 from export.state import ExportedParticipant, ExportState
 from export.table_files import Column, fit, json_text
 from hippodrome.model.project import Project
@@ -25,7 +25,7 @@ from protocol.session import is_session_id
 MAX_FIELDS = 1_000
 """Columns of answers. Participants can send any number of fields; the rarest ones share the column `other`."""
 MAX_LINK = 50
-"""Columns of the values in participants' links."""
+"""Columns of the values in participants' links, and of the headers of their first requests."""
 _MAX_PAGES = 100  # different pages that are counted at one step
 _MAX_COUNTED = 50_000  # different fields that are counted at once
 
@@ -98,7 +98,7 @@ class StudyAnswers:
                     known = fields.setdefault((step, name), new)
                     known.count += 1
                     known.kinds.add(_kind(value))
-            for name in texts(participant.document.get("link")):
+            for name in scrub.columns(participant.document):
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
@@ -163,7 +163,7 @@ class StudyAnswers:
             Column("finished", "truth"),
             *(_MEMBERSHIP if self.in_sessions else ()),
             *([] if self._apart else [Column("completionCode")]),
-            *([] if self._apart else [Column(f"link.{clean(name)}") for name in self.links]),
+            *([] if self._apart else [Column(clean(name)) for name in self.links]),
             *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
             *(Column(f"page.{moved.step}") for moved in self.moved),
             *(Column(f"group.{step}", "whole") for step in self.versioned),
@@ -176,7 +176,7 @@ class StudyAnswers:
         self.scrubbed = self.finished = 0
         for participant, found in self._participants():
             fields = {step: _fields(answers) for step, answers in found.items()}
-            link = texts(participant.document.get("link"))
+            link = scrub.columns(participant.document)
             finished = self._finished(found)
             self.finished += bool(finished)
             row: list[Any] = [
@@ -208,7 +208,7 @@ class StudyAnswers:
             for name, value in named.items()
             if (step, name) not in self.fields
         }
-        rest |= {f"link.{name}": value for name, value in link.items() if name not in self.links}
+        rest |= {name: value for name, value in link.items() if name not in self.links}
         return clean(json_text(rest)) if rest else None
 
     LONG = (

@@ -13,7 +13,7 @@ from hippodrome.model import ids
 from protocol.keys import NAME, SERVER_NAME, sessions_folder
 from protocol.session import is_session_id
 
-RESERVED = {"answered", "link", "page"}  # the tables have own columns with these names before a dot
+RESERVED = {"answered", "header", "link", "page"}  # the tables have own columns with these names before a dot
 _RECORDING = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64}?)-(?P<rest>(?:trial|episode-[0-9]{1,9})(?:-[0-9]{1,4})?)")
 _END = ".jsonl.gz"
 

@@ -71,6 +71,15 @@ def texts(link: Any) -> dict[str, str]:
     return {str(name): value if isinstance(value, str) else json.dumps(value) for name, value in link.items()}
 
 
+def columns(document: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of a participant's link and headers, by the names of their columns."""
+    return {
+        f"{kind}.{name}": value
+        for kind, field in (("link", "link"), ("header", "headers"))
+        for name, value in texts(document.get(field)).items()
+    }
+
+
 def clean(text: str) -> str:
     """Return the text with the replacement character for each unpaired surrogate, which UTF-8 cannot hold."""
     return text if text.isascii() else _SURROGATES.sub("\ufffd", text)

@@ -16,7 +16,7 @@ from typing import Any
 
 from export import scrub
 from export.recording_columns import as_number, as_whole, when
-from export.scrub import clean, texts
+from export.scrub import clean
 from export.state import ExportedParticipant, ExportState
 from export.table_files import BATCH, Column, fit
 from protocol.keys import sessions_folder
@@ -246,11 +246,11 @@ def _other_fields(row: Mapping[str, Any]) -> Mapping[str, Any]:
 def identities(state: ExportState, links: Sequence[str]) -> tuple[list[Column], Iterator[list[Any]]]:
     """Return the columns and rows of the table of identities, which is kept in `private/`."""
     columns = [Column("participant"), Column("userId"), Column("completionCode")]
-    columns += [Column(f"link.{clean(name)}") for name in links]
+    columns += [Column(clean(name)) for name in links]
 
     def rows() -> Iterator[list[Any]]:
         for participant in state.participants():
-            link = texts(participant.document.get("link"))
+            link = scrub.columns(participant.document)
             yield [
                 participant.number,
                 participant.user,

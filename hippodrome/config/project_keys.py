@@ -29,6 +29,8 @@ from protocol.values import KeyPath, Plain, as_text, number_in, show, step_file
 MAX_STEPS = 500
 MAX_HOSTS = 50
 """Origins in `allowedHosts`."""
+MAX_HEADERS = 20
+"""Names in `recordHeaders`."""
 MAX_TEXT = 500  # characters
 
 _LABEL = r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?"
@@ -39,9 +41,21 @@ _REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
 _BUCKET_ENDS = ("-s3alias", "--ol-s3", ".mrap", "--x-s3", "--table-s3")
+_HEADER = re.compile(r"[a-z0-9-]{1,64}")
+_SECRET_HEADERS = ("authorization", "cookie", "proxy-authorization")
 _STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
 _CERTIFICATES = "SSL"  # servers may not write into this folder (infra/template.yml), so a study there keeps no answers
 _DNS_ROOM = 253 - 64  # characters of a DNS name without the server's own label and its dot
+
+
+def header(value: object) -> str:
+    """Check the name of a request's header. Headers that hold secrets are refused."""
+    name = as_text(value, "the name of a header, such as user-agent").lower()
+    if not _HEADER.fullmatch(name):
+        raise ValueError(f"must be the name of a header, such as user-agent, not {show(value)}")
+    if name in _SECRET_HEADERS:
+        raise ValueError(f"{name} may hold secrets of the browser, and is never kept")
+    return name
 
 
 def project_id(value: object) -> str:
@@ -297,6 +311,11 @@ class ProjectKeys(Model):
     """Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients."""
     allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", MAX_HOSTS)] = ()
     """https:// origins from which step pages may load images, media, frames and scripts."""
+    record_headers: Annotated[tuple[Annotated[str, Rule(header)], ...], items("name of a header", MAX_HEADERS)] = (
+        "user-agent",
+        "accept-language",
+    )
+    """Headers of a participant's first request that are kept. user-agent names browser and device."""
     max_participants: Annotated[int, whole(1, 100_000)] | None = None
     """The largest number of participants. Later ones are told that the study is full. Default: no limit."""
     max_servers: Annotated[int, whole(1, 10_000)] | None = None

@@ -22,6 +22,7 @@ from protocol.answer import FAILED, Answer
 from protocol.keys import participant_folder
 
 REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
+MAX_HEADER = 512  # characters of a header's value
 MAX_COMPARED = 10  # the most answers with which such a form is compared; each costs a read
 
 
@@ -34,6 +35,7 @@ class Participant(Record, frozen=True):
     group: int | None = None
     completion_code: str = ""
     link: Mapping[str, str] = msgspec.field(default_factory=dict)  # the other fields of the recruiter's link
+    headers: Mapping[str, str] = msgspec.field(default_factory=dict)  # those of the first request that the study keeps
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,15 @@ def participant_key(project_id: str, user_id: str) -> str:
     return f"{participant_folder(project_id, user_id)}participant.json"
 
 
-def new_participant(project: Project, user_id: str, link: Mapping[str, str], now: datetime) -> Participant:
-    """Return the record of a participant who opens the link for the first time."""
+def new_participant(
+    project: Project, user_id: str, link: Mapping[str, str], now: datetime, headers: Mapping[str, str] | None = None
+) -> Participant:
+    """Return the record of a participant who opens the link for the first time.
+
+    Of the request's `headers`, by their names in lower case, it has those that the study keeps, and of each
+    `MAX_HEADER` characters.
+    """
+    sent = {name: headers[name] for name in project.record_headers if name in headers} if headers else {}
     return Participant(
         project_id=project.id,
         user_id=user_id,
@@ -93,6 +102,7 @@ def new_participant(project: Project, user_id: str, link: Mapping[str, str], now
         group=project.group(user_id),
         completion_code=ids.completion_code(project.secret, user_id),
         link=link,
+        headers={name: text.encode("utf-8", "replace").decode()[:MAX_HEADER] for name, text in sent.items()},
     )
 
 

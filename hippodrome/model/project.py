@@ -106,6 +106,7 @@ class Project(Record, frozen=True):
     plain_clients: bool = False  # whether its front end opens servers without a token
     front_end: list[str] = msgspec.field(default_factory=list)  # the origins of that front end
     allowed_hosts: list[str] = msgspec.field(default_factory=list)
+    record_headers: list[str] = msgspec.field(default_factory=list)  # those of a first request that are kept
     max_participants: int | None = None
     max_servers: int | None = None  # how many servers may run at once
     max_server_hours: int | None = None  # of all servers together, from the first registration on

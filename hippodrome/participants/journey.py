@@ -139,7 +139,7 @@ class Journey:
             raise PageError.of(Texts(project.texts), 200, "studyFull")
         publish_events(self._platform, project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
-        record = participant.new_participant(project, user_id, link, self._platform.now())
+        record = participant.new_participant(project, user_id, link, self._platform.now(), request.headers)
         if self._repository.create_participant(record):
             logger.info("arrived", extra={"project": project.id})
 

@@ -49,6 +49,7 @@ def participant(user: str, **changes: Any) -> dict[str, Any]:
         "group": 1,
         "completionCode": ids.completion_code(PROJECT.secret, user),
         "link": {"PROLIFIC_PID": f"prolific-of-{user}", "STUDY_ID": "study-77"},
+        "headers": {"user-agent": "Firefox on a phone"},
         **changes,
     }
 

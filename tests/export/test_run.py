@@ -48,6 +48,7 @@ def test_a_study_becomes_tables_recordings_and_a_manifest(place: Place) -> None:
     first = found[0]
     assert (first["group"], first["2.age"], first["2.pet"], first["3.score"]) == ("1", "20", "cat; dog", "12.5")
     assert first["link.PROLIFIC_PID"] == f"prolific-of-{users[0]}"
+    assert first["header.user-agent"] == "Firefox on a phone"
     assert first["answered.2"] == made_of.TIME
     table = pq.read_table(place.out / "answers.parquet")
     assert table.column_names == list(first)

@@ -221,7 +221,19 @@ def test_the_number_of_columns_is_limited(tmp_path: Path, monkeypatch: Any) -> N
         shown = {name: row[name] for name in row if name.startswith("2.junk") and row[name]}
         junk = {name: value for name, value in {**rest, **shown}.items() if name.startswith("2.junk")}
         assert junk == {f"2.junk-{number}-{m}": "x" for m in range(50)}
-        assert sum(name.startswith("link.") for name in rest) == 80 - MAX_LINK
+        assert sum(name.startswith("link.") for name in rest) == 80 + len(["header.user-agent"]) - MAX_LINK
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_headers_are_columns_only_where_identities_are(tmp_path: Path, apart: bool) -> None:
+    state = filled({"a": {}, "b": {}}, apart, headers={"user-agent": "Firefox", "x-forwarded-for": "203.0.113.7"})
+    (row, _), _ = written(state, tmp_path, apart)
+    assert (row.get("header.user-agent"), "203.0.113.7" in row.values()) == (
+        (None, False) if apart else ("Firefox", True)
+    )
+    columns, identities = tables.identities(state, StudyAnswers(state, PROJECT, apart).links)
+    assert "203.0.113.7" in next(identities)
+    assert "header.x-forwarded-for" in [column.name for column in columns]
 
 
 def test_finished_needs_every_step_but_the_last(tmp_path: Path) -> None:

@@ -108,6 +108,7 @@ def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
         "plainClients": False,
         "frontEnd": [],
         "allowedHosts": [],
+        "recordHeaders": ["user-agent", "accept-language"],
         "maxParticipants": None,
         "maxServers": None,
         "maxServerHours": None,

@@ -95,6 +95,7 @@ def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
         "plain_clients": False,
         "front_end": [],
         "allowed_hosts": [],
+        "record_headers": [],
         "max_participants": None,
         "max_servers": None,
         "max_server_hours": None,

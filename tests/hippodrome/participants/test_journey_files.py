@@ -6,9 +6,11 @@ import base64
 import json
 from typing import Any
 
+import msgspec
 import pytest
 
-from hippodrome.model.project import Events
+from hippodrome.model.project import MASTER_LIST, Events, MasterList
+from hippodrome.model.records import to_json
 from hippodrome.participants.files import MAX_BYTES
 from hippodrome.participants.link_fields import OUR_FIELDS, RECRUITER_IDS
 from lambdas import next_step
@@ -124,6 +126,34 @@ def test_fields_of_the_recruiters_link_are_stored_within_limits(platform: FakePl
     assert stored(platform, "participant.json")["link"] == {"SESSION": "7", "n" * 64: "v" * 256}
     assert sorted(OUR_FIELDS) == ["poll", "projectId", "signature", "userId"]
     assert RECRUITER_IDS == ("PROLIFIC_PID", "workerId", "survey_code", "participantId")
+
+
+SENT = {
+    "User-Agent": "Mozilla/5.0 " + "x" * 600,
+    "Accept-Language": "de",
+    "X-Forwarded-For": "203.0.113.7",
+    "Cookie": "a",
+}
+
+
+@pytest.mark.parametrize(
+    ("record_headers", "kept"),
+    [
+        ([], {}),
+        (["user-agent", "accept-language", "dnt"], {"user-agent": "Mozilla/5.0 " + "x" * 500, "accept-language": "de"}),
+        (["x-forwarded-for"], {"x-forwarded-for": "203.0.113.7"}),
+    ],
+)
+def test_only_the_headers_that_the_study_names_are_kept_and_none_is_logged(
+    platform: FakePlatform, caplog: pytest.LogCaptureFixture, record_headers: list[str], kept: dict[str, str]
+) -> None:
+    project = msgspec.structs.replace(study(), record_headers=record_headers)
+    platform.documents.put(MASTER_LIST, to_json(MasterList([project])))
+    next_step.handler(http_event("GET", "projectId=maze&userId=alice", headers=SENT), None)
+    assert stored(platform, "participant.json").get("headers", {}) == kept
+    assert not any(
+        value in str(record.__dict__) for record in caplog.records for value in SENT.values() if len(value) > 2
+    )
 
 
 def test_the_answer_to_a_poll_names_the_step_that_was_asked_for(platform: FakePlatform) -> None:
