@@ -84,7 +84,7 @@ def read_project(folder: Path) -> Config:
         file_mistakes += sessions.mistakes_of_groups(checked, groups)
     found = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
     mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
-    agent = list(_agent_problems(source)) if any(step.type.on_server for step in steps) else []
+    agent = list(_agent_problems(source, others=bool(mistakes))) if any(step.type.on_server for step in steps) else []
     mistakes += [problem for problem in agent if not problem.remark]
     if mistakes:
         raise ConfigErrors(in_order(mistakes))
@@ -96,14 +96,14 @@ def read_project(folder: Path) -> Config:
     return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
 
 
-def _agent_problems(source: ConfigSource) -> Iterator[Diagnostic]:
-    """The mistakes and remarks on agent.py; a mistake if there is neither an agent nor the name of an environment."""
+def _agent_problems(source: ConfigSource, *, others: bool) -> Iterator[Diagnostic]:
+    """The mistakes and remarks on agent.py. A study without agent and environment is one, unless there are `others`."""
     problems = list(source.layout.problems())
     yield from problems
-    refused = any(not problem.remark for problem in problems)
+    if others or source.layout.agent is not None or any(not problem.remark for problem in problems):
+        return
     trial = source.parsed.values.get("trial")
-    named = isinstance(trial, dict) and ("game" not in trial or not is_blank(trial["game"]))
-    if source.layout.agent is None and not refused and not named:
+    if not isinstance(trial, dict) or ("game" in trial and is_blank(trial["game"])):
         message = f"is empty, and there is no {AGENT}: name an environment, or write an {AGENT}"
         yield source.diagnostic(("trial", "game"), message)
 
