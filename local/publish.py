@@ -11,6 +11,7 @@ from hippodrome.config.step_order import changed_pages
 from hippodrome.model.project import MASTER_LIST, read_list
 from hippodrome.ports import Conflict, Documents
 from lambdas import update_project_master_list
+from protocol.file_names import composed
 
 CHANGED = (
     "The steps changed, and people have begun: {steps}. Answers keep the number of their step, and each participant "
@@ -40,7 +41,7 @@ def publish(
     except ConfigErrors as errors:
         raise NotPublished([str(problem) for problem in errors.diagnostics]) from None
     for file in [*step_files(folder), *config.own_pages]:
-        _put(documents, f"{config.project.id}/steps/{file.name}", file.read_bytes())
+        _put(documents, f"{config.project.id}/steps/{composed(file.name)}", file.read_bytes())
     # On this machine servers are processes, also if the project says that they run on AWS.
     registration = {**config.registration(), "useAWS": False}
     if subdomain is not None:

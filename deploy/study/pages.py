@@ -16,6 +16,7 @@ from hippodrome.aws.documents import S3Documents
 from hippodrome.config import layout
 from hippodrome.participants.files import MAX_BYTES
 from hippodrome.ports import Conflict
+from protocol.file_names import composed
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def compare(account: Account, bucket: str, project_id: str, folder: Path, more: 
     Raises `Problem` if a file is too large, or is a link out of the project folder.
     """
     prefix = f"{project_id}/steps/"
-    files = {prefix + file.name: file for file in [*_files(folder), *more]}
+    files = {prefix + composed(file.name): file for file in [*_files(folder), *more]}
     stored = _listing(account, bucket, prefix)
     put = {key: file for key, file in files.items() if not _same(account, bucket, key, file, stored.get(key))}
     return Changes(put, sorted(stored.keys() - files.keys()), len(files) - len(put))

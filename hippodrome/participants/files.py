@@ -6,6 +6,7 @@ from hippodrome.http import Request, Response
 from hippodrome.model import ids
 from hippodrome.participants.page_error import PageError
 from hippodrome.storage.project_cache import ProjectCache
+from protocol.file_names import composed
 
 MAX_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 MAX_BYTES = 4 * 1024**2  # a file's size on AWS: a function's answer has 6 MB at most, and the file is in base64 there
@@ -53,7 +54,7 @@ class Files:
         project = (
             self._project_cache.live_project(parts[2]) if len(parts) == 4 and ids.is_project_id(parts[2]) else None
         )
-        name = parts[-1]
+        name = composed(parts[-1])
         is_valid = is_served(name) and name.isprintable() and not name.startswith(".") and len(name) <= MAX_NAME
         found = self._project_cache.document(f"{project.id}/steps/{name}") if project and is_valid else None
         if found is None:

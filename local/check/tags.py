@@ -12,6 +12,7 @@ from hippodrome.participants.files import KINDS, is_served
 from hippodrome.participants.page_parser import PageParser, attributes_of
 from local.check import spans
 from local.check.wording import short
+from protocol.file_names import composed
 from protocol.similar import SIMILAR_FILES, did_you_mean
 
 _HANDLER = re.compile(r"on[a-z]{3,}")
@@ -34,7 +35,7 @@ class Tags(PageParser):
         super().__init__()
         self._label = label
         self._folder = label.partition("/")[0]
-        self._names = frozenset(names)
+        self._names = frozenset(map(composed, names))
         self._own = f"/steps/{config.project.id}/" if config else None
         self._hosts = frozenset(config.project.allowed_hosts) if config else None
         self._found: list[Diagnostic] = []
@@ -169,7 +170,7 @@ class Tags(PageParser):
     def _file(self, path: str) -> None:
         """Check whether this file of the project exists and is shown."""
         name = path.removeprefix(self._own) if self._own else path.rpartition("/")[2]
-        name = name.removeprefix("./")
+        name = composed(name.removeprefix("./"))
         alone = re.split(r"[/\\]", name)[-1]
         if name != alone:
             message = f"{short(name)} is not found: put the file into {self._folder}/ itself and write {short(alone)}"

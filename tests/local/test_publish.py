@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,6 +51,12 @@ def test_publish_writes_pages_pictures_and_the_registration(folder: Path, platfo
     ]
     [project] = json.loads((platform.documents.folder / "project_master_list.json").read_text())["projects"]
     assert project["id"] == "quick"
+
+
+def test_a_file_from_a_mac_has_the_name_that_pages_write(folder: Path, platform: LocalPlatform) -> None:
+    (folder / "steps" / unicodedata.normalize("NFD", "Übung.png")).touch()
+    config = publish.publish(folder, platform.documents)
+    assert platform.documents.get(f"{config.project.id}/steps/Übung.png") is not None
 
 
 def test_publish_writes_only_changed_files(folder: Path, platform: LocalPlatform) -> None:

@@ -13,9 +13,11 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeGuard
+
+from protocol.file_names import composed
 
 MAX_ASSETS = 500
 MAX_BYTES = 4 * 2**20
@@ -112,6 +114,8 @@ def load(project: Path, folder: str) -> Assets:
                 )
                 break
             found[name] = asset
+            if composed(name) not in found:
+                found[composed(name)] = replace(asset, name=composed(name))
         except AssetError as error:
             problems.append(f"{shown} {error}")
     return Assets(found, tuple(problems))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from protocol.file_names import on_disk
 from protocol.players import AGENT_PLAYER, ALL_KINDS, SAMPLE, files_there
 from trial.policies.policy import Policy, PolicyError, PolicyFileMissing
 from trial.policies.simple import IdlePolicy, RandomPolicy, of_class
@@ -43,7 +44,7 @@ def load(
 
 def _file(folder: Path, name: str) -> Path:
     """Find the file of this name in the folder or below it. Raises PolicyError if there is none."""
-    path = (folder / name).resolve()
+    path = on_disk(folder, name).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise PolicyError(f"{name} leads out of the project's folder")
     if not path.is_file():

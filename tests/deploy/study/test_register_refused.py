@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -223,6 +224,15 @@ def test_links_out_of_the_folder_and_large_pages_are_refused(
 def test_hidden_files_and_folders_are_not_uploaded(folder: Path, register: Register) -> None:
     write_study(folder, steps___DOT_DS_Store="x", steps__drafts__a_DOT_html="x")
     assert register("--json").json["pages"]["uploaded"] == 3
+
+
+def test_a_file_from_a_mac_has_the_name_that_pages_write(
+    register_world: RegisterWorld, folder: Path, register: Register
+) -> None:
+    (folder / "steps" / unicodedata.normalize("NFD", "Übung.png")).touch()
+    register()
+    uploaded = register_world.keys()
+    assert "steps/Übung.png" in {key.partition("/")[2] for key in uploaded}
 
 
 # --- failures on the way ------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import unicodedata
 from typing import Any
 
 import msgspec
@@ -61,6 +62,12 @@ def test_each_kind_of_file_is_served_with_its_content_type_in_a_sandbox(platform
         assert headers["Content-Type"] == KINDS[ending]
         assert headers["Cache-Control"] == "public, max-age=300"
         assert headers["Content-Security-Policy"] == "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_a_files_name_may_come_in_either_form(platform: FakePlatform, form: Any) -> None:
+    keep(platform, "Übung.png")
+    assert ask(f"/steps/maze/{unicodedata.normalize(form, 'Übung.png')}")["statusCode"] == 200
 
 
 def test_a_pdf_is_served_to_be_shown_and_cannot_be_read_as_a_page(platform: FakePlatform) -> None:

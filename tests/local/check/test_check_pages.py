@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import pytest
@@ -211,6 +212,15 @@ def test_a_file_that_aws_does_not_serve_is_a_mistake(on_aws: Path, size: int) ->
         "steps/sheet.pdf: larger than 4 MB, which AWS does not serve; make it smaller, or put it on another site"
     )
     assert lines == ([too_large] if size > 4 * 1024**2 else [])
+
+
+def test_a_file_from_a_mac_is_there(folder: Path) -> None:
+    (folder / "steps" / unicodedata.normalize("NFD", "Übung.png")).touch()
+    page(
+        folder,
+        f"<img src='Übung.png'><img src='{unicodedata.normalize('NFD', 'Übung.png')}'><a href='%C3%9Cbung.png'>x</a>",
+    )
+    assert looked(folder) == []
 
 
 def test_comments_end_where_browsers_end_them(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,17 @@ def test_images_are_called_by_their_path_without_its_extension(tmp_path: Path) -
     found = load_files(tmp_path, ball_png=image(), cooks__red_webp=image(form="WEBP"), sky_jpg=image(form="JPEG"))
     assert list(found.by_name) == ["ball", "cooks/red", "sky"]
     assert found.by_name["ball"].size == (4, 2)
+    assert not found.problems
+
+
+def test_an_image_has_both_forms_of_its_name(tmp_path: Path) -> None:
+    """macOS may store "Ü" as two characters; agents write one, or list the folder themselves."""
+    (tmp_path / "assets").mkdir()
+    stored, written = (unicodedata.normalize(form, "Übung") for form in ("NFD", "NFC"))
+    (tmp_path / "assets" / f"{stored}.png").write_bytes(image())
+    found = assets.load(tmp_path, "assets")
+    assert found.by_name.keys() == {stored, written}
+    assert {each["name"] for each in found.table()} == {stored, written}
     assert not found.problems
 
 
