@@ -288,11 +288,13 @@ def requestable_attempt(record: Server) -> int | None:
 def may_go_without(record: Server) -> bool:
     """Return whether the participant may go on without the game, because no server could run it.
 
-    They may not while another server starts by itself, nor while the project's limits leave no slot: that passes.
+    They may not while another server starts by itself, nor while the project's limits leave no slot: that passes. Nor
+    may they if no server failed, since participants can stop their own servers until they get no more.
     """
     if not record.is_closed or next_attempt(record) is not None:
         return False
-    return record.reason in FAILED or requestable_attempt(record) is None
+    none_left = requestable_attempt(record) is None
+    return record.reason in FAILED or (none_left and any(past.reason in FAILED for past in record.earlier))
 
 
 def replacing(before: Server, wanted: Server) -> Server:

@@ -249,6 +249,8 @@ def _report(view: GameView, texts: Texts) -> Html:
         return Html()
     contact = view.project.contact
     whom = texts.say("contact", contact=contact) if contact else texts["tell"]
+    if not view.state.get("without"):
+        return fill("report", text=whom)
     code = ids.completion_code(view.project.secret, view.user_id, FAILED)
     quote = texts.say("quote", user=view.user_id, code=code)
     return Html(fill("report", text=whom) + fill("report", text=quote))

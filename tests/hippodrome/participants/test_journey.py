@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer, StopServer, TaskChanged
 from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
 from hippodrome.model.records import to_json
-from hippodrome.model.server import MAX_ATTEMPTS
+from hippodrome.model.server import MAX_ATTEMPTS, Reason
 from hippodrome.ports import Refused, Topic
 from hippodrome.storage.repository import Repository
 from lambdas import installed as place
@@ -507,8 +508,31 @@ def test_a_program_that_gets_no_more_servers_gets_a_page_that_says_so(platform: 
         page = program(alice, form)["page"]
         assert "<h1>" in page
         assert "restart" not in page
-    program(alice, hidden(page))
+
+
+def used_up(platform: FakePlatform, *earlier: Reason) -> None:
+    """Let alice have had all her servers: she stopped the last one, and the earlier ones ended for these reasons."""
+    last = server.stopped_before_start("maze", "alice", MAX_ATTEMPTS, platform.now())
+    past = tuple(replace(server.past_attempt(last), attempt=n, reason=reason) for n, reason in enumerate(earlier, 1))
+    platform.documents.put(server.key(last.label), to_json(replace(last, earlier=past)))
+
+
+def test_a_program_goes_on_without_a_game_that_failed_once_there_are_no_more_servers(
+    platform: FakePlatform, alice: Browser
+) -> None:
+    to_game(alice)
+    used_up(platform, Reason.LOST, Reason.STOPPED)
+    program(alice, hidden(program(alice)["page"]))
     assert answer_of(platform, "3")["outcome"] == "failed"
+
+
+def test_nobody_gets_past_the_game_by_stopping_their_own_servers(platform: FakePlatform, alice: Browser) -> None:
+    to_game(alice)
+    used_up(platform, *[Reason.STOPPED] * (MAX_ATTEMPTS - 1))
+    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket("secret", "alice", "3")}
+    alice.post(**proof, **{"hippodrome-action": "without"})
+    assert "maze/users/alice/answers/3.json" not in platform.documents.kept
+    assert ids.completion_code("secret", "alice", "failed") not in alice.get()
 
 
 def test_a_participant_gets_at_most_eight_servers(platform: FakePlatform, alice: Browser) -> None:

@@ -113,7 +113,7 @@ def test_a_closed_server_has_failed_or_ended_and_may_be_asked_for_again(reason: 
     assert (state["again"], state["replaces"], reason in FAILURES) == (True, False, failed)
     assert state["without"] is (failed and reason is not Reason.FULL)
     last = state_of(server.close(started(8), reason, NOW))
-    assert (last["again"], last["without"]) == (reason is Reason.FULL, reason is not Reason.FULL), "nobody is stuck"
+    assert (last["again"], last["without"]) == (reason is Reason.FULL, failed and reason is not Reason.FULL)
 
 
 @pytest.mark.parametrize(("reason", "replaces"), [(Reason.LOST, True), (Reason.STOPPED, False)])
