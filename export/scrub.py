@@ -49,19 +49,22 @@ class Scrub:
 
 def identities(participant: ExportedParticipant) -> dict[str, str]:
     """Return the texts that identify a participant, each with its replacement: the id, the values of the link, and the
-    completion codes in `participant.json` and `session.json`."""
+    completion codes."""
     found = {value: f"({name})" for name, value in texts(participant.document.get("link")).items()}
-    for document in (participant.document, participant.membership):
-        if isinstance(code := document.get("completionCode"), str) and code:
-            found[code] = "(completionCode)"
+    found |= dict.fromkeys(_codes(participant), "(completionCode)")
     return {**found, participant.user: participant.number}
 
 
 def completion_code(participant: ExportedParticipant) -> str | None:
-    """Return the completion code of the participant. The code of an unmatched participant, in `session.json`, comes
-    before that in `participant.json`."""
-    codes = (document.get("completionCode") for document in (participant.membership, participant.document))
-    return next((clean(code) for code in codes if isinstance(code, str) and code), None)
+    """Return the completion code that the participant was shown."""
+    return next((clean(code) for code in _codes(participant)), None)
+
+
+def _codes(participant: ExportedParticipant) -> list[str]:
+    """The codes of a participant, first the one that they were shown: that of a game that failed comes before that of
+    an unmatched participant, in `session.json`, and this before that in `participant.json`."""
+    documents = (document.get("completionCode") for document in (participant.membership, participant.document))
+    return [code for code in (participant.failed_code, *documents) if isinstance(code, str) and code]
 
 
 def texts(link: Any) -> dict[str, str]:

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from protocol.answer import GAME
+
 _TABLES = """
 CREATE TABLE IF NOT EXISTS facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS participants (
@@ -76,7 +78,8 @@ class KnownFile(NamedTuple):
 class ExportedParticipant(NamedTuple):
     """A participant: the id, the number that replaces it, the name of the folder, and participant.json.
 
-    `membership` is `session.json` of their folder, which names their session; {} if they have none.
+    `membership` is `session.json` of their folder, which names their session; {} if they have none. `failed_code` is
+    the completion code that they saw because no server could run their game; "" if there is none.
     """
 
     user: str
@@ -84,6 +87,7 @@ class ExportedParticipant(NamedTuple):
     folder: str
     document: Mapping[str, Any]
     membership: Mapping[str, Any] = {}
+    failed_code: str = ""
 
 
 _SESSION_KINDS = ("membership", "session")
@@ -131,7 +135,7 @@ class ExportState:
         row = self._db.execute(
             "SELECT user, number, folder, document, membership FROM people WHERE user=?", (user,)
         ).fetchone()
-        return _participant(row) if row else None
+        return self._participant(row) if row else None
 
     def present(self, user: str) -> ExportedParticipant | None:
         """Return the participant if the last run has found files of them in the source, otherwise None."""
@@ -179,7 +183,28 @@ class ExportState:
         """Yield the participants whose files the last run has found, in the order of their numbers."""
         query = "SELECT user, number, folder, document, membership FROM people WHERE seen=? ORDER BY number"
         for row in self._db.execute(query, (self.run,)):
-            yield _participant(row)
+            yield self._participant(row)
+
+    def _participant(self, row: Any) -> ExportedParticipant:
+        user, number, folder, document, membership = row
+        return ExportedParticipant(
+            user,
+            number,
+            folder,
+            json.loads(document) if document else {},
+            json.loads(membership) if membership else {},
+            self._failed_code(user),
+        )
+
+    def _failed_code(self, user: str) -> str:
+        query = "SELECT document FROM answers WHERE user=? AND document LIKE '%\"completionCode\"%' ORDER BY step"
+        for (text,) in self._db.execute(query, (user,)):
+            document = json.loads(text)
+            fields = document.get("answers")
+            code = fields.get("completionCode") if isinstance(fields, dict) and document.get("page") == GAME else None
+            if isinstance(code, str):
+                return code
+        return ""
 
     # -- runs
 
@@ -307,7 +332,7 @@ class ExportState:
             if participant is None or row[0] != participant.user:
                 if participant is not None:
                     yield participant, found
-                participant, found = _participant(row[:5]), {}
+                participant, found = self._participant(row[:5]), {}
             if row[5] is not None:
                 found[row[5]] = json.loads(row[6])
         if participant is not None:
@@ -325,7 +350,7 @@ class ExportState:
             " WHERE f.path IS NOT NULL ORDER BY p.number, f.path, e.place"
         )
         for row in rows:
-            yield _participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
+            yield self._participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
 
     def problems(self) -> Iterator[tuple[ExportedParticipant | None, str, str]]:
         """Yield the participant (None for a file of no participant), the key and the problem of each bad file."""
@@ -335,7 +360,7 @@ class ExportState:
         )
         for row in rows:
             for problem in json.loads(row[6]):
-                yield _participant(row[:5]) if row[0] else None, row[5], problem
+                yield self._participant(row[:5]) if row[0] else None, row[5], problem
 
     def counts(self) -> dict[str, int]:
         """Return the counts for the manifest."""
@@ -357,12 +382,6 @@ class ExportState:
         for file in self.converted_files():
             digest.update(f"{file.path}\0{file.sha256}\n".encode())
         return digest.hexdigest()
-
-
-def _participant(row: Any) -> ExportedParticipant:
-    return ExportedParticipant(
-        row[0], row[1], row[2], json.loads(row[3]) if row[3] else {}, json.loads(row[4]) if row[4] else {}
-    )
 
 
 def _json(document: Mapping[str, Any] | None) -> str | None:

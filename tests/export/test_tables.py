@@ -224,6 +224,21 @@ def test_the_number_of_columns_is_limited(tmp_path: Path, monkeypatch: Any) -> N
         assert sum(name.startswith("link.") for name in rest) == 80 + len(["header.user-agent"]) - MAX_LINK
 
 
+def test_the_code_of_a_participant_whose_game_failed_is_the_one_that_they_saw(tmp_path: Path) -> None:
+    form = SourceFile("user-0001/2", "answer", "1", 1, step="2", document=answer("2", {"completionCode": "TYPED"}))
+    game = {"outcome": "failed", "completionCode": "FAILED7"}
+    played = SourceFile("user-0001/3", "answer", "1", 1, step="3", document=answer("3", game, page="game"))
+    state = filled({"user-0001": {}})
+    state.save("user-0001", [], [form, played])
+
+    (row,), _ = written(state, tmp_path)
+    assert (row["completionCode"], row["3.completionCode"]) == ("FAILED7", "FAILED7")
+    (hidden,), _ = written(state, tmp_path, apart=True)
+    assert "FAILED7" not in hidden.values()
+    _, (identity,) = tables.identities(state, [])
+    assert identity == ["user-0001", "user-0001", "FAILED7"]
+
+
 @pytest.mark.parametrize("apart", [False, True])
 def test_headers_are_columns_only_where_identities_are(tmp_path: Path, apart: bool) -> None:
     state = filled({"a": {}, "b": {}}, apart, headers={"user-agent": "Firefox", "x-forwarded-for": "203.0.113.7"})
