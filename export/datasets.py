@@ -63,6 +63,22 @@ class Dataset:
     steps: int = 0
     left_out: Counter[str] = field(default_factory=Counter)  # episodes, by the reason
 
+    def takes(self, spec: Spec) -> bool:
+        """Return whether this is the dataset for recordings of `spec`.
+
+        Numbers that are whole in some recordings and not in others are in one dataset.
+        """
+        if self.spec.kind is None or spec.kind is None:
+            return self.spec == spec
+        try:
+            kind = observations.common(self.spec.kind, spec.kind)
+        except observations.Unlike:
+            return False
+        if spec._replace(kind=kind) != self.spec._replace(kind=kind):
+            return False
+        self.spec = self.spec._replace(kind=kind)
+        return True
+
 
 def build(folder: Path, state: ExportState, project: str, progress: Callable[[int, int], None]) -> list[dict[str, Any]]:
     """Make `folder/minari` anew from the converted recordings, and return a summary of each dataset.
@@ -104,27 +120,30 @@ def build(folder: Path, state: ExportState, project: str, progress: Callable[[in
 
 
 def _datasets(folder: Path, state: ExportState, project: str) -> list[Dataset]:
-    found: dict[Spec, Dataset] = {}
+    found: list[Dataset] = []
     for path, several in groupby(state.episodes(), lambda row: row[1]):
         first = next(several)[2]
         for spec, highest, texts in episodes.specs(folder / path, str(first["step"]), first.get("people")):
-            dataset = found.setdefault(spec, Dataset(spec))
+            dataset = next((dataset for dataset in found if dataset.takes(spec)), None)
+            if dataset is None:
+                dataset = Dataset(spec)
+                found.append(dataset)
             dataset.files.append(path)
             dataset.highest = max(dataset.highest, highest)
             dataset.characters |= texts.characters
             dataset.longest = max(dataset.longest, texts.longest)
             dataset.began = min(dataset.began, str(first["started"]))
     humans: dict[str, set[str]] = {}
-    for spec in found:
-        humans.setdefault(spec.step, set()).add(spec.human)
+    for dataset in found:
+        humans.setdefault(dataset.spec.step, set()).add(dataset.spec.human)
     versions: Counter[str] = Counter()
-    for dataset in sorted(found.values(), key=lambda dataset: (dataset.spec.step, dataset.began, dataset.spec.human)):
+    for dataset in sorted(found, key=lambda dataset: (dataset.spec.step, dataset.began, dataset.spec.human)):
         spec = dataset.spec
         has_player = spec.human and (spec.together or len(humans[spec.step]) > 1)
         name = f"{project}-{spec.step}" + (f"-{_NOT_ALLOWED.sub('_', spec.human)}" if has_player else "")
         dataset.id = f"{name}-v{versions[name]}"
         versions[name] += 1
-    return sorted(found.values(), key=lambda dataset: dataset.id)
+    return sorted(found, key=lambda dataset: dataset.id)
 
 
 _NOT_ALLOWED = re.compile("[^A-Za-z0-9_-]")

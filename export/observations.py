@@ -26,7 +26,9 @@ class Unlike(Exception):
 
 
 def array_kind(dtype: str, shape: Sequence[int]) -> Kind:
-    """Return the kind of an array."""
+    """Return the kind of an array. Raises Unlike if Minari could not read its space: `[]` has lost the other axes."""
+    if 0 in shape[:-1]:
+        raise Unlike
     return ("array", dtype, tuple(shape))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import re
 import subprocess
@@ -374,6 +375,21 @@ def test_nan_in_a_list_of_numbers_is_nan_in_a_dataset(tmp_path: Path, monkeypatc
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=lambda n: [n, float("nan")])
     episode = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)[0]
     assert np.array_equal(episode.observations, [[n, np.nan] for n in range(6)], equal_nan=True)
+
+
+def test_numbers_that_are_whole_in_some_recordings_are_in_one_dataset(tmp_path: Path, monkeypatch: Any) -> None:
+    calls = itertools.count()
+    crowd(into_folder(tmp_path / "data"), tmp_path, 3, observe=True, picture=lambda n: [n, next(calls) // 6 / 2 or 0])
+    dataset = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)
+    assert [episode.observations[:, 1].tolist() for episode in dataset] == [[0.0] * 6, [0.5] * 6]
+
+
+def test_arrays_without_values_whose_space_minari_cannot_read_make_a_dataset_of_step_numbers(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=lambda n: {"others": np.zeros((0, 3))})
+    dataset = load(data(tmp_path, "--format", "minari"), "maze-3-v0", monkeypatch)
+    assert dataset[0].observations.tolist() == [[0], [1], [2], [3], [4], [5]]
 
 
 @pytest.mark.parametrize("look", [lambda n: [1] * n, lambda n: {"a/b": n}, lambda n: [n] if n % 2 else {"a": n}])

@@ -118,7 +118,7 @@ class ExperimentAgent:
         for key in game.human_players:  # with several participants, the researcher's code gets no participant's id
             game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
-        observation, infos = result if isinstance(result, tuple) and len(result) == 2 else (result, {})
+        observation, infos = map(self._own, result if isinstance(result, tuple) and len(result) == 2 else (result, {}))
         game.began(observation, infos)
         self._first = True
         return observation, infos
@@ -126,8 +126,10 @@ class ExperimentAgent:
     def step(self, action: Any) -> Any:
         """Take one step with an action, or with a map of the players' actions. Return the environment's five values."""
         game = self._game
-        result = tuple(self._raw.step(action))
         actions = action if isinstance(action, Mapping) else dict.fromkeys(mapping_of(self._config), action)
+        # Interactive Gym's games in the browser give a map to every environment, also to one with a single player.
+        by_player = self.several or self._config.run_through_pyodide
+        result = tuple(map(self._own, self._raw.step(actions if by_player else action)))
         game.stepped(actions, result)
         return result
 
@@ -155,6 +157,11 @@ class ExperimentAgent:
         close = getattr(self._raw, "close", None)
         if callable(close):
             close()
+
+    def _own(self, value: Any) -> Any:
+        """Return the value of the only player, if the environment returned a map by player for a single one."""
+        players = mapping_of(self._config)
+        return value[next(iter(players))] if not self.several and _is_by_player(value, players) else value
 
     @property
     def _game(self) -> RemoteGame:
@@ -259,6 +266,10 @@ def located(folder: Path) -> Callable[[Any], Any]:
 def _has_players(env: Any) -> bool:
     spaces = getattr(env, "action_spaces", None)
     return isinstance(spaces, Mapping) or bool(getattr(env, "possible_agents", None))
+
+
+def _is_by_player(value: Any, players: Mapping[Any, Any]) -> bool:
+    return isinstance(value, Mapping) and value.keys() == players.keys()
 
 
 def _kind(value: Any) -> Any:

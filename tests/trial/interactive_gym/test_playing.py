@@ -279,6 +279,21 @@ def test_environments_are_made_as_interactive_gym_makes_them() -> None:
         agent(environment_initialization_code="x = 1")
 
 
+def test_an_environment_of_a_game_in_the_browser_gets_a_map_of_actions_also_for_one_player() -> None:
+    """Interactive Gym's Mountain Car is of this form."""
+    code = """
+class Env:
+    def reset(self, seed=None): return {"human": 7}, {}
+    def step(self, actions): return {"human": actions["human"]}, 2.5, False, {"human": True}, {}
+env = Env()
+"""
+    options = {"environment_initialization_code": code, "policy_mapping": {"human": "human"}}
+    made = agent(**options, run_through_pyodide=True)
+    assert (made.reset(1), made.step(1)) == ((7, {}), (1, 2.5, False, True, {}))
+    assert made.game is not None
+    assert (made.game.prev_actions, made.game.over) == ({"human": 1}, True)
+
+
 def test_policies_are_loaded_from_the_projects_copy(tmp_path: Path) -> None:
     (tmp_path / "policies").mkdir()
     (tmp_path / "policies/model.onnx").write_bytes(b"")
