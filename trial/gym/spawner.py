@@ -201,7 +201,8 @@ class Spawner:
             sentence = f"The environments started more than {limits.processes} processes; all were ended."
             _kill_worker(pid, worker, _FAILED, sentence)
             return
-        used = sum(linux.used_megabytes(one) - self._own_megabytes for one in (pid, *started))
+        # What a fork has of this process is not theirs; a program that they started has nothing of it.
+        used = sum(max(0.0, linux.used_megabytes(one) - self._own_megabytes) for one in (pid, *started))
         if used > limits.megabytes:
             sentence = f"The environments used more than {limits.megabytes} MB; their process was ended."
             _kill_worker(pid, worker, _FAILED, sentence)

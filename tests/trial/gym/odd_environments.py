@@ -128,6 +128,16 @@ class GreedyShared(Calm):
         self.kept[-1].write(bytes(20 * 2**20))
 
 
+class GreedyBesideSmall(GreedyShared):
+    """The same, beside programs that use hardly any memory."""
+
+    def misbehave(self) -> None:
+        if not self.kept:
+            for _ in range(4):
+                subprocess.Popen(["sleep", "300"])
+        super().misbehave()
+
+
 class GreedyTogether(Calm):
     """Each of its processes stays below the limit, and all together exceed it."""
 
@@ -174,5 +184,5 @@ class OldSeeded(Calm):
 
 
 OLD = (Old, OldSeeded)
-for made in (*Calm.__subclasses__(), Calm):
+for made in (*Calm.__subclasses__(), GreedyBesideSmall, Calm):
     gymnasium.register(f"Odd/{made.__name__}-v0", made, disable_env_checker=True, order_enforce=made not in OLD)

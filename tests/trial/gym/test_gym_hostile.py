@@ -226,11 +226,12 @@ def test_processes_that_use_too_much_memory_together_are_ended(asking: TextClien
     assert reason == "The environments used more than 300 MB; their process was ended."
 
 
-def test_memory_that_processes_may_share_counts_too(asking: TextClient) -> None:
-    made = asking.make("Odd/GreedyShared-v0")
+@pytest.mark.parametrize("env_id", ["Odd/GreedyShared-v0", "Odd/GreedyBesideSmall-v0"])
+def test_memory_that_processes_may_share_counts_too(asking: TextClient, env_id: str) -> None:
+    made = asking.make(env_id)
     asking.ask("reset", instance_id=made)
     with contextlib.suppress(ConnectionClosed):
-        for _ in range(20):
+        for _ in range(18):
             asking.ask("step", instance_id=made, action=1)
     reason = closed_within(asking)
     assert reason == "The environments used more than 300 MB; their process was ended."
