@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from hippodrome.http import Request, Response
 from hippodrome.model import ids
 from hippodrome.participants.page_error import PageError
@@ -10,7 +12,8 @@ from protocol.file_names import composed
 
 MAX_NAME = 200  # characters of a file's name, at most 800 bytes: S3 refuses keys beyond 1,024 with an error
 MAX_BYTES = 4 * 1024**2  # a file's size on AWS: a function's answer has 6 MB at most, and the file is in base64 there
-_CACHE = {"Cache-Control": "public, max-age=300"}
+_CACHE = {"Cache-Control": "public, max-age=300", "Accept-Ranges": "bytes"}
+_RANGE = re.compile(r"bytes=(\d{1,9})?-(\d{1,9})?", re.ASCII)
 _SANDBOX = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}  # for scripts in SVGs
 KINDS = {
     "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
@@ -59,4 +62,24 @@ class Files:
         found = self._project_cache.document(f"{project.id}/steps/{name}") if project and is_valid else None
         if found is None:
             raise PageError(404, "There is nothing here", "Please open your study link again.")
+        if "range" in request.headers and "if-range" not in request.headers:
+            return _part(found.body, request.headers["range"], _headers(name))
         return Response(200, found.body, _headers(name))
+
+
+def _part(body: bytes, asked: str, headers: dict[str, str]) -> Response:
+    """Respond with the part of a file that `Range` asks for: Safari plays a film or a sound only if it gets parts.
+
+    A value of another form than one range is ignored (RFC 9110, section 14.2).
+    """
+    match = _RANGE.fullmatch(asked.strip())
+    if match is None or not any(match.groups()):
+        return Response(200, body, headers)
+    first, last = (None if text is None else int(text) for text in match.groups())
+    size = len(body)
+    if first is None:  # the last bytes of the file, as many as this
+        first, last = max(0, size - (last or 0)), size - 1
+    last = size - 1 if last is None else min(last, size - 1)
+    if first > last:
+        return Response(416, "", {**headers, "Content-Range": f"bytes */{size}"})
+    return Response(206, body[first : last + 1], {**headers, "Content-Range": f"bytes {first}-{last}/{size}"})

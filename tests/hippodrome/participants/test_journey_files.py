@@ -87,6 +87,30 @@ def test_a_file_that_browsers_cannot_show_is_saved(platform: FakePlatform, endin
     assert ask(f"/steps/maze/a.{ending}")["headers"].get("Content-Disposition") == ("attachment" if saved else None)
 
 
+@pytest.mark.parametrize(
+    ("asked", "status", "body", "content_range"),
+    [
+        ("bytes=0-1", 206, b"01", "bytes 0-1/10"),  # Safari's first request for a film
+        ("bytes=0-", 206, b"0123456789", "bytes 0-9/10"),
+        ("bytes=8-99", 206, b"89", "bytes 8-9/10"),
+        ("bytes=-3", 206, b"789", "bytes 7-9/10"),
+        ("bytes=10-", 416, b"", "bytes */10"),
+        ("bytes=0-1,4-5", 200, b"0123456789", None),
+        ("bytes=-", 200, b"0123456789", None),
+        ("steps=1-2", 200, b"0123456789", None),
+    ],
+)
+def test_a_part_of_a_file_is_served_without_which_safari_plays_no_film(
+    platform: FakePlatform, asked: str, status: int, body: bytes, content_range: str | None
+) -> None:
+    platform.documents.put("maze/steps/film.mp4", b"0123456789")
+    response = next_step.handler(http_event("GET", path="/steps/maze/film.mp4", headers={"Range": asked}), None)
+    sent = base64.b64decode(response["body"]) if response["isBase64Encoded"] else response["body"].encode()
+    assert (response["statusCode"], sent) == (status, body)
+    assert response["headers"].get("Content-Range") == content_range
+    assert ask("/steps/maze/film.mp4")["headers"]["Accept-Ranges"] == "bytes"
+
+
 def test_the_largest_file_fits_into_a_functions_answer(platform: FakePlatform) -> None:
     platform.documents.put("maze/steps/sheet.pdf", b"x" * MAX_BYTES)
     assert len(json.dumps(ask("/steps/maze/sheet.pdf"))) < 6 * 1024 * 1024  # Lambda's quota
