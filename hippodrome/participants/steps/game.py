@@ -100,7 +100,9 @@ class GameStep:
             if may_go_without(record):
                 self._services.answers.store(project, user_id, step, participant.failed_game(project, user_id))
         elif (attempt := requestable_attempt(record)) is not None:
-            self._request_server(project, owner, attempt)
+            due = repository.progress(project.id, user_id).due_step(project)
+            if participant.may_have_server(project, due):  # the ticket of a game that is over stays valid
+                self._request_server(project, owner, attempt)
 
     def _state_alone(self, visit: Visit) -> dict[str, Any]:
         """The state of the participant's own server.

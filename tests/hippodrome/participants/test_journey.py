@@ -384,6 +384,15 @@ def test_after_a_failed_server_the_participant_can_ask_for_another(platform: Fak
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]
 
 
+def test_nobody_gets_another_server_for_a_game_that_is_over(platform: FakePlatform, alice: Browser) -> None:
+    failed(platform, alice)
+    page = alice.get()
+    alice.post(**hidden(page), **{"hippodrome-action": "without"})
+    platform.bus.sent.clear()
+    alice.post(**hidden(page), **{"hippodrome-action": "restart"})
+    assert [topic for topic, _ in platform.bus.sent if topic is Topic.START] == []
+
+
 def answer_of(platform: FakePlatform, step: str) -> dict[str, Any]:
     """Return alice's stored answers at this step."""
     found: dict[str, Any] = json.loads(platform.documents.kept[f"maze/users/alice/answers/{step}.json"][0])["answers"]
