@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from trial.gym.errors import LimitReached
 
+_SILENT_SECONDS = 60.0
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:
@@ -31,6 +33,11 @@ class Limits:
     """The bytes of a client's message."""
     reply_bytes: int = 256 * 2**20
     """The bytes of the observations in one reply."""
+
+    @property
+    def silent_seconds(self) -> float:
+        """The seconds that a client has for its first request, after the handshake."""
+        return min(_SILENT_SECONDS, self.idle_seconds or _SILENT_SECONDS)
 
 
 class Rate:

@@ -32,7 +32,6 @@ from trial.gym.wakeup import Wakeup
 
 PATH = "/gym"
 _HANDSHAKE_SECONDS = 10.0
-_SILENT_SECONDS = 60.0  # after the handshake, the time that a client has for its first request
 _HANDSHAKE_BYTES = 16 * 1024  # the most bytes of a handshake
 _CLOSE_SECONDS = 2.0  # the time that a client has to close its end
 _NO_FILES_SECONDS = 0.05  # the pause if no file can be opened
@@ -79,7 +78,6 @@ class GymServer:
         self._listener = listener
         self._control = control
         self._limits = limits
-        self._silent_seconds = min(_SILENT_SECONDS, limits.idle_seconds or _SILENT_SECONDS)
         self._origins = frozenset(origins)
         self._selector = selectors.DefaultSelector()
         self._connections: set[_Connection] = set()
@@ -112,7 +110,9 @@ class GymServer:
                 checked = now
                 for connection in [one for one in self._timed() if (one.deadline or now) < now]:
                     if connection.form and not connection.closing:
-                        self._send_close(connection, 1001, f"There was no request for {self._silent_seconds:g} s.")
+                        self._send_close(
+                            connection, 1001, f"There was no request for {self._limits.silent_seconds:g} s."
+                        )
                     else:
                         self._drop(connection)
 
@@ -186,7 +186,7 @@ class GymServer:
         if response.status_code != http.HTTPStatus.SWITCHING_PROTOCOLS:
             self._close_soon(connection)
             return
-        connection.deadline = time.monotonic() + self._silent_seconds
+        connection.deadline = time.monotonic() + self._limits.silent_seconds
         connection.form = (ARRAYS if protocol.subprotocol == SUBPROTOCOL else form or GYMIE).name
         if connection.socket.family != socket.AF_UNIX:
             connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

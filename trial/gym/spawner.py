@@ -187,8 +187,9 @@ class Spawner:
                         os.kill(pid, signal.SIGALRM)
             else:
                 worker.interrupted = False
-                if limits.idle_seconds and worker.state.idle(now) > limits.idle_seconds:
-                    sentence = f"There was no request for {limits.idle_seconds:g} s."
+                most = limits.silent_seconds if worker.state.silent else limits.idle_seconds
+                if most and worker.state.idle(now) > most:
+                    sentence = f"There was no request for {most:g} s."
                     _kill_worker(pid, worker, _AWAY, sentence)
                 elif check_usage:
                     self._check_usage(pid, worker)

@@ -47,6 +47,7 @@ class WorkerState:
         self._memory = memory
         self._at = at
         self.rest()
+        self._first: float = memory[at]
 
     def work(self) -> None:
         """Note that a request begins."""
@@ -55,6 +56,11 @@ class WorkerState:
     def rest(self) -> None:
         """Note that a request has been answered."""
         self._memory[self._at] = -time.monotonic()
+
+    @property
+    def silent(self) -> bool:
+        """Whether no request has come yet."""
+        return bool(self._memory[self._at] == self._first)
 
     def busy(self, now: float) -> float:
         """Return the seconds since the present request began; 0 if there is none."""

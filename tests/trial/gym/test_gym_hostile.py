@@ -19,6 +19,8 @@ from websockets.sync.client import connect
 
 from testing.gym_server import GymServerProcess, TextClient, gym_server
 from testing.waiting import until
+from trial.gym.limits import Limits
+from trial.gym.worker import WorkerState
 
 WITHIN = 15.0
 
@@ -392,6 +394,20 @@ def test_a_connection_whose_first_request_does_not_come_is_closed() -> None:
         assert closed_within(client) == "There was no request for 1 s."
         with TextClient(own.url) as other:
             other.make("CartPole-v1")
+
+
+@pytest.mark.parametrize(("idle", "first"), [(3600.0, 60.0), (0.0, 60.0), (5.0, 5.0)])
+def test_a_client_that_begins_its_first_request_has_no_longer_to_send_it_than_a_silent_one(
+    idle: float, first: float
+) -> None:
+    """Otherwise two bytes on each connection would keep everybody out for an hour."""
+    state = WorkerState([0.0], 0)
+    assert state.silent
+    state.work()
+    assert not state.silent
+    state.rest()
+    assert not state.silent
+    assert Limits(idle_seconds=idle).silent_seconds == first
 
 
 def have_ended(pids: list[int]) -> bool:
