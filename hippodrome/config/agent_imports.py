@@ -193,7 +193,7 @@ def hidden_files(folder: Path) -> list[Diagnostic]:
 
 def _also_has(name: str) -> str:
     """Who else has a module of this name; "" if nobody."""
-    if name in sys.stdlib_module_names:
+    if name in sys.stdlib_module_names or name == "test":  # Python's own tests, which that list leaves out
         return "Python"
     if (_ROOT / name / "__init__.py").is_file():
         return "Hippodrome"

@@ -44,7 +44,8 @@ def read_agent(folder: Path) -> list[Diagnostic]:
 def never_called(folder: Path, config: Config) -> list[Diagnostic]:
     """Return remarks on methods that are never called.
 
-    These are a method whose name is nearly a callback's, and a function `match` that config.yml does not ask for.
+    These are a method whose name is nearly that of one that is called, a method `on_…` that is not a callback, and a
+    function `match` that config.yml does not ask for.
     """
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
@@ -69,12 +70,14 @@ def _unused_functions(body: list[ast.stmt], used: set[str]) -> list[ast.Function
 
 
 def _nearly_called(name: str, members: set[str]) -> str:
-    """The remark on a method whose name is similar to one that is called, and that the class lacks; otherwise empty."""
+    """The remark on a method that looks as if it were called; otherwise empty."""
     if name in (*NAMES, *_METHODS) or name.startswith("__"):
         return ""
     callback = name.startswith("on_")
     known = NAMES if callback else tuple(set(_METHODS) - members)
     hint = did_you_mean(name, known, SIMILAR if callback else _SIMILAR_METHODS)
+    if callback:
+        hint = hint or "; docs/callbacks.md lists the callbacks"
     return f"{name} is never called by Hippodrome{hint}" if hint else ""
 
 

@@ -98,11 +98,11 @@ def _try(report: Path, deadline: Deadline) -> None:
     progress.callbacks = _callbacks(player, players, progress, config.callback_seconds)
     names, count = progress.known["names"], progress.known["count"]
     if count is not None and names > count:
-        if isinstance(player, AgentAdapter):
+        if not player.steps_itself:
+            progress.foreign = [count]
+        elif isinstance(player, AgentAdapter):
             first = environments.first_number(player.env.action_space)
             progress.foreign = _foreign_actions(player.env, range(first, first + count))
-        elif not player.steps_itself:
-            progress.foreign = [count]
     if isinstance(player, JointAdapter):
         player.views = tuple(one.name for one in players if one.human)
     game = CheckedGame(joint, players, config, progress)

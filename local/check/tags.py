@@ -22,6 +22,7 @@ _IN_SRCSET = re.compile(r"(?:\A|,)\s*([^\s,]+)")
 BUTTONS = ("button", "reset", "submit", "image")
 """The types of inputs that need no name."""
 _HOST = re.compile(r"(?:[a-z][a-z0-9+.-]*:)?//[^/?#]*(?=[/?#]|\Z)", re.IGNORECASE)
+_ON_DISK = re.compile(r"file:|[a-z]:[\\/]", re.IGNORECASE)
 _SCRIPT = (
     "a script of the project whose address holds a value never runs; write its name, and pass the value in the page"
 )
@@ -119,6 +120,8 @@ class Tags(PageParser):
         relations = given.get("rel", "").lower().split()
         if not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
             return
+        if self._on_disk(address):
+            return
         if self._is_elsewhere(address):
             host = _HOST.match(address)
             if host is None or spans.MARK not in host[0]:
@@ -126,6 +129,8 @@ class Tags(PageParser):
         elif address.startswith(spans.MARK):
             if tag == "script":
                 self._mistake(_SCRIPT)
+            elif tag in fragments.ADDRESSES:
+                self._begins_with_a_value(address)
         elif tag in ("iframe", "embed", "object"):
             self._remark(f"<{tag}> cannot show a file of the project")
         elif not address.startswith(("#", "?")):
@@ -138,7 +143,9 @@ class Tags(PageParser):
     def _link(self, address: str) -> None:
         """Check whether the file at this address can be opened. A link to another site opens whatever it names."""
         path = _path(address)
-        if not path or spans.MARK in path or self._is_elsewhere(address):
+        if address.startswith(spans.MARK):
+            self._begins_with_a_value(address)
+        if not path or spans.MARK in path or self._on_disk(address) or self._is_elsewhere(address):
             return
         if path.startswith("/") and not path.startswith("/steps/"):
             return
@@ -148,6 +155,23 @@ class Tags(PageParser):
             self._remark(f"{short(path)} is not found; write https:// before it")
         elif path != "next":
             self._file(path)
+
+    def _on_disk(self, address: str) -> bool:
+        """Remark on the address of a file on the researcher's own disk; return whether it is one."""
+        if not _ON_DISK.match(address):
+            return False
+        alone = re.split(r"[/\\]", _path(address))[-1]
+        message = (
+            f"participants do not have {short(address)}: put the file into {self._folder}/ and write {short(alone)}"
+        )
+        self._remark(message)
+        return True
+
+    def _begins_with_a_value(self, address: str) -> None:
+        """Remark on the name of a file that begins with a value: it may be a whole address, so it is not changed."""
+        path = _path(address)
+        if is_served(path) and "/" not in path:
+            self._remark("a file's name that begins with a value is not found; write ./ before it")
 
     def _elsewhere(self, tag: str, address: str, style_sheet: bool) -> None:
         try:

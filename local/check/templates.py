@@ -61,8 +61,26 @@ def check_template(label: str, source: str, config: Config | None, visitors: Vis
             undefined.remove(name.name)
             message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
+    yield from _group_of_nobody(label, parsed, config)
     yield from check_answers_named(label, parsed, visitors.earlier)
     yield from _shown(label, page, parsed, config, visitors)
+
+
+def _group_of_nobody(label: str, parsed: nodes.Template, config: Config | None) -> Iterator[Diagnostic]:
+    """A remark if the page compares `group` with a number in a study without groups: all see the same branch."""
+    if config is None or config.groups:
+        return
+    for found in parsed.find_all(nodes.Compare):
+        with_number = any(
+            isinstance(operand.expr, nodes.Const) and isinstance(operand.expr.value, int) for operand in found.ops
+        )
+        if isinstance(found.expr, nodes.Name) and found.expr.name == "group" and with_number:
+            message = (
+                "the study has no groups, so all participants see the same branch; groups come from versions of a "
+            )
+            message += "page, such as consent-0.html and consent-1.html (docs/pages.md#groups)"
+            yield Diagnostic(label, found.lineno, "", message, remark=True)
+            return
 
 
 def _shown(

@@ -187,6 +187,12 @@ def test_an_episode_that_was_not_played_for_long_may_end(folder: Path, told: dic
     assert any("no episode ended" in str(problem) for problem in report.problems(0)) == remarked
 
 
+def test_a_method_that_is_named_like_a_callback_is_remarked_on(folder: Path) -> None:
+    agent(folder, "    def close", "    def on_key(self, key):\n        pass\n\n    def close")
+    (line,) = looked(folder)
+    assert line.endswith("remark: on_key is never called by Hippodrome; docs/callbacks.md lists the callbacks")
+
+
 def test_a_method_that_is_nearly_a_callback_is_remarked_on(folder: Path) -> None:
     agent(folder, "    def close", "    def on_episode_over(self, session):\n        pass\n\n    def close")
     (line,) = looked(folder)
@@ -385,6 +391,13 @@ def test_if_the_agent_translates_names_an_error_is_not_attributed_to_the_names(f
     (line,) = tried(folder)
     assert "step(2) fails" in line
     assert line.endswith("AssertionError: mine")
+
+
+def test_more_names_than_the_action_space_has_are_a_mistake_if_the_agent_has_no_step(folder: Path) -> None:
+    with_a_third_name(folder, "return self.env.step(action)")
+    agent(folder, "def step(self, action):\n        return", "def unused(self, action):\n        return")
+    (line,) = tried(folder)
+    assert line.startswith("config.yml:13: trial.actionSpace: has 3 names, but the environment has 2 actions; ")
 
 
 def test_an_action_that_the_environment_refuses_is_a_mistake_in_the_names(folder: Path) -> None:
@@ -657,7 +670,7 @@ def test_words_that_reach_no_method_of_the_agent_are_remarked(folder: Path, cont
     ("file", "whose"),
     [
         ("console.py", "Hippodrome"), ("protocol.py", "Hippodrome"), ("export/__init__.py", "Hippodrome"),
-        ("local/maze.py", "Hippodrome"), ("random.py", "Python"), ("yaml.py", "the installed package PyYAML"),
+        ("local/maze.py", "Hippodrome"), ("random.py", "Python"), ("test.py", "Python"), ("yaml.py", "the installed package PyYAML"),
         ("maze.py", None),
     ],
 )  # fmt: skip

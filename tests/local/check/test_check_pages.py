@@ -45,6 +45,10 @@ def test_mistakes_in_jinja_are_reported(folder: Path, text: str, said: str) -> N
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        (
+            "{% if group == 0 %}a{% else %}b{% endif %}",
+            "the study has no groups, so all participants see the same branch; ",
+        ),
         ("{{ completion_cod }}", "nothing is shown: there is no value completion_cod; did you mean completion_code?"),
         ("{{ answers['1'].n * 2 }}", "a participant without the answer gets an error page here (UndefinedError: "),
     ],
@@ -151,6 +155,16 @@ def test_crossed_versions_are_shown_with_each_version_of_the_earlier_page(folder
         ("<a href='/steps/quick/sheet.pdf'>x</a>", "there is no sheet.pdf in steps/"),
         ("<map><area href='ct.png'></map>", "there is no ct.png in steps/; did you mean cat.png?"),
         ("<a href='files/cat.png'>x</a>", "files/cat.png is not found: put the file into steps/ itself"),
+        ("<img src='{{ project.id }}.png'>", "a file's name that begins with a value is not found; "),
+        (
+            "<a href='{{ project.id }}.pdf'>x</a>",
+            "a file's name that begins with a value is not found; write ./ before",
+        ),
+        (
+            r"<img src='C:\Users\me\dog.png'>",
+            r"participants do not have C:\Users\me\dog.png: put the file into steps/ and",
+        ),
+        ("<a href='file:///home/me/a.pdf'>x</a>", "participants do not have file:///home/me/a.pdf: put the file into"),
         ("<a href='cat.zip'>x</a>", "cat.zip is not shown: of files beside the pages only png, "),
         ("<a href='bye.html#end'>x</a>", "bye.html cannot be opened by a link; make it a step, or link to a PDF"),
         ("<a href='www.example.org/x'>x</a>", "www.example.org/x is not found; write https:// before it"),
@@ -237,7 +251,7 @@ def test_good_html_gets_no_finding(folder: Path) -> None:
         folder,
         """<img src="a%20cat.png?2#x"><img src="./a cat.png"><img src="/steps/quick/a%20cat.png">
         <img src="https://MEDIA.example/x.png"><img src="https://media.example:443/x"><img src="data:image/png;base64,AA=">
-        <img src="{{ project.id }}.png"><a href="https://anywhere.example">x</a><link rel="preconnect" href="https://x.example">
+        <img src="./{{ project.id }}.png"><a href="https://anywhere.example">x</a><link rel="preconnect" href="https://x.example">
         <iframe src="https://media.example/video"></iframe><script src="x.js"></script>
         <script>if (1 < 2) document.write('<img src="none.png" onclick="x">')</script>
         <input type="submit"><input type=button><button>Go</button><input name="q{{ group }}" value="{{ answers["1"].n }}">
@@ -297,7 +311,7 @@ def test_good_questions_and_tags_get_no_finding(folder: Path) -> None:
         f"""<h1>Hello<br></h1><p>One<p>Two<ul><li>a<li>b</ul>
         <fieldset>{radio("q", "a", "b")}</fieldset><fieldset>{radio("r", "a", "b")}</fieldset>
         <table><tr><td>{radio("s", "1")}</td></tr><tr><td>{radio("s", "2")}</td></tr><tr><td>{radio("s", "3")}</table>
-        {{% if group == 1 %}}{radio("t", "a", "b")}{{% else %}}{radio("t", "a", "b")}{{% endif %}}
+        {{% if completion_code %}}{radio("t", "a", "b")}{{% else %}}{radio("t", "a", "b")}{{% endif %}}
         {{% for i in range(2) %}}<div>{radio("u{{ i }}", "a", "b")}</div>{{% endfor %}}
         <svg><path d="M0 0"/><circle r="1"/></svg> <b><i>x</b></i>
         <script>const a = {{{{ answers["1"].a|tojson }}}}, g = {{{{ group }}}}, n = {{{{ (group or 0)|int }}}}; if (a < 1) b = "<div>"</script>""",
