@@ -18,10 +18,6 @@ HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command l
 PORT ?= 8000
 BOTS ?= 20
 TEMPLATE ?=
-SAMPLE ?= 150
-SEED ?=
-MODULES ?=
-JOBS ?= 2
 STACK ?= hippodrome
 DOMAIN ?=
 EMAIL ?=
@@ -30,14 +26,14 @@ MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
-KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN SAMPLE MODULES JOBS
+KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
 # PROJECT=$STUDY with nothing in STUDY would be the example, and DATA= another folder than was meant.
 $(foreach name,PROJECT DATA USER_ID TEMPLATE PORT BOTS STACK DOMAIN EMAIL,$(if $(filter command,$(origin $(name))),$(if $(strip $($(name))),,\
 	$(error $(name)= has no value, and nothing was run: write one, or leave $(name)= out))))
-NUMBERS := PORT BOTS WORKERS TIMES SEED WITHIN SAMPLE JOBS
+NUMBERS := PORT BOTS WORKERS TIMES SEED WITHIN
 DIGITS := 0 1 2 3 4 5 6 7 8 9
 without = $(if $(2),$(call without,$(subst $(firstword $(2)),,$(1)),$(wordlist 2,10,$(2))),$(1))# the text $(1) without the characters $(2)
 $(foreach name,$(NUMBERS),$(if $(call without,$($(name)),$(DIGITS)),\
@@ -131,10 +127,6 @@ WITHIN ?=
 .PHONY: hunt
 hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them, WITHIN= ends it)
 	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) HUNT_SEED=$(SEED) $(PYTEST) -rs
-
-.PHONY: mutants
-mutants: $(VENV)/dev ## change the pure core a little, SAMPLE=150 times: do the quick tests notice? (SEED=, MODULES=, JOBS=2)
-	@SAMPLE=$(SAMPLE) SEED=$(SEED) MODULES="$(MODULES)" JOBS=$(JOBS) $(BIN)/python -m tests.mutation
 
 .PHONY: bench
 bench: $(VENV)/dev $(MINISTACK)/ready ## measure, print a table, write bench/results.json

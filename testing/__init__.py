@@ -18,7 +18,6 @@ Platforms, from the fastest to the one most like AWS; `fake_platform` and `moto_
     `simulation/`     AWS with quotas, latencies, lost and late events on a `GreenletClock`. For crowds, and for the bench
     `moto_world`      the adapters of `hippodrome/aws` on moto; each call is judged by the role of its function (`iam/`)
     `moto_study`      the example study on `moto_world`; the test delivers messages
-    `clocked_moto`    the example study on `moto_world`, where time passes, queues deliver again, and the sweep runs
     `strict_s3`       an HTTP server that checks presigned requests as S3 does
     `ministack/`      the whole stack on the emulator, in processes of its own
 
@@ -28,7 +27,6 @@ Time and tasks
 
 Faults, one module for each level at which they are injected
     `port_faults`     at a call of a port: the call is refused, loses its reply, or the function crashes before or after it
-    `aws_faults`      below botocore, in the HTTP answers of AWS
     `os_faults`       at the system calls of one machine
     `power_cut`       a disk that loses what was not synced
 

@@ -1,6 +1,6 @@
 """The example study on moto, and a participant with a browser. The test says when messages are delivered.
 
-Here the test goes step by step; in `testing/clocked_moto.py` time passes, and faults are injected.
+The test goes step by step.
 """
 
 from __future__ import annotations

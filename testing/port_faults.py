@@ -1,6 +1,6 @@
 """Faults at one call of a port, on the simulated platforms: the call is refused, loses its reply, or is the last one.
 
-`testing/aws_faults.py` injects faults below botocore, in HTTP; `testing/os_faults.py` injects them at system calls.
+`testing/os_faults.py` injects faults at system calls.
 """
 
 from __future__ import annotations

@@ -35,7 +35,6 @@ ONE_AFTER_ANOTHER = (
     ("tests/deploy/code/test_build.py",),
     ("tests/bench/test_bench.py",),
     ("tests/infra/test_enforcement.py",),
-    ("tests/hippodrome/aws/test_faults.py",),
 )
 """Files and folders whose tests share something costly: one worker runs them. The longest are the first that begin.
 
