@@ -114,3 +114,17 @@ def test_a_choice_without_a_button_is_said_in_words(dilemma: World, phone: Any) 
     play(dilemma, phone)
     tell(dilemma, state="playing", toAct=False, chosen="doNothing")
     phone.wait_for_selector("#choice:text-is('You chose “Do nothing”.')")
+
+
+def test_who_loses_the_network_at_the_end_stays_in_the_study(world: World, phone: Any) -> None:
+    hold_timers(phone, LAST_PICTURE)
+    play_on(world, phone, (360, 740), {}, [])
+    tell(world, state="ended")
+    world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 3}))
+    phone.wait_for_selector("#overlay-button:text('Go on')")
+    phone.context.set_offline(True)
+    try:
+        phone.click("#overlay-button")
+        phone.wait_for_selector("#leave-text:text('There is no connection at the moment')")
+    finally:
+        phone.context.set_offline(False)

@@ -20,9 +20,8 @@ export async function leave({ score, episodes, error } = {}) {
   }).then(() => showSection("leave"));
   for (;;) {
     try {
-      const answers = await pageAnswers();
-      await seen;
-      if (answers) await loadPage();
+      await seen; // asked only now: a network that was lost meanwhile would leave the participant on the browser's own page
+      if (await pageAnswers()) await loadPage();
     } catch {
       setText(find("leave-text"), TEXT.savedOffline);
     }
