@@ -80,10 +80,10 @@ _WAITING = {
         "The game needs JavaScript, which is switched off in this browser. "
         "Please switch it on, or open your study link in another browser."
     ),
-    "movedTitle": "Your game moves to another computer",
+    "movedTitle": "Your game starts on another computer",
     "moved": (
-        "The computer it was on has failed; you did nothing wrong. You need not do anything: the game appears on this "
-        "page by itself, and what you have played is kept."
+        "The previous computer has failed. This is not your fault. You need not do anything: the game appears on this "
+        "page by itself. What you have answered and played before is kept."
     ),
     "movedProgramTitle": "The connection to your game was lost",
     "movedProgram": (
@@ -173,6 +173,7 @@ _GAME = {
     "othersTurn": "The others’ turn",
     "youChose": "You chose “{action}”.",
     "timeUp": "Time was up: “{action}” was chosen for you.",
+    "timeUpIdle": "Time was up; nothing was chosen for you.",
     "timeUpEnds": "The time for a choice was up, so this game has ended.",
     "gameOver": "Game {game} of {games} is over",
     "nextGameIn": "The next game begins in {time}.",
@@ -195,7 +196,7 @@ _GAME = {
     "thanksForPlaying": "Thank you for playing!",
     "savedMoment": "Your game is saved. One moment, please…",
     "savedOffline": (
-        "Your game is saved. There is no connection at the moment – trying again… Please stay on this page: it continues "
+        "Your game is saved. No connection – trying again… Please stay on this page: it continues "
         "by itself. If this lasts for minutes, try another network."
     ),
 }
@@ -285,11 +286,9 @@ _TOGETHER = {
     "tooSlow": "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
 }
 SAID_ALONE = {
-    "saidRoundFailed": "Something went wrong in the game, so this round has ended. The next round begins.",
-    "saidRoundAgain": "This round could not go on where it was, so it begins again. The rounds before it are kept.",
-    "saidGameFailed": (
-        "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
-    ),
+    "saidRoundFailed": "Something went wrong, so this game has ended. The next game begins.",
+    "saidRoundAgain": "This game could not go on where it was, so it begins again. The games before it are kept.",
+    "saidGameFailed": ("Something went wrong, so the game ends here. What you have played is kept."),
 }
 SAID_TOGETHER = {
     "saidPartnerLeft": (

@@ -116,6 +116,21 @@ def test_a_choice_without_a_button_is_said_in_words(dilemma: World, phone: Any) 
     phone.wait_for_selector("#choice:text-is('You chose “Do nothing”.')")
 
 
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [({}, "Time was up; nothing was chosen for you."), ({"noop": "Stay"}, "Time was up: “Stay” was chosen for you.")],
+    ids=["no label", "label"],
+)
+def test_the_idle_action_has_no_name_for_participants_unless_the_study_gives_it_one(
+    dilemma: World, phone: Any, labels: dict[str, str], words: str
+) -> None:
+    dilemma.controls |= {"labels": labels}
+    play(dilemma, phone)
+    tell(dilemma, state="playing", toAct=True, timeUp="noop")
+    phone.wait_for_selector(f"#choice:text-is('{words}')")
+    assert phone.inner_text("#announce") == f"{words} Your turn"
+
+
 def test_who_loses_the_network_at_the_end_stays_in_the_study(world: World, phone: Any) -> None:
     hold_timers(phone, LAST_PICTURE)
     play_on(world, phone, (360, 740), {}, [])
@@ -125,6 +140,6 @@ def test_who_loses_the_network_at_the_end_stays_in_the_study(world: World, phone
     phone.context.set_offline(True)
     try:
         phone.click("#overlay-button")
-        phone.wait_for_selector("#leave-text:text('There is no connection at the moment')")
+        phone.wait_for_selector("#leave-text:text('No connection')")
     finally:
         phone.context.set_offline(False)

@@ -623,7 +623,7 @@ def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: W
     wait_for_next_page(tab, within=4_000)
 
 
-FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+FAILED = "Something went wrong, so the game ends here. What you have played is kept."
 
 
 @pytest.mark.parametrize("own", [None, "Das Spiel ging kaputt."])
@@ -743,12 +743,29 @@ def test_the_page_says_that_the_server_was_lost_and_goes_on_with_the_next(world:
     assert "Your game is kept" in tab.inner_text("#overlay-hint")
     shot(tab, f"{width}-3-lost-connection")
     world.state = {"state": "queued", "seconds": 1, "attempt": 2, "reason": "lost", "replaces": True}
-    tab.wait_for_selector("h1:text('moves to another computer'):visible")
+    tab.wait_for_selector("h1:text('starts on another computer'):visible")
     assert tab.locator("h1:visible").count() == 1
     shot(tab, f"{width}-3-moves")
     world.ready()
     tab.wait_for_selector("#overlay-button:visible")
     assert len(world.connections) == 2
+
+
+@pytest.mark.parametrize("width", [360, 1280])
+def test_a_game_that_could_not_begin_is_still_loading_and_not_lost(world: World, tab: Any, width: int) -> None:
+    tab.set_viewport_size({"width": width, "height": 740})
+    world.step = 2
+    world.refusal = "The game cannot be started at the moment. Please wait: it is tried again."
+    world.ready()
+    tab.goto(world.url)
+    tab.wait_for_selector(f"#trouble:text('{world.refusal}')")
+    world.state = {**world.state, "url": NOWHERE}
+    tab.wait_for_selector("#overlay-hint:text('This takes longer than usual. Please stay on this page.')")
+    assert tab.inner_text("#overlay-title") == "Loading the game…"
+    shot(tab, f"{width}-not-begun")
+    world.refusal = ""
+    world.ready()
+    tab.wait_for_selector("#overlay-button:visible")
 
 
 def test_the_page_of_a_first_server_does_not_say_that_the_game_moves(world: World, tab: Any) -> None:
@@ -763,8 +780,8 @@ def test_the_page_says_what_may_help_if_the_server_cannot_be_reached(world: Worl
     world.state["url"] = NOWHERE
     lone_tab.clock.install()
     lone_tab.goto(world.url)
-    lone_tab.wait_for_selector("#overlay-title:text('Connection lost')")
-    assert "try another network" in lone_tab.inner_text("#overlay-hint")
+    lone_tab.wait_for_selector("#overlay-hint:text('try another network')")
+    assert lone_tab.inner_text("#overlay-title") == "Loading the game…", "no connection was there to lose"
     world.ready()
     lone_tab.clock.run_for(10_000)
     lone_tab.wait_for_selector("#overlay-button:visible")

@@ -202,9 +202,9 @@ def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
     world: World, phone: Any, size: tuple[int, int]
 ) -> None:
     play(world, phone, size, {}, ALL)
-    failed = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+    failed = "Something went wrong, so the game ends here. What you have played is kept."
     world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1, "error": failed}))
-    phone.wait_for_selector("#overlay-hint:visible:text('cannot go on')")
+    phone.wait_for_selector("#overlay-hint:visible:text('ends here')")
     shot(phone, f"{size[0]}-failed")
     over, stage = box(phone, "#overlay"), box(phone, ".stage")
     assert over["y"] >= stage["y"], "the line above the picture is not covered"
@@ -283,7 +283,7 @@ COVERED = """() => {
 def test_a_message_covers_none_of_the_words_over_the_picture(world: World, phone: Any, size: tuple[int, int]) -> None:
     hold_timers(phone, MESSAGE)
     play(world, phone, size, {}, ALL)
-    failed = "Something went wrong in the game, so this round has ended. The next round begins."
+    failed = "Something went wrong, so this game has ended. The next game begins."
     world.connections[0].send(json.dumps({"error": failed}))
     tell(world, state="break", nextIn=9)
     phone.wait_for_selector("#overlay-hint:text('The next game begins')")

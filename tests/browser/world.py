@@ -84,6 +84,8 @@ class World:
     """What the trial server answers to `start`."""
     before_pictures: Callable[[], object] = lambda: None
     """What the trial server waits for between its first message and the first picture."""
+    refusal: str = ""
+    """What the trial server says instead if the game cannot begin on it."""
     url: str = ""
     game_url: str = ""
 
@@ -127,7 +129,10 @@ class World:
         for text in connection:
             message = json.loads(text)
             self.received.append(message)
-            if "token" in message:
+            if "token" in message and self.refusal:
+                connection.send(json.dumps({"error": self.refusal}))
+                connection.close(1011)
+            elif "token" in message:
                 connection.send(json.dumps(controls))
                 self.before_pictures()
                 connection.send(pack(1, RED * 4))

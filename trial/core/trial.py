@@ -74,9 +74,9 @@ from trial.core.timing import Due, Timing
 from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
 from trial.settings import TrialSettings
 
-EPISODE_FAILED = "Something went wrong in the game, so this round has ended. The next round begins."
-EPISODE_BEGINS_AGAIN = "This round could not go on where it was, so it begins again. The rounds before it are kept."
-TRIAL_FAILED = "Something went wrong in the game and it cannot go on. What you have played is kept; please continue."
+EPISODE_FAILED = "Something went wrong, so this game has ended. The next game begins."
+EPISODE_BEGINS_AGAIN = "This game could not go on where it was, so it begins again. The games before it are kept."
+TRIAL_FAILED = "Something went wrong, so the game ends here. What you have played is kept."
 
 
 class Phase(Enum):

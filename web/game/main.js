@@ -26,12 +26,15 @@ const title = document.title;
 async function main() {
   let state = data.state;
   let losses = 0;
+  let hint = TEXT.noConnection; // why the game is not there yet, if the connection fails; "" once a server has let the page in
   let waitsSince = performance.now();
   for (let polls = 0; ; polls += 1) {
     if (state.state === "ready" && state.url) {
       const { why, welcome, result } = await playOn(state);
       losses = welcome ? 0 : losses + 1;
-      if (why === "lost") showOverlay("lost");
+      if (welcome) hint = "";
+      else if (why === "failed") hint = TEXT.takesLonger;
+      if (why === "lost") hint ? setText(find("overlay-hint"), hint) : showOverlay("lost");
       if (why === "done") return leave(result);
       if (why === "moved") await loadPage();
       if (why === "elsewhere") await playHere();

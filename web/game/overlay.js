@@ -16,7 +16,7 @@ export const overlays = {
 
 // Shows the overlay with that name; no overlay for names without one, such as "playing".
 export function showOverlay(name) {
-  const overlay = Object.hasOwn(overlays, name) && overlays[name];
+  const overlay = overlays[name] ?? false;
   find("overlay").hidden = !overlay;
   if (overlay.aside) find("controls").after(find("overlay")); // in their place: the last picture stays visible
   else find("trouble").before(find("overlay"));
@@ -31,9 +31,9 @@ export function showOverlay(name) {
   setText(find("announce"), `${overlay.title ?? TEXT.playing}${score}`);
   setText(find("overlay-score"), "");
   setText(find("overlay-title"), overlay.title ?? "");
-  const hint = matchMedia("(hover: hover) and (pointer: fine)").matches && game.directions ? overlay.hint : "";
-  setText(find("overlay-hint"), overlay.note ?? hint ?? "");
-  find("overlay-button").textContent = overlay.button ?? "";
+  const hint = game.directions && matchMedia("(hover: hover) and (pointer: fine)").matches && overlay.hint;
+  setText(find("overlay-hint"), overlay.note || hint || "");
+  find("overlay-button").textContent = overlay.button;
   find("overlay-button").hidden = !overlay.button;
   for (const hook of hooks.overlay) hook(name);
 }

@@ -47,7 +47,8 @@ function showChoice({ chosen, timeUp }) {
     if (is) button.setAttribute("aria-pressed", "true");
     else button.removeAttribute("aria-pressed");
   }
-  if (timeUp) setText(choice, TEXT.timeUp(labelOf(timeUp, labels)));
+  if (timeUp === "noop" && !labels.noop) setText(choice, TEXT.timeUpIdle);
+  else if (timeUp) setText(choice, TEXT.timeUp(labelOf(timeUp, labels)));
   else if (timeUp === "") setText(choice, TEXT.timeUpEnds);
   else setText(choice, chosen && !shown ? TEXT.youChose(name) : "");
 }

@@ -270,7 +270,7 @@ def test_an_error_of_the_agent_ends_the_episode_and_the_next_begins():
     error = ValueError("oops")
     effects = driver.fails(error)
     assert LogAgentError(error) in effects
-    assert "this round has ended" in sent(effects)[0]["error"]
+    assert "this game has ended" in sent(effects)[0]["error"]
     assert driver.records("error") == [{"episode": 1, "step": 1, "error": "ValueError: oops"}]
     assert driver.records("end")[0]["why"] == "failed"
     assert isinstance(driver.call, ResetCall)
@@ -280,7 +280,7 @@ def test_an_agent_that_hangs_ends_the_trial_and_is_called_no_more():
     driver = Driver().playing()
     driver.say(command="good")
     effects = driver.fails(AgentTimeout("no answer within 30 s"))
-    assert "cannot go on" in sent(effects)[0]["error"]
+    assert "the game ends here" in sent(effects)[0]["error"]
     assert not driver.of(Call), "not even for the feedback"
     assert driver.of(SaveAnswer)[0].answers["outcome"] == "failed"
     assert sent(driver.connect("tab again"))[1] == sent(effects)[0], (
