@@ -461,7 +461,8 @@ def test_a_participant_whose_game_failed_reads_how_to_go_on_and_whom_to_ask() ->
 @pytest.mark.parametrize("reason", [*Reason, None])
 def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> None:
     state = "failed" if reason in FAILURES else "ended"
-    text = Elements(game(state=state, reason=reason, again=True).html).text
+    _, over = game(state=state, reason=reason, again=True).html.split('<section id="over"')
+    text = Elements(f"<section {over}").text
     assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
     assert ("switched off by the researchers" in text) is (reason == Reason.STOPPED)
     assert ("The game was not played for a while" in text) is (reason == Reason.ENDED)
