@@ -86,9 +86,10 @@ def test_without_a_network_the_page_says_what_is_kept_and_what_to_do_and_it_reco
     assert lone_tab.evaluate("[document.documentElement.scrollWidth - innerWidth]") == [0]
     shot(lone_tab, f"{width}-no-network-{phase.__name__}")
     requests = len(world.polls)
-    lone_tab.context.set_offline(False)
     if phase is over:
         world.step, world.source = 3, "<h1>Next page</h1>"
+    lone_tab.context.set_offline(False)
+    if phase is over:
         lone_tab.wait_for_selector("h1:text('Next page')")
     elif world.connections:
         lone_tab.wait_for_selector("#overlay-title:text('Ready?')")
