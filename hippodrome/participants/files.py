@@ -19,11 +19,11 @@ KINDS = {
     "png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg", "gif": "image/gif", "webp": "image/webp",
     "svg": "image/svg+xml", "mp4": "video/mp4", "webm": "video/webm", "mp3": "audio/mpeg", "ogg": "audio/ogg",
     "wav": "audio/wav", "css": "text/css", "js": "text/javascript", "vtt": "text/vtt", "woff2": "font/woff2",
-    "pdf": "application/pdf", "txt": "text/plain; charset=utf-8", "csv": "text/csv; charset=utf-8",
+    "pdf": "application/pdf", "txt": "text/plain; charset=utf-8",
     "ics": "text/calendar; charset=utf-8", "odt": "application/vnd.oasis.opendocument.text",
     "docx": "application/vnd.openxmlformats-officedocument.wordprocessingml.document",
 }  # fmt: skip
-_SAVED = ("csv", "ics", "odt", "docx")
+_SAVED = ("ics", "odt", "docx")
 """The endings of files that browsers save, since other programs open them."""
 
 
