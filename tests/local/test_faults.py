@@ -5,8 +5,7 @@ error, how far it reaches (`testing/os_faults.py`). Afterwards the participant m
 faults; no process, open record, timer, message, dead letter or recording in the spool may be left; and what the
 participant was told is kept must be there.
 
-All points are some thousands: `make hunt` runs them, and with TIMES=1 one for each kind of call of each journey. The other
-tests run a few, chosen by a fixed seed.
+All points are some thousands; the tests run a few, chosen by a fixed seed.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from pathlib import Path
 
 import pytest
 
-from testing import exploration
 from testing.os_faults import ERRORS, KILLS, OsCall, OsFault, OsReach
 from tests.local.faulty_study import JOURNEYS, FaultyStudy, Stranded, run
 
@@ -67,26 +65,3 @@ def test_a_sample_of_faults_leaves_nothing_wrong(tmp_path: Path) -> None:
     journey = dice.choice(list(JOURNEYS))
     for number, fault in enumerate(dice.sample(list(points(run(journey, tmp_path / "counted"))), SAMPLE)):
         assert went_wrong(journey, tmp_path / str(number), fault) == [], f"{journey}: {fault}"
-
-
-@pytest.mark.hunt
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("journey", JOURNEYS)
-def test_a_fault_at_any_call_leaves_nothing_wrong(journey: str, tmp_path: Path) -> None:
-    """Every kind of call, with the next of its faults; all of them if the hunt is a long one."""
-    chosen = list(points(run(journey, tmp_path / "counted")))
-    if exploration.TIMES < 2:
-        chosen = one_each(chosen, turn=list(JOURNEYS).index(journey))
-    wrong = {}
-    for number, fault in enumerate(chosen):
-        if found := went_wrong(journey, tmp_path / str(number), fault):
-            wrong[str(fault)] = found
-    assert wrong == {}
-
-
-def one_each(faults: list[OsFault], turn: int) -> list[OsFault]:
-    """Of each kind of call one fault: another one in each journey, and for each place."""
-    kinds: dict[OsCall, list[OsFault]] = {}
-    for fault in faults:
-        kinds.setdefault(fault.call, []).append(fault)
-    return [of_it[(turn + number) % len(of_it)] for number, of_it in enumerate(kinds.values())]
