@@ -1,4 +1,4 @@
-"""One call is refused: what each part of local mode does then. All calls in turn: `test_faults.py`."""
+"""One call is refused: what each part of local mode does then. A sample of all calls: `test_faults.py`."""
 
 from __future__ import annotations
 
