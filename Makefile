@@ -103,16 +103,13 @@ erase: WHO = -- "$(USER_ID)"
 certificate doctor status cost data erase logs stop destroy:
 	@$(DEPLOY) $@ $(STUDY) $(ARGS) $(WHO) $(FOUND)
 
-# The quick tests only compute. All tests together wait for two thirds of their time, so two cores can have more workers.
 WORKERS ?=
-AT_ONCE := 4
-# Python keeps its bytecode, whatever the shell's environment says: every worker and every process of a test uses it.
-PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(or $(WORKERS),$(AT_ONCE)) --dist loadgroup
+# Many tests wait for processes, so two cores have four workers. `loadscope` gives a worker the tests of a module.
+PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(or $(WORKERS),4) --dist loadscope
 QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/core \
 	$(addprefix --ignore ,tests/hippodrome/aws tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py)
 
 .PHONY: test
-test: AT_ONCE := 10
 test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
 	@$(PYTEST)
 
@@ -126,7 +123,7 @@ SEED ?= 0
 WITHIN ?=
 .PHONY: hunt
 hunt: $(VENV)/dev $(MINISTACK)/ready ## explore for long: every fault point, TIMES=10 times as many examples (SEED= repeats them, WITHIN= ends it)
-	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) HUNT_SEED=$(SEED) $(PYTEST) -rs
+	@HUNT=$(TIMES) HUNT_SECONDS=$(WITHIN) $(PYTEST) -rs $(if $(filter-out 0,$(SEED)),--hypothesis-seed=$(SEED))
 
 .PHONY: bench
 bench: $(VENV)/dev $(MINISTACK)/ready ## measure, print a table, write bench/results.json

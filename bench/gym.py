@@ -175,7 +175,7 @@ def ours() -> Iterator[tuple[str, int]]:
     """Run our server within the block; give its address and process id."""
     with contextlib.ExitStack() as stack:
         with pinned():
-            found = stack.enter_context(gym_server(anew=True))
+            found = stack.enter_context(gym_server())
         yield found.url, found.pid
 
 

@@ -42,7 +42,7 @@ def applies() -> Iterator[Row]:
 
 def _apply(world: MinistackWorld, *options: str) -> float:
     begun = time.monotonic()
-    ran = world.deploy("apply", *options, "--yes", anew=True)
+    ran = world.deploy("apply", *options, "--yes")
     if ran.code:
         raise RuntimeError(f"apply ended with {ran.code}: {ran.err[-500:]}")
     return time.monotonic() - begun

@@ -35,9 +35,8 @@ How much and how fast
     `waiting`         `until` waits until a condition is true
     `quiet_log`       switches the log off for a block
     `exploration`     how many examples and cases `make test` and `make hunt` take
-    `preloaded`       starts processes of `python -m …` whose imports are already done; `held_study` and `held_rehearsal` use it
-    `forked_servers`  does so for the servers of a study on this machine
-    `memoized_aws`    botocore and moto compute once per process what they would compute for each client and call
+    `processes`       starts `python -m …`
+    `held_study`      a study that a test runs in a process of its own
     `template`        the resources of `infra/template.yml`
     `imports`         the modules that a Python file imports
 """

@@ -6,7 +6,7 @@ the same verdict within minutes. `make hunt` sets the environment variable HUNT,
 * tests with the mark `hunt`, which `make test` leaves out,
 * tests with the mark `explores`, which then take all their cases instead of a sample (`sample`), or the Chromium that
   people have instead of the one without windows,
-* hypothesis tests, with 2 * HUNT times as many examples, different ones each time; the same ones with HUNT_SEED.
+* hypothesis tests, with 2 * HUNT times as many examples, different ones each time, unless `--hypothesis-seed` repeats them.
 """
 
 from __future__ import annotations
@@ -16,16 +16,12 @@ import random
 from collections.abc import Callable, Hashable, Iterable
 from typing import TypeVar
 
-from hypothesis import HealthCheck, core, settings
-from hypothesis.internal.conjecture import providers
+from hypothesis import HealthCheck, settings
 
 T = TypeVar("T")
 
 TIMES = int(os.environ.get("HUNT") or 0)
 """The factor by which `make hunt` multiplies the examples of a property; 0 in `make test`."""
-
-SEED = int(os.environ.get("HUNT_SEED") or 0)
-"""The number that decides which examples `make hunt` runs; 0: others each time."""
 
 SECONDS = float(os.environ.get("HUNT_SECONDS") or "inf")
 """The seconds after which `make hunt` begins no new test, and reports the remaining tests as skipped."""
@@ -64,13 +60,9 @@ def sample_of_each(cases: Iterable[T], share: int, kind: Callable[[T], Hashable]
 def load_profile() -> None:
     """Make one profile of hypothesis the default of all tests.
 
-    In `make test`, and with HUNT_SEED, examples hold no constants from our modules: hypothesis 6.170 takes constants from
-    the modules that the process has loaded, so the tests that a worker has run before would decide which examples it
-    runs.
-
-    The profile has no deadline, because a slow machine is no fault of the code; no database, because an example that
-    failed once belongs in a test; and no health checks, because they measure time, too, and because no example changes
-    anything that a function-scoped fixture here holds.
+    It has no deadline, because a slow machine is no fault of the code; no database, because an example that failed once
+    belongs in a test; and no health checks, because they measure time, too, and because no example changes anything that
+    a function-scoped fixture here holds.
     """
     settings.register_profile(
         "hippodrome",
@@ -82,7 +74,3 @@ def load_profile() -> None:
         suppress_health_check=list(HealthCheck),
     )
     settings.load_profile("hippodrome")
-    if SEED:
-        core.__dict__["global_force_seed"] = SEED  # as the option `--hypothesis-seed` does
-    if SEED or not TIMES:
-        providers._get_local_constants = lambda: providers._local_constants  # loaded modules add nothing to these

@@ -16,7 +16,7 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from testing import preloaded
+from testing import processes
 
 ROOT = Path(__file__).resolve().parent.parent
 SECONDS = 60.0  # an answer may take so long: on a participant's server, environments have the lowest priority
@@ -41,29 +41,20 @@ def gym_server(
     program: Sequence[str] = ("-m", "trial.gym"),
     cwd: Path = ROOT,
     env: Mapping[str, str] | None = None,
-    anew: bool = False,
 ) -> Iterator[GymServerProcess]:
     """Run `python -m trial.gym` with these arguments at a free port for the block.
 
     At the end it is interrupted, as by Ctrl-C. `program` is run instead, if it is given; `env` is added to the
-    environment. The program prints the server's address first. The server's imports are already done; with `anew`, or
-    with a `program`, it starts as users start it.
+    environment. The program prints the server's address first.
     """
-    options: dict[str, Any] = {
-        "stdout": subprocess.PIPE,
-        "cwd": cwd,
-        "env": {**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT), **(env or {})},
-    }
-    words = [*(("--port", "0") if program[0] == "-m" else ()), *arguments]
-    if anew or program[0] != "-m":
-        process: Any = subprocess.Popen(
-            [sys.executable, *program, *words],
-            text=True,
-            preexec_fn=preloaded.interruptible,  # noqa: PLW1509 - it sets a signal and no more
-            **options,
-        )
-    else:
-        process = preloaded.start(program[1], words, stderr=2, **options)
+    process = subprocess.Popen(
+        [sys.executable, *program, *(("--port", "0") if program[0] == "-m" else ()), *arguments],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT), **(env or {})},
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=processes.interruptible,  # noqa: PLW1509 - it sets a signal and no more
+    )
     try:
         assert process.stdout is not None
         line = process.stdout.readline()

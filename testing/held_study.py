@@ -9,13 +9,13 @@ from typing import Any
 
 from local.rehearsal.study_process import ROOT, Process, StudyProcess, logs_of
 from protocol import environment
-from testing import preloaded
+from testing import processes
 from trial.recordings.recording import read
 from trial.settings import STALLED_SECONDS
 
 
 class HeldStudy(StudyProcess):
-    """A `StudyProcess` whose imports are done when it starts, and those of its servers, too (`forked_servers.py`).
+    """A `StudyProcess` for tests.
 
     With `port`, it can be started again at the same port. `stalled`: for how many seconds a page may leave a frame without
     acknowledgement; a page on a busy machine may need more than the 3 s that a server gives it otherwise.
@@ -34,7 +34,7 @@ class HeldStudy(StudyProcess):
             environment.STALLED_SECONDS: str(self._stalled),
         }
         arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
-        return preloaded.start("testing.forked_servers", arguments, starts=True, **options)
+        return processes.start("local", arguments, **options)
 
     def steps_written(self, owner: str = "*") -> int:
         """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""

@@ -554,34 +554,6 @@ def _own_client(service: str, region: str) -> Any:
     return _own_session.create_client(service, region_name=region)
 
 
-LISTS = {
-    "acm": "list_certificates",
-    "cloudformation": "list_stacks",
-    "cloudwatch": "describe_alarms",
-    "codebuild": "list_projects",
-    "ec2": "describe_vpcs",
-    "ecr": "describe_repositories",
-    "ecs": "list_clusters",
-    "iam": "list_roles",
-    "lambda": "list_functions",
-    "logs": "describe_log_groups",
-    "route53": "list_hosted_zones",
-    "s3": "list_buckets",
-    "scheduler": "list_schedule_groups",
-    "sns": "list_topics",
-    "sqs": "list_queues",
-    "sts": "get_caller_identity",
-}
-"""A call without parameters for each service that many tests use."""
-
-
-def load() -> None:
-    """Load what botocore and moto need for these services. Processes that are forked from this one find it loaded."""
-    with MotoWorld() as world:
-        for service, operation in LISTS.items():
-            getattr(world.client(service), operation)()
-
-
 @pytest.fixture
 def moto_world() -> Iterator[MotoWorld]:
     """Open a `MotoWorld` for a test."""

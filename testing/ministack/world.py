@@ -26,7 +26,7 @@ import boto3
 import httpx
 from botocore.config import Config
 
-from testing import aws_events, ports, preloaded, template
+from testing import aws_events, ports, processes, template
 from testing.certificates import authority
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -233,13 +233,8 @@ class MinistackWorld:
 
     # -- commands
 
-    def deploy(
-        self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "", anew: bool = False
-    ) -> CommandRun:
-        """Run `python -m deploy …` in the copy of the project, with these credentials or with root's.
-
-        The process starts with its imports already done; with `anew`, it starts as users start it.
-        """
+    def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> CommandRun:
+        """Run `python -m deploy …` in the copy of the project, with these credentials or with root's."""
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
         env |= {
             "AWS_ENDPOINT_URL": self.endpoint,
@@ -258,12 +253,9 @@ class MinistackWorld:
             env["HIPPODROME_STACK"] = stack
         began = time.monotonic()
         with tempfile.TemporaryFile("w+") as errors:
-            options: Any = {"cwd": self.source, "env": env, "stdout": subprocess.PIPE, "stderr": errors}
-            if anew:
-                command = [sys.executable, "-m", "deploy", *arguments]
-                process: Any = subprocess.Popen(command, stdin=subprocess.DEVNULL, text=True, **options)
-            else:
-                process = preloaded.start("deploy", arguments, copied=True, **options)
+            process = processes.start(
+                "deploy", arguments, cwd=self.source, env=env, stdout=subprocess.PIPE, stderr=errors
+            )
             try:
                 out, _ = process.communicate(timeout=280)  # a busy machine takes its time; the tests may take 300 s
             finally:

@@ -8,7 +8,7 @@ import pytest
 
 from bench import pictures, scenes, seen
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(autouse=True)

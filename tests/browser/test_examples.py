@@ -14,7 +14,7 @@ from tests.browser.conftest import Hold
 from tests.browser.world import SHOTS
 from trial.recordings.recording import read
 
-pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SIZES = [(1280, 800), (360, 740)]

@@ -9,7 +9,7 @@ import pytest
 
 from tests.browser.world import World, play, tell
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 CONTROLS = ["left", "right", "start", "pause", "good", "fpsUp", "fpsSet"]
 
 

@@ -22,7 +22,7 @@ from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 
 __all__ = ["launch"]  # a fixture
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 AGENT = """
 import numpy as np

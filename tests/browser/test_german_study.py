@@ -18,7 +18,7 @@ from testing.held_study import HeldStudy
 from tests.browser.conftest import GamesToEnd
 from tests.browser.world import FLAWS, SHOTS
 
-pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 
 GERMAN: dict[str, str] = yaml.safe_load((ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8"))["project"][
     "texts"

@@ -12,7 +12,7 @@ from local.rehearsal.study_process import StudyProcess
 from tests.browser.conftest import Hold
 from trial.recordings.recording import read
 
-pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 HUD = "text => document.querySelector('.hud').textContent.includes(text)"

@@ -14,7 +14,7 @@ from tests.browser.conftest import hold_timers, note_texts, wait_for_noted
 from tests.browser.world import FLAWS, LAST_PICTURE, PATIENCE, World, play, shot, tell
 from tests.trial.conftest import Running, grid_agent
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 KEYS = {
     "ArrowLeft": "left", "a": "left", "ArrowUp": "up", "ArrowLeft+ArrowUp": "leftup", " ": "jump", "Enter": "put", "1": "one",

@@ -12,7 +12,7 @@ import pytest
 from tests.browser.test_together_browser import LOBBY
 from tests.browser.world import World, play, shot, tell
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 
 def waiting(world: World, page: Any) -> None:

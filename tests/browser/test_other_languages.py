@@ -12,7 +12,7 @@ from hippodrome.model.texts import ENGLISH, is_right_to_left
 from tests.browser.test_together_browser import LOBBY
 from tests.browser.world import FLAWS, World, play, shot, tell
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 SIZES = [(360, 740), (1280, 800)]
 NO_LONGER_WRITTEN = {"ae"}  # Avestan
 LONG = {"start": "Commencer", "pause": "Pause", "goOn": "Continuer", "saidPing": "Trop lent."}

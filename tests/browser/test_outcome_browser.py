@@ -13,7 +13,7 @@ from tests.browser.test_phone_browser import play as play_on
 from tests.browser.world import LAST_PICTURE, World, play, shot, tell
 
 __all__ = ["phone", "phone_context"]  # fixtures
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 ALL = ["up", "down", "left", "right", "start", "pause"]
 SIZES = [(320, 568), (360, 740), (740, 360), (768, 1024), (1280, 800)]
 TIMED_OUT = "Time was up: “Defect” was chosen for you."

@@ -33,7 +33,7 @@ from tests.browser.world import (
 from tests.trial.conftest import Running, grid_agent
 
 STEPS = Path(__file__).resolve().parents[2] / "steps"
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 
 # Step pages

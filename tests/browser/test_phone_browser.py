@@ -12,7 +12,7 @@ import pytest
 from tests.browser.conftest import hold_timers, own_page
 from tests.browser.world import LAST_PICTURE, NOWHERE, PATIENCE, World, shot, tell
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 SCENE = {"width": 960, "height": 500, "background": "#c6e8f4", "coordinates": "pixels"}
 
 

@@ -21,7 +21,7 @@ from tests.browser.world import FLAWS, PATIENCE, RED, World, deflated_zeros, pac
 from tests.browser.world import play as open_game
 from tests.trial.conftest import Running
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 AGENT = """
 class Agent:

@@ -13,7 +13,7 @@ import pytest
 from local.rehearsal.study_process import servers_of, wait_until_gone
 from tests.browser.world import PATIENCE
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 CANVAS = """() => {

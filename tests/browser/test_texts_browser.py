@@ -20,7 +20,7 @@ from hippodrome.participants.frame import message_page
 from hippodrome.participants.texts import in_script
 from tests.hippodrome.participants.test_pages import LOBBY, PROJECT, game, step_view
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 
 PARTS = (
     *("`", "$", "${", "{", "}", "{{", "\\", '"', "'", "$$", "${alert(1)}", "\\u0041", "\\x4", "\\1", "//", "/*", "*/"),

@@ -17,7 +17,7 @@ from tests.browser.conftest import hold_timers, note_texts, wait_for_noted
 from tests.browser.world import FLAWS, LAST_PICTURE, PATIENCE, World, shot, tell
 from trial.core.session import PARTNER_MISSING, PING
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 SIZES = [(360, 740), (1280, 800)]
 LOBBY = {
     "state": "lobby", "players": 2, "here": 1, "seconds": 40, "patience": 300, "then": "unmatched", "proposed": False,

@@ -8,7 +8,7 @@ import pytest
 
 from tests.browser.world import FLAWS, World, play, shot, tell
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+pytestmark = pytest.mark.browser
 
 
 @pytest.fixture

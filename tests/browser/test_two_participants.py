@@ -17,7 +17,7 @@ from tests.browser.world import FLAWS, shot
 from trial.recordings.recording import read
 from trial.settings import STALLED_SECONDS
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 CHANGES = {
     "afterAbsent: policy\n": "afterAbsent: end\n",
     # On a busy machine the second participant may come late, and a page needs seconds to load again.

@@ -16,7 +16,7 @@ from tests.browser.conftest import GamesToEnd, Hold, note_texts, replace_lines, 
 from tests.browser.world import PATIENCE, SHOTS
 from trial.recordings.recording import read
 
-pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.xdist_group("browser"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SHORT = {

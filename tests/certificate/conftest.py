@@ -26,12 +26,6 @@ PLACE = certificate.location(DOMAIN, ROOT_DOMAIN)
 FULLCHAIN, PRIVKEY, STATE = PLACE
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if "pebble" in getattr(item, "fixturenames", ()) or "second_pebble" in getattr(item, "fixturenames", ()):
-            item.add_marker(pytest.mark.xdist_group("pebble"))
-
-
 @pytest.fixture(scope="session", autouse=True)
 def no_proxy() -> None:
     """Loopback is reached without a proxy, whatever the environment says."""

@@ -42,7 +42,7 @@ from hippodrome.model.warm_pool import Pool
 from hippodrome.storage.repository import Repository
 from protocol.answer import Answer
 from protocol.keys import answer_key
-from testing import preloaded
+from testing import processes
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
 from testing.servers import Servers
@@ -288,7 +288,7 @@ def environment(endpoint: str = "") -> dict[str, str]:
 def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> CommandResult:
     """Run a command as a process of its own."""
     with tempfile.TemporaryFile("w+") as errors:
-        ran = preloaded.start("deploy", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
+        ran = processes.start("deploy", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
         try:
             out, _ = ran.communicate(timeout=timeout)
         finally:

@@ -50,12 +50,12 @@ from lambdas import (
     task_changed,
     update_project_master_list,
 )
-from testing import aws_events, preloaded
+from testing import aws_events, processes
 from testing.certificates import authority
 from tests.deploy.installation import KEYS, ROOT, Installed
 from tests.deploy.registering import _stream
 
-Process = preloaded.Forked | subprocess.Popen[str]
+Process = subprocess.Popen[str]
 FUNCTIONS = {"start": start_server, "stop": stop_server, "task": task_changed}
 NEAR = timedelta(minutes=2)
 UNTIL_KILLED = 100.0  # seconds
@@ -221,7 +221,7 @@ class RunningInstallation(Installed):
         spool = Path(self._temporary) / aws_events.last(task.task_arn)
         spool.mkdir()
         with (spool / "log").open("w") as log:
-            return preloaded.start(
+            return processes.start(
                 "trial",
                 cwd=ROOT,
                 env={**env, "SPOOL": str(spool), "LINGER_SECONDS": "0.2"},

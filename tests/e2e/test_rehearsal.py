@@ -26,16 +26,16 @@ from bots.game import RandomKeys
 from bots.links import with_project, with_user
 from local.new import LEFT_OUT
 from local.rehearsal.study_process import ROOT, copy_of, servers_of
-from testing import preloaded
+from testing import processes
 from testing.waiting import until
 from trial.recordings.recording import read
 
 TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the system call that names a thread
-Process = preloaded.Forked | subprocess.Popen[str]
+Process = subprocess.Popen[str]
 
 
-def rehearsal(*arguments: str | Path, module: str = "testing.held_rehearsal", **env: str) -> Process:
-    return preloaded.start(
+def rehearsal(*arguments: str | Path, module: str = "local.rehearsal", **env: str) -> Process:
+    return processes.start(
         module,
         [*map(str, arguments)],
         cwd=ROOT,
@@ -43,7 +43,6 @@ def rehearsal(*arguments: str | Path, module: str = "testing.held_rehearsal", **
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
-        starts=True,
     )
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from local.rehearsal.study_process import ROOT
-from testing import preloaded
+from testing import processes
 
 EXAMPLES = sorted(path.parent.name for path in (ROOT / "examples").glob("*/config.yml"))
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_make_check_finds_neither_mistakes_nor_remarks(example: str, tmp_path: Path) -> None:
-    process = preloaded.start(
+    process = processes.start(
         "local.check",
         [str(ROOT / "examples" / example)],
         cwd=tmp_path,

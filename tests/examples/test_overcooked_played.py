@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
-pytestmark = pytest.mark.xdist_group("examples")
-
 
 def test_a_person_and_the_policy_cook_together(play_example: Any, load_module: Any) -> None:
     played = play_example(

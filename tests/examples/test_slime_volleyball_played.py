@@ -6,12 +6,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "slime-volleyball"
 LEFT, RIGHT = "agent_left", "agent_right"
-
-pytestmark = pytest.mark.xdist_group("examples")
 
 
 def test_a_person_plays_against_the_policy(play_example: Any, load_module: Any) -> None:

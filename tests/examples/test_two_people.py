@@ -20,8 +20,6 @@ from local.rehearsal.study_process import ROOT
 from testing.held_study import HeldStudy
 from trial.recordings.recording import read
 
-pytestmark = pytest.mark.xdist_group("examples")
-
 SHORT = {"maxEpisodes": 1, "resetFreeze": 0, "countdown": 1, "absent": 10}
 PATIENCE = 150.0  # seconds within which both bots must finish the study
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from local.backend.processes import end_everything, marked
-from testing import preloaded
+from testing import processes
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -110,17 +110,17 @@ class Local:
         self.output = place / "output.txt"
         self.url = ""
         self.through_pipe = False  # so that what it says arrives even if it may write no file
-        self.process: preloaded.Forked | subprocess.Popen[str] | None = None
+        self.process: subprocess.Popen[str] | None = None
 
     def let_go_on(self) -> None:
         """Let a game that waits go on."""
         (self.folder.parent / "hold").unlink()
 
-    def begin(self, *options: str) -> preloaded.Forked | subprocess.Popen[str]:
+    def begin(self, *options: str) -> subprocess.Popen[str]:
         with self.output.open("wb") as file:
             cat = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file) if self.through_pipe else None
             output = cat.stdin if cat else file
-            self.process = preloaded.start(
+            self.process = processes.start(
                 "local",
                 [str(self.folder), "--port", "0", *options],
                 cwd=self.place,

@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from testing import preloaded
 from testing.ministack.world import REGION, ROOT, MinistackWorld
 from tests.certificate import pebble
 from tests.certificate.nameserver import answering
@@ -31,22 +30,16 @@ class Newcomer:
     folder: Path
     env: dict[str, str]
     internet: dict[tuple[str, str], Sequence[str]]
-    forker: int
 
-    def types(self, line: str, answer: str = "", seconds: float = 280, *, anew: bool = False) -> tuple[int, str]:
-        """Return the exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks.
-
-        The commands for AWS start with their imports already done (`testing/ministack/typed.py`); with `anew`, or at a
-        terminal, as users start them.
-        """
+    def types(self, line: str, answer: str = "", seconds: float = 280) -> tuple[int, str]:
+        """Return the exit code, and all that was printed. `answer` is typed, at a terminal, when the command asks."""
         keyboard, terminal = pty.openpty()
         try:
             os.write(keyboard, f"{answer}\n".encode())
             ended = subprocess.run(
                 ["bash", "-c", line],
                 cwd=self.folder,
-                env=self.env if anew or answer else {**self.env, "FORKER": str(self.forker)},
-                pass_fds=[self.forker],
+                env=self.env,
                 stdin=terminal if answer else subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -102,13 +95,7 @@ def arrived(world: MinistackWorld, home: Path) -> Iterator[Newcomer]:
             "PYTHONUTF8": "1",
             "COLUMNS": "160",
         }
-        bridged = preloaded.new_forker(
-            ("testing.ministack.bridged", *preloaded.OTHERS["deploy"][0]),
-            world.source,
-            {**env, "PYTHONPATH": str(ROOT)},
-        )
-        stack.enter_context(bridged)
-        yield Newcomer(world, world.source, env, internet, bridged.fileno())
+        yield Newcomer(world, world.source, env, internet)
 
 
 def _clone(folder: Path) -> None:
@@ -118,11 +105,7 @@ def _clone(folder: Path) -> None:
     bin = folder / ".venv" / "bin"
     bin.mkdir(parents=True)
     programs = ROOT / "testing" / "ministack"
-    (bin / "python").write_text(
-        "#!/bin/sh\n"
-        f'[ -n "$FORKER" ] && [ "$1 $2" = "-m deploy" ] && exec "{sys.executable}" -IS "{programs / "typed.py"}" "$@"\n'
-        f'exec "{sys.executable}" "{programs / "bridge.py"}" "$@"\n'
-    )
+    (bin / "python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "{programs / "bridge.py"}" "$@"\n')
     (bin / "python").chmod(0o755)
     for ready in ("local", "deploy"):
         (folder / ".venv" / ready).touch()

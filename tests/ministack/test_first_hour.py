@@ -19,7 +19,7 @@ from tests.certificate import pebble
 from tests.ministack.conftest import emulated
 from tests.ministack.newcomer import DOMAIN, Newcomer, arrived
 
-pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 DEPLOY = f"make deploy DOMAIN={DOMAIN} EMAIL=you@example.org"
 BEFORE = ("make doctor", f"make plan DOMAIN={DOMAIN} EMAIL=you@example.org", "make cost")
@@ -102,7 +102,7 @@ def test_problems_are_reported_in_the_words_of_the_page(
 
 def types(newcomer: Newcomer, command: str, exit_code: int = 0, answer: str = "") -> None:
     """Run a command of the page, and check that it prints what the page shows."""
-    code, printed = newcomer.types(command, answer=answer, anew=command == "make doctor")
+    code, printed = newcomer.types(command, answer=answer)
     assert code == exit_code, printed
     assert first_hour.differs(first_hour.shown()[command], printed) == "", printed
 

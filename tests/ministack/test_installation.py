@@ -37,7 +37,7 @@ from testing.ministack.world import (
 )
 from tests.ministack.study import AFTER, GAME, PROJECT, SECRET_WORD, Member, Person, Trial, trial_done, write_project
 
-pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.timeout(300)]
 
 OUTPUTS = [
     "Alarms",
@@ -90,7 +90,7 @@ def applied(world: MinistackWorld) -> Applied:
     # Gap: the emulator has no name servers, so wherever the tests can ask DNS the domain is not delegated.
     return Applied(
         before,
-        world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes", "--anyway", anew=True),
+        world.deploy("apply", "--domain", DOMAIN, "--email", "admin@example.org", "--yes", "--anyway"),
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from testing.ministack.world import ROOT, MinistackWorld, until
 
-pytestmark = [pytest.mark.xdist_group("ministack"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.timeout(120)]
 
 HOLD = """
 import sys, time

@@ -16,7 +16,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
-from testing import preloaded
+from testing import processes
 from testing.async_tests import pytest_pyfunc_call  # noqa: F401 - a hook
 from tests.trial.client_messages import TakesMessages
 from trial.pictures.frames import Decoder, Frame
@@ -112,7 +112,7 @@ class Running:
         }
         inherited = {k: v for k, v in os.environ.items() if k not in settings and k not in ("SPOOL", "DEADLINE")}
         with self.log.open("ab") as log:
-            self.process = preloaded.start(
+            self.process = processes.start(
                 "trial", cwd=folder, env={**inherited, **settings, **env}, stdout=subprocess.PIPE, stderr=log
             )
         assert self.process.stdout is not None

@@ -9,7 +9,7 @@ from pathlib import Path
 from hippodrome.config import read_project
 from local.check import agent as agent_check
 from local.check.project import check_project
-from testing import preloaded
+from testing import processes
 from tests.local.conftest import ROOT
 
 
@@ -46,7 +46,7 @@ def run(folder: Path) -> tuple[int, list[str]]:
     """Return the exit status and the lines of the command."""
     said = folder.parent / "said.log"
     with said.open("w") as errors:
-        done = preloaded.start(
+        done = processes.start(
             "local.check",
             [str(folder)],
             cwd=folder.parent,

@@ -6,15 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from testing import preloaded
 from tests.local.conftest import write_study
-from trial.server import process_group
-
-
-@pytest.fixture
-def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried in this process is tried in a forked one, whose imports are done; `make check` starts it as its users do."""
-    monkeypatch.setattr(process_group, "Popen", preloaded.popen)
 
 
 @pytest.fixture

@@ -16,9 +16,6 @@ from local.watch import Watch
 from tests.local.check.checking import agent, config, looked, page, run, tried
 from tests.local.conftest import ROOT, Local
 
-pytestmark = pytest.mark.usefixtures("forked")
-
-
 # --- the command -------------------------------------------------------------------------------------
 
 

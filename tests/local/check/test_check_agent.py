@@ -23,13 +23,10 @@ from local.check import waiting
 from local.check.agent_report import AgentReport, slowness
 from local.check.pace import Pace
 from testing.exploration import sample
-from testing.preloaded import interruptible
+from testing.processes import interruptible
 from testing.waiting import until
 from tests.local.check.checking import agent, config, looked, page, run, tried
 from tests.local.conftest import ROOT
-
-pytestmark = pytest.mark.usefixtures("forked")
-
 
 # --- agent.py ----------------------------------------------------------------------------------------
 

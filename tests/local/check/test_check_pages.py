@@ -11,9 +11,6 @@ from hippodrome.config import read_project
 from local.check.pages import check_pages
 from tests.local.check.checking import config, looked, page
 
-pytestmark = pytest.mark.usefixtures("forked")
-
-
 # --- Jinja -------------------------------------------------------------------------------------------
 
 

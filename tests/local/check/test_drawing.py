@@ -21,7 +21,7 @@ SECTION = re.findall(r"```yaml\n(.*?)```", DOCS, re.DOTALL)[0]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, forked: None) -> Path:
+def folder(tmp_path: Path) -> Path:
     made = write_study(tmp_path / "study", start=2)
     (made / "agent.py").write_text(EXAMPLE)
     config = made / "config.yml"

@@ -12,8 +12,6 @@ from local.check import agent as agent_check
 from testing import onnx_files
 from tests.local.conftest import write_study
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 AGENT = """
 import numpy
 

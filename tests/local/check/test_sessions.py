@@ -16,8 +16,6 @@ from tests.local.check.test_players import AGENT
 from tests.local.conftest import write_study
 from trial.agent.match import SECONDS
 
-pytestmark = pytest.mark.usefixtures("forked")
-
 TRIAL = """
 trial:
   game: none

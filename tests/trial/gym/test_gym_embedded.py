@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from testing.gym_server import ROOT, GymServerProcess, TextClient, gym_server
-from testing.preloaded import interruptible
+from testing.processes import interruptible
 from trial.gym import override
 from trial.gym.__main__ import main
 from trial.gym.limits import Limits

@@ -10,8 +10,6 @@ import pytest
 from tests.trial.gym.served import serving
 from trial.gym import RemoteEnv, RemoteError, ids
 
-pytestmark = pytest.mark.xdist_group("gym-server")
-
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:

@@ -31,8 +31,6 @@ from trial.gym import client as client_module
 from trial.gym.limits import Limits
 from trial.gym.spaces import CodecError
 
-pytestmark = pytest.mark.xdist_group("gym-server")
-
 ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "Blackjack-v1", "Taxi-v4", "Acrobot-v1", "Everything-v0"]
 
 

@@ -14,8 +14,6 @@ from tests.trial.gym.odd_results import PICTURES, RESULTS
 from tests.trial.gym.served import serving
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError
 
-pytestmark = pytest.mark.xdist_group("gym-server")
-
 REFUSED = {
     "exception without text": "WithoutText",
     "exception with odd text": "TextOfAnotherType",

@@ -16,8 +16,6 @@ from tests.trial.gym.served import serving
 from tests.trial.test_trial_tls import put
 from trial.gym import ConnectionLost, RemoteEnv
 
-pytestmark = pytest.mark.xdist_group("gym-server")
-
 
 @contextlib.contextmanager
 def encrypted(url: str, folder: Path) -> Iterator[str]:

@@ -19,8 +19,6 @@ import pytest
 from testing.waiting import PATIENCE
 from tests.trial.gym.served import serving
 
-pytestmark = pytest.mark.xdist_group("gym-server")
-
 CONT, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
 MAKE = b'{"method": "make", "params": {"env_id": "CartPole-v1"}}'
 UNKNOWN = b'{"method": "step", "params": {"instance_id": "none", "action": 0}}'

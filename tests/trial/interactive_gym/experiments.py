@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import subprocess
-import tempfile
+import sys
 from pathlib import Path
 
-from testing import preloaded
+from testing import processes
 
 ALONE = """
 import gymnasium
@@ -134,21 +134,18 @@ PEOPLE = TOGETHER.replace('"brains/two.txt"', "configuration_constants.PolicyTyp
 
 def environment() -> dict[str, str]:
     """Return the variables of a process that finds `trial`."""
-    return {**os.environ, "PYTHONPATH": str(preloaded.ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**os.environ, "PYTHONPATH": str(processes.ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def run_experiment(folder: Path) -> subprocess.CompletedProcess[str]:
-    """`python experiment.py` in this folder, to its end; gymnasium is loaded already (`testing/preloaded.py`)."""
-    with tempfile.TemporaryFile("w+") as errors:
-        process = preloaded.start(
-            preloaded.EXPERIMENT, cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=errors
-        )
-        try:
-            said, _ = process.communicate(timeout=60)
-        finally:
-            process.kill()
-            assert process.stdout is not None
-            process.stdout.close()
-        errors.seek(0)
-        assert process.returncode is not None
-        return subprocess.CompletedProcess([preloaded.EXPERIMENT], process.returncode, said, errors.read())
+    """Run `python experiment.py` in this folder, to its end."""
+    return subprocess.run(
+        [sys.executable, "experiment.py"],
+        cwd=folder,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
