@@ -55,8 +55,8 @@ def gym_server(
         text=True,
         preexec_fn=processes.interruptible,  # noqa: PLW1509 - it sets a signal and no more
     )
+    assert process.stdout is not None
     try:
-        assert process.stdout is not None
         line = process.stdout.readline()
         yield GymServerProcess(int(line.split("/gym")[0].rpartition(":")[2]), process.pid)
     finally:
