@@ -37,6 +37,7 @@ How much and how fast
     `exploration`     how many examples and cases `make test` and `make hunt` take
     `processes`       starts `python -m …`
     `held_study`      a study that a test runs in a process of its own
+    `botocore_sessions` sessions of botocore that read the description of a service once per process
     `template`        the resources of `infra/template.yml`
     `imports`         the modules that a Python file imports
 """

@@ -35,7 +35,6 @@ from typing import Any, Self
 from unittest import mock
 
 import botocore.handlers
-import botocore.session
 import moto
 import pytest
 from botocore.awsrequest import AWSResponse
@@ -57,6 +56,7 @@ from moto.sqs.models import sqs_backends
 from hippodrome.aws import AwsPlatform
 from testing import aws_events
 from testing.aws_events import ACCOUNT, IMAGE
+from testing.botocore_sessions import botocore_session
 from testing.iam.enforcement import ApiCall, IamEnforcement
 
 
@@ -103,7 +103,7 @@ class MotoWorld:
         self._bridge()
         self._record()
         self._build()
-        self.platform = AwsPlatform(self.env)
+        self.platform = AwsPlatform(self.env, botocore_session())
         if self._enforce:
             self.enforce(IamEnforcement.of(self))
         return self
@@ -546,7 +546,7 @@ class MotoWorld:
 
 
 _making = threading.Lock()  # making a client is not thread-safe, using one is
-_own_session = botocore.session.get_session()  # made before the handlers of any world: its calls are not recorded
+_own_session = botocore_session()  # made before the handlers of any world: its calls are not recorded
 
 
 @functools.cache

@@ -22,6 +22,7 @@ from hippodrome.aws import AwsPlatform
 from lambdas import installed
 from testing import template as cfn
 from testing.aws_events import ACCOUNT
+from testing.botocore_sessions import botocore_session
 from testing.iam.actions import asks
 from testing.iam.judge import Judge, evaluator
 
@@ -260,7 +261,7 @@ class IamEnforcement:
     def _room(self, name: str) -> tuple[Any, dict[Any, Any]]:
         """Return the function's own platform, and the cache that it keeps between invocations."""
         if name not in self._rooms:
-            self._rooms[name] = (AwsPlatform(self.environment(name)), {})
+            self._rooms[name] = (AwsPlatform(self.environment(name), botocore_session()), {})
         return self._rooms[name]
 
     def environment(self, name: str) -> dict[str, str]:

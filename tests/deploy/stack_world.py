@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Iterator
 from typing import Any
 
-import botocore.session
 import pytest
 from moto import mock_aws
 from moto.iam.access_control import PermissionResult
@@ -21,6 +20,7 @@ from deploy.code.template import Template
 from deploy.lifecycle import preflight
 from deploy.stack import changes, stack
 from deploy.study.image import docker
+from testing.botocore_sessions import botocore_session
 from tests.deploy.fake_cloudformation import FakeCloudFormation, refusal
 
 REGION = "ca-central-1"
@@ -103,7 +103,7 @@ class Limits:
 
 class WorldAccount(Account):
     def __init__(self, fake: FakeCloudFormation, limits: Limits) -> None:
-        super().__init__(botocore.session.get_session(), REGION)
+        super().__init__(botocore_session(), REGION)
         self.fake, self.limits = fake, limits
 
     def client(self, service: str, region: str | None = None) -> Any:

@@ -18,7 +18,6 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Self
 from unittest import mock
 
-import botocore.session
 import msgspec
 import pytest
 from moto.core.responses import ActionResult
@@ -36,6 +35,7 @@ from hippodrome.model.server import Reason, Server
 from hippodrome.ports import Address
 from lambdas import installed, sweep
 from testing.aws_events import ACCOUNT
+from testing.botocore_sessions import botocore_session
 from testing.exploration import TIMES, sample
 from testing.moto_world import MotoWorld, _InvalidBatch
 from testing.quiet_log import quiet
@@ -61,7 +61,7 @@ class Place(MotoWorld):
 
     def __enter__(self) -> Self:
         super().__enter__()
-        session = botocore.session.get_session()
+        session = botocore_session()
         session.register("before-call", self._begin_call)
         session.register("after-call", self._end_call)
         session.register("after-call-error", lambda **_: self._one.release())
