@@ -140,9 +140,8 @@ class TrialSection:
         "Seconds for which the game waits for a callback of the agent; then it goes on without waiting.",
     )
     gym: str = keyed.choice(
-        ("none", "watch", "advise", "environments"),
-        "What programs with the server's token may do at its path /gym: nothing, watch each step, also advise, or "
-        "make environments of their own.",
+        ("none", "watch", "advise"),
+        "What programs with the server's token may do at its path /gym: nothing, watch each step, or also advise.",
     )
     scene: SceneSection | None = keyed.key(
         values.section("width: 600"),

@@ -51,7 +51,6 @@ ROOMS = {
         "policies",
         "wire",
         "gym",
-        "programs",
         "server",
         "check",
         "interactive_gym",

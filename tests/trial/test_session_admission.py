@@ -4,11 +4,9 @@ import asyncio
 import contextlib
 import json
 
-import pytest
 from hypothesis import given as for_all
 from hypothesis import strategies as st
 from websockets.asyncio.client import connect
-from websockets.exceptions import InvalidStatus
 
 from protocol.session import member_token
 from tests.trial.sessions import (
@@ -170,13 +168,6 @@ async def test_a_program_needs_the_servers_token_and_a_formed_session(launch):
     form(server.store)
     async with member(server, "anna"):
         await watch(None)
-
-
-async def test_a_members_token_makes_no_environments(launch):
-    server = launch_session(launch, trial={"gym": "environments"})
-    with pytest.raises(InvalidStatus) as refusal:
-        await connect(f"{server.address}gym?token={member_token(TOKEN, 'anna')}", proxy=None)
-    assert refusal.value.response.status_code == 401
 
 
 async def test_a_page_without_a_token_never_gets_into_a_session(launch, open_client):

@@ -12,8 +12,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.trial.two_players import TRIAL, two_players
-from trial.programs.watch import MAX_PROGRAMS, Watchers
 from trial.recordings import resume
+from trial.server.watch import MAX_PROGRAMS, Watchers
 
 PROOF = "?token=the-secret-token"
 ANSWER_SECONDS = 60

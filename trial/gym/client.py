@@ -71,8 +71,7 @@ class GymClient:
         if self._connection.subprotocol != SUBPROTOCOL:
             self._end(f"it does not speak {SUBPROTOCOL}")
             raise ConnectionLost(
-                f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do, and those "
-                f"of a study with `gym: environments`. {_UNFIT}"
+                f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do. {_UNFIT}"
             )
 
     @property

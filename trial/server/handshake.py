@@ -17,8 +17,7 @@ from protocol.keys import NAME
 from protocol.session import member_token
 from trial.core import messages
 from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
-from trial.gym import forms
-from trial.programs import environments, watch
+from trial.server import watch
 from trial.settings import TrialSettings
 from trial.wire import notice, plain
 from trial.wire.connection import SUBPROTOCOLS
@@ -39,23 +38,14 @@ REFUSED_MESSAGES_A_SECOND = 20
 """The most messages in a second of a client that is refused and whose connection stays open."""
 
 
-def process_request(
-    websocket: ServerConnection, request: Request, *, gym: str = "none", token: str = ""
-) -> Response | None:
+def process_request(websocket: ServerConnection, request: Request, *, gym: str = "none") -> Response | None:
     """Return the answer to an HTTP request that opens no WebSocket; None: go on with the WebSocket's handshake.
 
-    `gym` is the key of the section `trial`: if it is `none`, there is no path /gym, which programs open. A program
-    that asks for environments must show the token here, since its protocol has no message for a later refusal.
+    `gym` is the key of the section `trial`: if it is `none`, there is no path /gym, which programs open.
     """
     path = urlsplit(request.path).path
     if path == "/healthz":
         return websocket.respond(http.HTTPStatus.OK, "ok\n")
-    if path == watch.PATH and gym == "environments":
-        try:
-            check_matches(token_in_address(websocket), token)
-        except CloseConnection as refused:
-            return websocket.respond(http.HTTPStatus.UNAUTHORIZED, f"{refused.words}\n")
-        return environments.prepare(websocket, request)
     if path == watch.PATH and gym != "none":
         return None
     if path != "/":
@@ -67,12 +57,8 @@ def process_request(
     return None
 
 
-def select_subprotocol(
-    websocket: ServerConnection, offered: Sequence[Subprotocol], *, gym: str = "none"
-) -> Subprotocol | None:
-    """Return the subprotocol to use. None if the client offers none of ours, as HIPPO's and Gymie's clients do."""
-    if gym == "environments" and is_program(websocket):
-        return forms.SUBPROTOCOL if forms.SUBPROTOCOL in offered else None
+def select_subprotocol(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+    """Return the subprotocol to use. None if the client offers none of ours, as HIPPO's clients do."""
     return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
 
 

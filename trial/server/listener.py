@@ -11,7 +11,6 @@ from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
-from trial.gym.forms import SUBPROTOCOL
 from trial.recordings.store import Store
 from trial.server.certificate import RELOAD_SECONDS, Certificate
 from trial.server.handshake import process_request, select_subprotocol
@@ -58,9 +57,9 @@ class Listener:
             open_timeout=settings.hello_seconds,
             ssl=certificate.context if certificate is not None else None,
             ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
-            subprotocols=[Subprotocol(name) for name in (*SUBPROTOCOLS, SUBPROTOCOL)],
-            select_subprotocol=partial(select_subprotocol, gym=settings.trial.gym),
-            process_request=partial(process_request, gym=settings.trial.gym, token=settings.token),
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+            select_subprotocol=select_subprotocol,
+            process_request=partial(process_request, gym=settings.trial.gym),
             server_header=None,
             compression=None,
             max_size=MAX_MESSAGE,

@@ -46,13 +46,13 @@ from trial.core.policies import AskPolicy
 from trial.core.trial import Trial
 from trial.policies.places import Places
 from trial.policies.policy import PolicyError
-from trial.programs.watch import Watchers
 from trial.recordings.recorder import Recorder
 from trial.recordings.recording import Line
 from trial.recordings.spool import Spool
 from trial.recordings.store import Store, short_error
 from trial.server.callbacks import TrialCallbacks
 from trial.server.started import StartedAgent, TrialPlayers
+from trial.server.watch import Watchers
 from trial.settings import TrialSettings
 from trial.wire.connection import Connection
 

@@ -29,10 +29,9 @@ from trial.core.effects import AgentTimeout
 from trial.core.messages import BadMessage, CloseConnection, CommandRefused, NotAMessage
 from trial.core.players import PlayersError
 from trial.policies.policy import PolicyError
-from trial.programs import watch
-from trial.programs.environments import MAX_PROGRAMS, Environments
 from trial.recordings.spool import Spool, store_file
 from trial.recordings.store import Store, open_store
+from trial.server import watch
 from trial.server.admission import NOT_ASSIGNED, Admission, first_of
 from trial.server.assignment import AssignmentDocument, Search, set_environment
 from trial.server.drawing import Drawing
@@ -85,7 +84,6 @@ class TrialServer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._watchers = watch.Watchers()
         self._watching = 0  # the number of programs that watch
-        self._environments = Environments(settings.agent_dir)
 
     async def run(self) -> int:
         """Serve until the last trial is over, no participant comes, the deadline passes, or `end` is called."""
@@ -140,7 +138,6 @@ class TrialServer:
         self._worker.close()
         for connection in self._connections:
             connection.abort()
-        await self._environments.close()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._listener.wait_closed(), CLOSE_SECONDS)
 
@@ -227,10 +224,7 @@ class TrialServer:
 
     async def _serve(self, websocket: ServerConnection) -> None:
         if is_program(websocket):
-            if self.settings.trial.gym == "environments":
-                await self._serve_environments(websocket)
-            else:
-                await self._serve_watching(websocket)
+            await self._serve_watching(websocket)
             return
         hello = await self._admission.admit(websocket)
         self._listener.authenticated(websocket)
@@ -280,19 +274,6 @@ class TrialServer:
             await watch.Watching(websocket, self._watchers, self._action_space, advise).run()
         finally:
             self._watching -= 1
-
-    async def _serve_environments(self, websocket: ServerConnection) -> None:
-        """Serve environments to a program. The handshake has checked its token.
-
-        An error is the reason of a close, since Gymie's clients take every message for an answer.
-        """
-        self._listener.authenticated(websocket)
-        if not self.settings.assigned:
-            await websocket.close(1013, NOT_ASSIGNED)
-        elif self._environments.connections >= MAX_PROGRAMS:
-            await websocket.close(1013, f"{MAX_PROGRAMS} programs are connected already; try later.")
-        else:
-            await self._environments.serve(websocket)
 
     def _action_space(self, player: str | None) -> tuple[str, ...]:
         return self._current().core.progress.choices.action_space_of(player)

@@ -45,7 +45,7 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     ),
     "actionSpace": NAMES,
     "dataFile": st.sampled_from(["episode", "trial", "both"]),
-    "gym": st.sampled_from(["none", "watch", "advise", "environments", "play"]),
+    "gym": st.sampled_from(["none", "watch", "advise", "play"]),
     **dict.fromkeys(("frameSkip", "policySeconds", "seed", "turnSeconds"), NUMBERS),
     "pace": st.sampled_from(["realtime", "turns", "fast"]),
     **dict.fromkeys(("absent", "gather", "countdown", "maxPing", "pingSamples"), NUMBERS),

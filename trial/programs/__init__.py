@@ -1,1 +1,0 @@
-"""The path /gym of a trial server, for programs that watch, advise, or use environments."""
