@@ -1,27 +1,24 @@
 """OpenAI Gym's old interface over Gymnasium, for agents that say `import gym`.
 
 The trial puts this package at the end of Python's path, so a real `gym` that is installed comes first. Environments of
-`make` are as in Gym before 0.26: `reset()` returns the observation alone, `step()` four values,
-`render(mode="rgb_array")` a picture, and `seed()` seeds. If `make` gets a `render_mode`, which it takes since Gym 0.26,
-`reset` and `step` return what they return there: two and five values.
-
-docs/hippo.md says which parts of Gym are here.
+`make` are as in Gym 0.21: `reset()` returns the observation alone, `step()` four values, `render(mode="rgb_array")` a
+picture, and `seed()` seeds. If `make` gets a `render_mode`, which came with five values, it returns Gymnasium's
+environment. The spaces and errors are Gymnasium's.
 """
 
 import sys
 
 import gymnasium
-from gymnasium import error, spaces, vector
+from gymnasium import error, spaces
 from gymnasium.spaces import Space
 
-from gym import core, envs, logger, utils, version, wrappers
-from gym.core import ActionWrapper, Env, GoalEnv, ObservationWrapper, RewardWrapper, Wrapper
-from gym.envs.registration import make, register, registry, spec
+from gym import core, envs, utils, version, wrappers
+from gym.core import ActionWrapper, Env, ObservationWrapper, RewardWrapper, Wrapper
+from gym.envs.registration import make, register
 
 __all__ = [
     "ActionWrapper",
     "Env",
-    "GoalEnv",
     "ObservationWrapper",
     "RewardWrapper",
     "Space",
@@ -30,28 +27,16 @@ __all__ = [
     "core",
     "envs",
     "error",
-    "logger",
     "make",
     "register",
-    "registry",
     "spaces",
-    "spec",
     "utils",
-    "vector",
     "version",
     "wrappers",
 ]
 
 __version__ = version.VERSION
 
-
-def _alias() -> None:
-    """Let `import gym.spaces.box` find Gymnasium's module of that name, where this package has none."""
-    for name, module in list(sys.modules.items()):
-        if name.startswith(("gymnasium.spaces", "gymnasium.error", "gymnasium.vector", "gymnasium.utils.")):
-            sys.modules.setdefault(f"{__name__}{name.removeprefix(gymnasium.__name__)}", module)
-    for ours, theirs in ((envs, gymnasium.envs), (utils, gymnasium.utils)):
-        ours.__path__.extend(theirs.__path__)
-
-
-_alias()
+for _name, _module in list(sys.modules.items()):  # so that `from gym.spaces.box import Box` finds Gymnasium's
+    if _name.startswith(("gymnasium.spaces", "gymnasium.error")):
+        sys.modules.setdefault(_name.replace(gymnasium.__name__, __name__, 1), _module)

@@ -1,6 +1,5 @@
-"""Environments by their ids. The classes of Gymnasium's own environments can be imported from here, too."""
+"""Environments by their ids."""
 
-from gym.envs import registration
-from gym.envs.registration import make, register, registry, spec
+from gym.envs.registration import make, register
 
-__all__ = ["make", "register", "registration", "registry", "spec"]
+__all__ = ["make", "register"]

@@ -1,7 +1,7 @@
-"""Gym's utilities: Gymnasium's, and `seeding` of this package."""
+"""Gym's utilities: `seeding` of this package, and Gymnasium's `EzPickle`."""
 
-from gymnasium.utils import EzPickle, colorize
+from gymnasium.utils import EzPickle
 
 from gym.utils import seeding
 
-__all__ = ["EzPickle", "colorize", "seeding"]
+__all__ = ["EzPickle", "seeding"]
