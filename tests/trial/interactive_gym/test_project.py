@@ -515,7 +515,8 @@ def test_a_file_for_other_observations_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
     assert refusal_of(tmp_path, WITH_A_FILE) == (
         "the policy of 1 does not fit: partner.onnx takes observations of 7 numbers (its input 'obs'); "
-        "the environment gives 2 numbers"
+        "the environment gives 2 numbers; "
+        "export it for one such observation, or write a class with act() in agent.py that runs the file"
     )
 
 

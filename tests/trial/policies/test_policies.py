@@ -288,7 +288,7 @@ def test_a_file_may_choose_the_action_itself(tmp_path: Path) -> None:
     ],
 )
 def test_a_recurrent_file_remembers_until_the_next_episode(tmp_path: Path, state: Any, seq_lens: Any) -> None:
-    """`state_in_0` and `state_ins` are RLlib's; an older one calls a second state `seq_lens`, and its output a number."""
+    """Shapes and their order tell which output is for which state: names differ among RLlib, PyTorch and others."""
     onnx_files.counter(tmp_path / "p.onnx", state=state, seq_lens=seq_lens)
     policy = load_policy("p.onnx", tmp_path)
     policy.reset(1)
@@ -339,24 +339,12 @@ def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path, content: bytes) -> No
 def test_a_file_for_observations_of_another_size_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
     assert refusal("p.onnx", tmp_path, space=Box(-1, 1, (16,))) == (
-        "p.onnx takes observations of 2 numbers (its input 'obs'); the environment gives 16 numbers"
+        "p.onnx takes observations of 2 numbers (its input 'obs'); the environment gives 16 numbers; "
+        "export it for one such observation, or write a class with act() in agent.py that runs the file"
     )
-    assert refusal("p.onnx", tmp_path, space=Box(0, 255, (84, 84, 3), np.uint8)).endswith("gives 84 x 84 x 3")
-
-
-@pytest.mark.timeout(60)
-@pytest.mark.parametrize(
-    ("space", "given"),
-    [
-        (Discrete(10**12), "one number"),
-        (Dict(a=Discrete(10**12), b=Discrete(2)), "2 numbers"),
-        (MultiDiscrete([10**12, 2, 2]), "3 numbers"),
-    ],
-)
-def test_a_one_hot_observation_that_is_far_too_large_is_not_made(tmp_path: Path, space: Any, given: str) -> None:
-    onnx_files.linear(tmp_path / "p.onnx", np.ones((12, 3)))
-    said = refusal("p.onnx", tmp_path, space=space)
-    assert said == f"p.onnx takes observations of 12 numbers (its input 'obs'); the environment gives {given}"
+    assert "gives 84 x 84 x 3;" in refusal("p.onnx", tmp_path, space=Box(0, 255, (84, 84, 3), np.uint8))
+    onnx_files.linear(tmp_path / "batch.onnx", WEIGHTS, shape=(32, 2))
+    assert "of 32 x 2 (its input 'obs'); the environment gives 2 numbers; export" in refusal("batch.onnx", tmp_path)
 
 
 @pytest.mark.timeout(60)
@@ -369,22 +357,6 @@ def test_several_discrete_numbers_are_one_hot_one_after_the_other(tmp_path: Path
     assert policy.act(np.array([0, 1]), {}, None) == 1
 
 
-def test_an_observation_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "p.onnx", np.ones((12, 3)))
-    endless = types.SimpleNamespace(shape=(10**15,), dtype=np.float32)
-    assert refusal("p.onnx", tmp_path, space=endless) == (
-        "p.onnx cannot be tried: an observation of the environment needs more memory"
-    )
-
-
-def test_an_observation_that_contains_itself_gets_a_sentence(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
-    loop: dict[str, Any] = {}
-    loop["in"] = loop
-    with pytest.raises(PolicyError, match=r"^p\.onnx takes no observation that contains itself$"):
-        load_policy("p.onnx", tmp_path).act(loop, {}, None)
-
-
 def test_an_observation_without_numbers_gets_a_sentence(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", np.ones((2, 3)))
     around: list[Any] = []
@@ -392,15 +364,6 @@ def test_an_observation_without_numbers_gets_a_sentence(tmp_path: Path) -> None:
     for seen in ({"in": around}, {"in": "left"}, {"in": object()}):
         with pytest.raises(PolicyError, match=r"^p\.onnx takes an observation of numbers, and this is none: "):
             load_policy("p.onnx", tmp_path).act(seen, {}, None)
-
-
-def test_a_file_of_a_fixed_batch_says_how_to_export_it(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "p.onnx", WEIGHTS, shape=(32, 2))
-    assert refusal("p.onnx", tmp_path, space=Box(-1, 1, (2,))) == (
-        "p.onnx takes observations of 32 x 2 (its input 'obs'); the environment gives 2 numbers; "
-        "32 is its batch: export it with a batch of 1, or of any size (dynamic axes)"
-    )
-    assert "batch" not in refusal("p.onnx", tmp_path, space=Box(-1, 1, (16,)))
 
 
 def test_a_file_for_another_number_of_actions_is_refused(tmp_path: Path) -> None:
@@ -418,19 +381,19 @@ def test_values_of_nan_are_refused(tmp_path: Path) -> None:
     assert refusal("p.onnx", tmp_path) == "p.onnx returned NaN instead of the actions' values"
 
 
-def test_actions_are_also_drawn_from_infinite_values(tmp_path: Path) -> None:
+def test_an_action_of_minus_infinity_is_never_drawn(tmp_path: Path) -> None:
     """A policy that masks actions itself gives them minus infinity."""
     onnx_files.constant(tmp_path / "p.onnx", np.array([[-np.inf, -np.inf, 1]], np.float32))
     policy = load_policy("sample:p.onnx", tmp_path)
     assert {policy.act([0, 0], {}, mask) for mask in (None, (True, False, True))} == {2}
-    assert policy.act([0, 0], {}, (True, True, False)) in (0, 1)
 
 
 def test_an_unknown_input_is_refused(tmp_path: Path) -> None:
     nodes = [helper.make_node("Add", ["obs", "speed"], ["output"])]
     onnx_files.save(tmp_path / "p.onnx", nodes, [("obs", (1, 3)), ("speed", (1, 3))], [("output", (1, 3))])
     assert refusal("p.onnx", tmp_path, space=Box(0, 1, (3,))) == (
-        "p.onnx takes an input 'speed' of 3 numbers, which is no observation and no state: no output has its shape"
+        "p.onnx takes an input 'speed' of 3 numbers, which is neither an observation nor a recurrent state (no output "
+        "has its shape); write a class with act() in agent.py that runs the file"
     )
 
 
