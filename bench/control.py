@@ -296,7 +296,7 @@ def calls_of_the_trial() -> Iterator[Row]:
     """Count the requests of a real trial server with TLS, from its certificate to the end of its first episode."""
     with StrictS3().serving() as bucket, tempfile.TemporaryDirectory() as spool:
         project, now = study(id="bench"), bucket.now()
-        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="bench", nonce="bench")
+        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, nonce="bench")
         files = location(record.domain, bucket.settings.root_domain)
         for key, pem in zip((files.fullchain, files.privkey), authority().issue("localhost"), strict=True):
             bucket.documents.put(key, pem)

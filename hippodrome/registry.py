@@ -61,18 +61,15 @@ def _enter(platform: Platform, project: Project) -> Project:
     if problems:
         raise NotRegistered(problems)
     _set_participant_limit(platform, project)
-    keys = SecretCache(platform.documents)
-    keys.get_or_create()  # the secret must exist before anything that needs it is written
+    SecretCache(platform.documents).get_or_create()  # the secret must exist before anything that needs it is written
     for _ in range(TRIES):
         found, listed = _master_list(platform)
         before = listed.find(project.id)
         if before and before.has_sessions and not project.has_sessions:
             raise NotRegistered([ALONE.format(players=before.players)])
-        keys.add_project_secrets(listed.secrets())
-        salt = listed.salt(project.id)  # a project whose secret an earlier version made has the salt ""
-        salt = secrets.token_hex(8) if salt is None else salt
+        salt = listed.salt(project.id) or secrets.token_hex(8)
         entry = msgspec.structs.replace(project.following(before), salt=salt, version=secrets.token_hex(4))
-        body = write_list(listed.without_secrets().with_project(entry))
+        body = write_list(listed.with_project(entry))
         try:
             if found:
                 platform.documents.replace(MASTER_LIST, body, found.etag)
@@ -85,27 +82,6 @@ def _enter(platform: Platform, project: Project) -> Project:
         if entry.warm_servers or (before and before.warm_servers):
             _warm_up(platform, entry)
         return entry
-    raise NotRegistered(["too many registrations at this moment; please try again"])
-
-
-def migrate_secrets(platform: Platform) -> int:
-    """Move secrets from the master list, where earlier versions wrote them, to `_secret.json`; return their number.
-
-    The secrets stay valid. Raises `NotRegistered`.
-    """
-    keys = SecretCache(platform.documents)
-    for _ in range(TRIES):
-        found, listed = _master_list(platform)
-        known = listed.secrets()
-        if found is None or not known:
-            return 0
-        keys.add_project_secrets(known)
-        try:
-            platform.documents.replace(MASTER_LIST, write_list(listed.without_secrets()), found.etag)
-        except Conflict:
-            continue
-        logger.info("secrets were taken out of the list", extra={"count": len(known)})
-        return len(known)
     raise NotRegistered(["too many registrations at this moment; please try again"])
 
 
@@ -237,8 +213,6 @@ def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     * `{"project": …}` registers the project.
     * `{"links": {"projectId": …, "userIds": […]}}` gets `{"signatures": […]}` of signed links instead, so that
       researchers need not know the secret.
-    * `{"takeOver": true}` moves the secrets that an earlier version wrote into the master list to `_secret.json`, and
-      gets `{"takenOver": n}`.
     * A payload of HIPPO's script is handled by `_handle_hippo`.
     """
     if not _is_utf8(event):
@@ -246,8 +220,6 @@ def handle(platform: Platform, event: Mapping[str, Any]) -> dict[str, Any]:
     if hippo_registration.is_payload(event):
         return _handle_hippo(platform, event)
     try:
-        if event.get("takeOver") is True:
-            return {"takenOver": migrate_secrets(platform)}
         if "links" in event:
             return {"signatures": sign_links(platform, event["links"])}
         project = register(platform, event.get("project", event))

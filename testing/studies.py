@@ -6,13 +6,17 @@ import msgspec
 
 from hippodrome.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, Step, step_key
 from hippodrome.model.records import to_json
+from hippodrome.storage.secret import KEY, Secret
 from testing.fake_platform import FakePlatform
+
+INSTALLATION_SECRET = Secret("0" * 64)
 
 
 def study(**changes: object) -> Project:
     """Return a project with five steps: consent (with two groups), questionnaire, game, survey, debrief.
 
-    Its server starts at step 2 and stops at step 4. `changes` replaces fields.
+    Its server starts at step 2 and stops at step 4. `changes` replaces fields. Its secret is derived from
+    `INSTALLATION_SECRET`.
     """
     steps = [
         Step("1", "consent", 2),
@@ -30,9 +34,13 @@ def study(**changes: object) -> Project:
         events=Events("2", "4"),
         aws_setup=AwsSetup(cpu=1, memory=2),
         trial={"game": "ALE/MsPacman-v5"},
-        secret="secret",
+        salt="salt",
     )
-    return msgspec.structs.replace(project, **changes)
+    project = msgspec.structs.replace(project, **changes)
+    return msgspec.structs.replace(project, secret=INSTALLATION_SECRET.project_secret(project))
+
+
+SECRET = study().secret
 
 
 PAGES = {
@@ -45,9 +53,10 @@ PAGES = {
 
 
 def installed(project: Project | None = None) -> FakePlatform:
-    """Return a platform in memory that holds the project (`study()` unless given) and its pages."""
+    """Return a platform in memory that holds the project (`study()` unless given), its pages, and the secret."""
     platform = FakePlatform()
     project = project or study()
+    platform.documents.keep(KEY, to_json(INSTALLATION_SECRET))
     platform.documents.keep(MASTER_LIST, to_json(MasterList([project])))
     for file, source in PAGES.items():
         platform.documents.keep(step_key(project.id, file), source.encode())

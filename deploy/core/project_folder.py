@@ -89,7 +89,7 @@ def _value_of(folder: Path, key: str) -> Any:
 def registration_of(project: Project, live: bool) -> dict[str, Any]:
     """Return the registration with which `update_project_master_list` sets `live` of a registered project."""
     known = msgspec.to_builtins(project)
-    ours = {"salt", "secret", "version"}
+    ours = {"salt", "version"}
     kept = {key: value for key, value in known.items() if value is not None and key not in ours}
     if project.aws_setup is not None:  # a record leaves out values that are the default
         kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}

@@ -14,7 +14,7 @@ from console.formatting import count, duration
 from console.problem import Exit, Problem
 from deploy.aws.account import STACK, Account, find_installation, open_account
 from deploy.code import bytecode
-from deploy.core import options, register_function
+from deploy.core import options
 from deploy.core.finding import Finding
 from deploy.core.stages import Executor
 from deploy.lifecycle import plan as plans
@@ -146,8 +146,6 @@ def _carry_out(prepared: Prepared, request: ApplyRequest, began: float) -> Apply
         domain_change.certify(prepared)
         _execute(prepared, made.arn, made.stack_id, len(changes))
     installation = find_installation(account, stack)
-    if prepared.existing:
-        register_function.hide_secrets(account, installation)
     seconds = time.monotonic() - began
     screen.success(f"The stack {stack} is up to date: {count(len(changes), 'change')} in {duration(seconds)}.")
     return ApplyOutcome(True, seconds, prepared.existing is None, dict(installation.outputs))

@@ -71,7 +71,7 @@ def command(
 def signed(account: Account, installation: Installation, project_id: str, users: Sequence[str]) -> dict[str, str]:
     """Ask the function that has the secret for signatures. Return them by id, in the order of `users`.
 
-    Raises `Problem` if the function fails, or is too old to sign links.
+    Raises `Problem` if the function fails or refuses.
     """
     found: dict[str, str] = {}
     for start in range(0, len(users), MAX_SIGNED):
@@ -79,7 +79,7 @@ def signed(account: Account, installation: Installation, project_id: str, users:
         answer = register_function.ask(account, installation, {"links": {"projectId": project_id, "userIds": chunk}})
         signatures = answer.get("signatures")
         if not isinstance(signatures, list) or len(signatures) != len(chunk):
-            raise Problem("The installation signs no links.", "Bring it up to date with `python -m deploy apply`.")
+            raise Problem("The links were not signed.", details=list(map(str, answer.get("problems", []))))
         found |= dict(zip(chunk, map(str, signatures), strict=True))
     return found
 

@@ -234,7 +234,7 @@ def _registered(
 def _differs(before: Project, registration: Mapping[str, Any]) -> bool:
     """Whether the registration differs from the registered project."""
     after = from_data(parse_registration(dict(registration)), Project)
-    ours = {"version": before.version, "salt": before.salt, "secret": before.secret}
+    ours = {"version": before.version, "salt": before.salt}
     return bool(msgspec.structs.replace(after, **ours) != before)
 
 

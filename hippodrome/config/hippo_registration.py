@@ -26,7 +26,7 @@ _NO_GAME = 'trial: updateProject.py sends none; until make register sends it, st
 
 def is_payload(event: Mapping[str, Any]) -> bool:
     """Return whether HIPPO's script has sent this event: its `steps` are a map, or it has keys that only HIPPO uses."""
-    if any(key in event for key in ("project", "links", "takeOver")):
+    if any(key in event for key in ("project", "links")):
         return False
     return isinstance(event.get("steps"), dict) or any(key in event for key in _ONLY_HIPPO)
 

@@ -36,7 +36,6 @@ def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     keys = visited(list(pages), pages)
     if type_of(pages[keys[-1]]).on_server:
         raise ValueError("its last step is the game")
-    secret, salt = entry.get("secret"), entry.get("salt")
     return {
         "id": entry.get("id"),
         "name": _text(entry.get("name")),
@@ -48,7 +47,7 @@ def fields_of(entry: Mapping[str, Any]) -> dict[str, Any]:
         "steps": [{"key": key, "page": pages[key]} for key in keys],
         "events": _events(entry, keys, pages),
         "pageFolder": "",
-        **({"secret": secret} if isinstance(secret, str) and secret else {"salt": _text(salt) or SALT}),
+        "salt": SALT,
     }
 
 

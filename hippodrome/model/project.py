@@ -128,7 +128,7 @@ class Project(Record, frozen=True):
     other_numbers: tuple[ForPlayers, ...] = ()  # the last registrations for other numbers of players
     version: str = ""  # random, new at each registration
     salt: str = ""  # made at the first registration. Not secret; the secret is derived from it (`secret.py`)
-    secret: str = ""  # signs tickets, links, codes. `SecretCache.with_secret` sets it; earlier versions stored it here
+    secret: str = ""  # signs tickets, links, codes. Never stored: `SecretCache.with_secret` sets it
 
     @property
     def final(self) -> Step:
@@ -269,21 +269,6 @@ class MasterList(Record, frozen=True):
         entries = (_as_object(entry.raw) for entry in self.unreadable if entry.id == project_id)
         return next((_string(entry, "salt") for entry in entries), None)
 
-    def secrets(self) -> dict[str, str]:
-        """Return the secrets that an earlier version wrote into entries, by project id.
-
-        Entries that cannot be read are included.
-        """
-        unread = {entry.id: _string(_as_object(entry.raw), "secret") for entry in self.unreadable if entry.id}
-        known = unread | {project.id: project.secret for project in self.projects}
-        return {project_id: secret for project_id, secret in known.items() if secret}
-
-    def without_secrets(self) -> MasterList:
-        """Return the list as it is stored. It holds no secret, since researchers may read it."""
-        projects = [msgspec.structs.replace(project, secret="") for project in self.projects]
-        unread = tuple(entry._replace(raw=_without_secret(entry.raw)) for entry in self.unreadable)
-        return MasterList(projects, unread, {key: _without_secret(raw) for key, raw in self.by_hippo.items()})
-
     def with_project(self, project: Project) -> MasterList:
         """Return the list with this project, which replaces any entry with its id, readable or not."""
         others = [p for p in self.projects if p.id != project.id]
@@ -357,14 +342,6 @@ def _as_object(raw: bytes) -> Mapping[str, Any]:
 def _string(entry: Mapping[str, Any], key: str) -> str:
     found = entry.get(key)
     return found if isinstance(found, str) else ""
-
-
-def _without_secret(raw: bytes) -> bytes:
-    """The JSON of an entry without the secret that an earlier version may have written into it."""
-    if not _string(_as_object(raw), "secret"):
-        return raw
-    entry = from_json(raw, dict[str, msgspec.Raw])
-    return msgspec.json.encode({key: value for key, value in entry.items() if key != "secret"})
 
 
 def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:

@@ -93,7 +93,6 @@ class Server(Record, frozen=True):
     user_id: str
     attempt: int
     state: ServerState
-    token: str  # "" except in records of earlier versions; they require the key, so it is always written (`secret.py`)
     requested: datetime
     deadline: datetime
     cluster: str
@@ -216,7 +215,7 @@ def key(label: str) -> str:
 
 
 def new_attempt(
-    project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime, token: str = ""
+    project: Project, user_id: str, attempt: int, *, nonce: str = "", settings: Settings, now: datetime
 ) -> Server:
     """Return the record of a new attempt, to be written before anything is started.
 
@@ -237,7 +236,6 @@ def new_attempt(
         user_id=user_id,
         attempt=attempt,
         state=ServerState.STARTING,
-        token=token,
         requested=now,
         deadline=warm_pool.deadline(project, settings, label, now) if is_warm_server else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
@@ -322,7 +320,6 @@ def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datet
         user_id=user_id,
         attempt=attempt,
         state=ServerState.CLOSED,
-        token="",
         requested=now,
         deadline=now,
         cluster="",
@@ -409,9 +406,7 @@ def draining(warm_server: Server) -> Server:
 
 def assigned(server: Server, warm_server: Server, now: datetime) -> Server:
     """Return the record of a server that has got the warm server's resources, so that the participant may connect."""
-    return msgspec.structs.replace(
-        server, state=ServerState.READY, nonce=warm_server.nonce, token=warm_server.token, running=now, ready=now
-    )
+    return msgspec.structs.replace(server, state=ServerState.READY, nonce=warm_server.nonce, running=now, ready=now)
 
 
 def close(server: Server, reason: Reason, now: datetime, cause: str = "") -> Server:

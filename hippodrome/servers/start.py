@@ -183,7 +183,7 @@ class Start:
             environment=_environment(project, record, self._platform.settings, self._services.secrets.get_or_create()),
             port=record.port or LEGACY_PORT,
             spot=record.spot,
-            nonce=record.token or record.nonce,  # earlier versions ran tasks with the token as nonce
+            nonce=record.nonce,
         )
         try:
             self._platform.tasks.run(request)

@@ -12,13 +12,11 @@ import hashlib
 import hmac
 import os
 import threading
-from collections.abc import Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from hippodrome.model import hippo_entry
 from hippodrome.model.records import Record, from_json, to_json
 from hippodrome.ports import Conflict, Documents
 
@@ -28,14 +26,12 @@ if TYPE_CHECKING:
 
 KEY = "_secret.json"
 CACHE_SECONDS = 3600.0  # if an administrator replaces the secret, all functions use the new one after this time
-TRIES = 20  # for one change of the document
 
 
 class Secret(Record, frozen=True):
-    """`_secret.json`. `projects` holds the secrets that earlier versions kept in the master list; they stay valid."""
+    """`_secret.json`."""
 
     secret: Annotated[str, msgspec.Meta(min_length=32)]  # everyone knows the empty text
-    projects: Mapping[str, str] = msgspec.field(default_factory=dict)
 
     def __repr__(self) -> str:
         return "Secret(…)"
@@ -50,16 +46,12 @@ class Secret(Record, frozen=True):
         return self.derive("credential", name, nonce)
 
     def token(self, server: Server) -> str:
-        """Return the token with which the participant plays on this server; empty if there is none."""
-        if server.token or not server.nonce:
-            return server.token
-        return self.derive("token", server.name, server.nonce)[:48]
+        """Return the token with which the participant plays on this server; empty if it was never started."""
+        return self.derive("token", server.name, server.nonce)[:48] if server.nonce else ""
 
     def project_secret(self, project: Project) -> str:
         """Return the key that signs the project's tickets, links and completion codes."""
-        is_older = project.salt in ("", hippo_entry.SALT)  # it may have a secret that an earlier version stored
-        stored = (project.secret or self.projects.get(project.id)) if is_older else ""
-        return stored or self.derive("project", project.id, project.salt)
+        return self.derive("project", project.id, project.salt)
 
 
 class SecretCache:
@@ -90,13 +82,11 @@ class SecretCache:
         return found
 
     def token(self, server: Server) -> str:
-        """Return the token with which the participant plays on this server; "" if the server has none.
+        """Return the token with which the participant plays on this server; "" if it was never started.
 
         AWS calls: at most one an hour; none for a record without a nonce.
         """
-        if server.token or not server.nonce:
-            return server.token
-        found = self.find()
+        found = self.find() if server.nonce else None
         return found.token(server) if found else ""
 
     def with_secret(self, project: Project) -> Project:
@@ -104,38 +94,7 @@ class SecretCache:
 
         Raises LookupError if the document `_secret.json` is gone.
         """
-        if project.secret and not project.salt:
-            return project
         found = self.find()
-        if found and not project.salt and project.id not in found.projects:
-            self._invalidate()  # the project's secret may have been added since the document was read
-            found = self.find()
         if found is None:
             raise LookupError(f"{KEY} is gone; the bucket keeps older versions: put the last one in its place")
         return msgspec.structs.replace(project, secret=found.project_secret(project))
-
-    def add_project_secrets(self, found: Mapping[str, str]) -> None:
-        """Store projects' secrets that were found in the master list, by project id.
-
-        Raises `Conflict` after `TRIES` conflicts.
-        """
-        if not found:
-            return
-        for _ in range(TRIES):
-            self.get_or_create()
-            document = self._documents.get(KEY)
-            if document is None:
-                continue
-            before = from_json(document.body, Secret)
-            after = msgspec.structs.replace(before, projects={**before.projects, **found})
-            with contextlib.suppress(Conflict):
-                if after != before:
-                    self._documents.replace(KEY, to_json(after), document.etag)
-                with self._lock:
-                    self._cached = after
-                return
-        raise Conflict(KEY)
-
-    def _invalidate(self) -> None:
-        with self._lock:
-            self._cached = None

@@ -16,7 +16,8 @@ from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step
 from hippodrome.model.records import to_json
 from hippodrome.participants.journey import Journey
 from hippodrome.ports import Platform
-from testing.studies import study
+from hippodrome.storage.secret import KEY
+from testing.studies import INSTALLATION_SECRET, SECRET, study
 from tests.contract.backends import concurrent
 
 AT_ONCE = 20
@@ -28,6 +29,7 @@ QUERY = (("projectId", "maze"), ("userId", "alice"))
 def journey(platform: Platform) -> Iterator[Journey]:
     """A study of pages only, which alice has opened."""
     project = study(steps=[Step(key, "survey") for key in STEPS], events=Events())
+    platform.documents.create(KEY, to_json(INSTALLATION_SECRET))
     platform.documents.create(MASTER_LIST, to_json(MasterList([project])))
     platform.documents.create(step_key("maze", "survey"), b"<input name='words'>")
     journey = Journey(platform)
@@ -66,7 +68,7 @@ def test_of_many_equal_forms_at_once_one_is_stored(journey: Journey, platform: P
 def test_a_form_with_a_ticket_and_programs_that_repeat_it_at_once_answer_one_step(
     journey: Journey, platform: Platform
 ) -> None:
-    proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
+    proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "alice", "1")}
     form = (urlencode({"words": "fun", **proof}), "application/x-www-form-urlencoded")
     at_once(journey, [form, *[('{"words": "fun"}', "application/json")] * (AT_ONCE - 1)])
     assert answered(platform) == ["1.json"]

@@ -40,13 +40,14 @@ from hippodrome.model.records import to_json
 from hippodrome.model.server import Server, ServerState
 from hippodrome.model.warm_pool import Pool
 from hippodrome.storage.repository import Repository
+from hippodrome.storage.secret import KEY
 from protocol.answer import Answer
 from protocol.keys import answer_key
 from testing import processes
 from testing.aws_events import ACCOUNT
 from testing.moto_world import MotoWorld
 from testing.servers import Servers
-from testing.studies import study
+from testing.studies import INSTALLATION_SECRET, study
 
 ROOT = Path(__file__).resolve().parents[2]
 STACK = "hippodrome"
@@ -187,7 +188,8 @@ class Installed(MotoWorld):
         return [line["Key"] for page in pages for line in page.get("Contents", ())]
 
     def register(self, *projects: Project) -> None:
-        """Write these projects into the master list, without any check."""
+        """Write these projects into the master list, without any check, and the installation's secret."""
+        self.put(KEY, to_json(INSTALLATION_SECRET))
         self.put(MASTER_LIST, to_json(MasterList(sorted(projects or [study()], key=lambda p: p.id))))
 
     def participant(
@@ -217,7 +219,7 @@ class Installed(MotoWorld):
         then = datetime.now(UTC) - timedelta(minutes=10)
         attempt = changes.pop("attempt", 1)
         settings = self.platform.settings
-        made = server.new_attempt(project, user, attempt, token="secret-token", settings=settings, now=then)
+        made = server.new_attempt(project, user, attempt, nonce="secret-token", settings=settings, now=then)
         if state is not ServerState.STARTING:
             changes.setdefault("running", then + timedelta(seconds=40))
             changes.setdefault("host", "203.0.113.7")

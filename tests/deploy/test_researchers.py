@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from console.problem import Exit
@@ -37,7 +36,7 @@ def test_a_command_of_researchers_needs_no_more_than_their_policy(
     if evaluator() is None:
         pytest.skip(MISSING)
     SecretCache(register_world.platform.documents).get_or_create()
-    register_world.register(msgspec.structs.replace(study(signed_links=True), secret="", salt="s"))
+    register_world.register(study(signed_links=True))
     register_world.participant("alice", answered=2)
     register_world.record("alice", nonce="n")
     register_world.platform.tasks.run(

@@ -19,15 +19,14 @@ from lambdas import start_server, sweep, update_project_master_list
 from testing.aws_events import queue_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import study
+from testing.studies import INSTALLATION_SECRET, study
 from testing.visitors import Browser
 from tests.hippodrome.test_registry import registration
 
 BROKEN = {
-    "steps as HIPPO writes them": {"id": "broken", "live": True, "steps": {"1": "consent.html"}, "secret": "kept"},
-    "no steps": {"id": "broken", "steps": [], "secret": "kept"},
-    "a number for the name": {"id": "broken", "steps": [{"key": "1", "page": "a"}], "name": 7, "secret": "kept"},
-    "a secret that is none": {"id": "broken", "steps": [{"key": "1", "page": "a"}], "secret": {}},
+    "steps as HIPPO writes them": {"id": "broken", "live": True, "steps": {"1": "consent.html"}},
+    "no steps": {"id": "broken", "steps": []},
+    "a number for the name": {"id": "broken", "steps": [{"key": "1", "page": "a"}], "name": 7},
     "an id that is none": {"id": "../broken", "steps": [{"key": "1", "page": "a"}]},
     "a list": [1, 2, 3],
     "nothing": None,
@@ -76,23 +75,22 @@ def test_registering_another_project_does_not_change_the_unreadable_entry(platfo
         platform.documents.put(step_key("other", file), b"x")
     answer = update_project_master_list.handler({"project": registration("other")}, None)
     assert answer["registered"] == "other"
-    kept = {k: v for k, v in entry.items() if v != "kept"} if isinstance(entry, dict) else entry
-    assert kept in entries(platform), "as it was, but for the secret, which was taken over"
-    assert [one["id"] for one in entries(platform) if one != kept] == ["maze", "other"]
+    assert entry in entries(platform)
+    assert [one["id"] for one in entries(platform) if one != entry] == ["maze", "other"]
 
 
 def test_registering_the_project_itself_replaces_the_unreadable_entry_and_keeps_its_secret(
     platform: FakePlatform,
 ) -> None:
-    """The secret signs the links and codes that participants have."""
-    spoil(platform, BROKEN["steps as HIPPO writes them"])
+    """The secret, which is derived from the salt, signs the links and codes that participants have."""
+    spoil(platform, {**BROKEN["no steps"], "salt": "kept"})
     for file in ("consent-0", "consent-1", "bye"):
         platform.documents.put(step_key("broken", file), b"x")
     assert update_project_master_list.handler({"project": registration("broken")}, None)["registered"] == "broken"
     assert [one["id"] for one in entries(platform)] == ["broken", "maze"]
     mended = ProjectCache(platform, SecretCache(platform.documents)).project("broken")
     assert mended
-    assert mended.secret == "kept"
+    assert mended.secret == INSTALLATION_SECRET.project_secret(study(id="broken", salt="kept"))
     assert not ProjectCache(platform).is_unreadable("broken")
 
 
@@ -115,8 +113,7 @@ def test_a_readable_list_is_written_as_it_was_read() -> None:
 def test_an_entry_that_is_not_utf_8_is_written_back_unchanged() -> None:
     listed = read_list(b'{"projects": [{"id": "broken", "name": "\xff"}]}')
     assert [(entry.id, entry.raw) for entry in listed.unreadable] == [(None, b'{"id": "broken", "name": "\xff"}')]
-    assert listed.secrets() == {}
-    assert b"\xff" in write_list(listed.without_secrets())
+    assert b"\xff" in write_list(listed)
 
 
 def test_an_unreadable_record_of_a_server_affects_only_its_participant(platform: FakePlatform) -> None:

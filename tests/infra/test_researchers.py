@@ -189,7 +189,6 @@ def ways() -> Iterator[Ask]:
         for action in ("s3:GetObject", "s3:GetObjectVersion", "s3:PutObject", "s3:DeleteObject", "s3:GetObjectTorrent"):
             yield Ask(action, f"{BUCKET}/{key}")
     for key in ("project_master_list.json", f"_servers/{'s' * 21}.json", "p/users/u/participant.json"):
-        yield Ask("s3:GetObjectVersion", f"{BUCKET}/{key}")  # as earlier versions of ours wrote them
         yield Ask("s3:PutObject", f"{BUCKET}/{key}")
     for action in (
         "s3:ListBucketVersions", "s3:PutBucketPolicy", "s3:PutReplicationConfiguration", "s3:PutInventoryConfiguration",

@@ -89,7 +89,6 @@ def claimed(platform: FakePlatform, event: dict[str, Any], **changes: Any) -> No
             user_id=user,
             attempt=attempt,
             state=ServerState.STARTING,
-            token="t",
             requested=platform.now(),
             deadline=platform.now(),
             cluster="hippodrome",

@@ -9,6 +9,7 @@ import re
 from html.parser import HTMLParser
 from typing import Any
 
+from hippodrome.model import ids
 from hippodrome.model.project import Project, Step
 from testing import studies
 from testing.fake_platform import FakePlatform
@@ -67,13 +68,20 @@ TEXTS = [
 
 VICTIM = "victim-whose-link-nobody-knows"
 MINE = "alice"
+NONCE = "a-nonce"
 
 
 def study(**changes: object) -> Project:
     """Return a study like the example, whose pages show all that a participant has sent."""
     pages = ("mirror", "game", "mirror", "mirror")
     steps = [Step("1", "consent", 2), *map(Step, ("2", "3", "4", "finalStep"), pages)]
-    return studies.study(steps=steps, secret="the-project-secret-f00d", **changes)
+    return studies.study(steps=steps, **changes)
+
+
+def token(user: str) -> str:
+    """Return the token of this participant's first server, whose record has the nonce `NONCE`."""
+    name = ids.server_name(ids.server_label(PROJECT, user), 1)
+    return studies.INSTALLATION_SECRET.derive("token", name, NONCE)[:48]
 
 
 MIRROR = """<h1>Mirror</h1><p title="{{ participant }}">{{ participant.note }} {{ participant }}</p>

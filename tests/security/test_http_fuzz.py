@@ -42,7 +42,7 @@ WEB = {
     "send_start_server_message": send_start_server_message.handler,
     "send_stop_server_message": send_stop_server_message.handler,
 }
-SECRETS = (hostile.study().secret, "token-of-the-victim", VICTIM)
+SECRETS = (hostile.study().secret, hostile.token(VICTIM), VICTIM)
 WRITTEN = re.compile(
     rf"{PROJECT}/users/[A-Za-z0-9_-]{{1,64}}/(participant|answers/(1|2|4|finalStep))\.json"
     rf"|_servers/s[a-z2-7]{{20}}\.json|{PROJECT}/places/[0-9]+\.json|_places/{PROJECT}\.json"
@@ -108,7 +108,7 @@ forged = st.fixed_dictionaries(
         "hippodrome-step": texts | st.sampled_from(["1", "3"]),
         "hippodrome-ticket": texts,
         "hippodrome-action": st.sampled_from(["restart", "xss"]),
-        "token": texts | st.just("token-of-alice"),
+        "token": texts | st.just(hostile.token(MINE)),
         "delay": texts | st.integers() | st.floats() | st.just("60"),
     },
 )
@@ -206,7 +206,7 @@ near = st.builds(
 )
 far = st.builds(_event, methods, paths, queries, headers, bodies | LARGE, whole)
 proofs = st.sampled_from([
-    {"hippodrome-step": "3", "hippodrome-ticket": _ticket("3")}, {"token": "token-of-alice"}, {"token": "token-of-the-victim"}, {},
+    {"hippodrome-step": "3", "hippodrome-ticket": _ticket("3")}, {"token": hostile.token(MINE)}, {"token": hostile.token(VICTIM)}, {},
 ])  # fmt: skip
 delays = st.fixed_dictionaries(
     {}, optional={"delay": texts | st.integers() | st.sampled_from(["60", 60, 86_400, 86_401, True])}
@@ -229,11 +229,11 @@ STUDIES = st.sampled_from([{}, {}, LIMITS, {"signed_links": True}, {"signed_link
 def _world(**changes: Any) -> FakePlatform:
     """Return a platform with the study, a participant with a running server, and one unknown to the attacker."""
     platform = hostile.installed(**changes)
-    for user, token in ((MINE, "token-of-alice"), (VICTIM, "token-of-the-victim")):
+    for user in (MINE, VICTIM):
         arrived = participant.new_participant(hostile.study(), user, {"note": "<xss>"}, platform.now())
         platform.documents.put(participant.participant_key(PROJECT, user), to_json(arrived))
         claim = server.new_attempt(
-            hostile.study(), user, 1, token=token, settings=platform.settings, now=platform.now()
+            hostile.study(), user, 1, nonce=hostile.NONCE, settings=platform.settings, now=platform.now()
         )
         platform.documents.put(server.key(claim.label), to_json(claim))
     return platform

@@ -14,14 +14,14 @@ import pytest
 
 from hippodrome.model import ids, server
 from hippodrome.model.server import Server
-from hippodrome.storage.secret import KEY
+from hippodrome.storage.secret import KEY, SecretCache
 from protocol.keys import handover_key
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
 
 ROOT = Path(__file__).resolve().parents[2]
 MALLORY, ALICE = "mallory", "alice"
-SECRETS = ("alice's answer", "the other project's answer", "alice's recording", "the master list", "alice's token")
+SECRETS = ("alice's answer", "the other project's answer", "alice's recording", "the master list")
 
 # It runs as the researcher's code does: the trial imports it into its process. It writes what it got into a file.
 ATTACK = r'''
@@ -123,16 +123,17 @@ class Site(StrictS3):
         self.before = dict(self.documents.kept)
 
     def _claim(self, project: str, user: str) -> Server:
-        token = "alice's token" if user == ALICE else "mallory's token"
         return server.new_attempt(
             study(id=project),
             user,
             1,
-            token=token,
             nonce=f"nonce-{project}-{user}",
             settings=self.settings,
             now=self.now(),
         )
+
+    def token(self, record: Server) -> str:
+        return SecretCache(self.documents).get_or_create().token(record)
 
     @property
     def others(self) -> list[str]:
@@ -167,7 +168,7 @@ def got(site: Site, tmp_path: Path) -> dict[str, Any]:
     }
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     told = {
-        "PROJECT_ID": "maze", "USER_ID": MALLORY, "SERVER": site.mallory.name, "TOKEN": site.mallory.token, "GAME_STEPS": "3",
+        "PROJECT_ID": "maze", "USER_ID": MALLORY, "SERVER": site.mallory.name, "TOKEN": site.token(site.mallory), "GAME_STEPS": "3",
         "STORE": site.url, "CREDENTIAL": site.credential, "TRIAL": '{"game": "grid"}', "HOST": "127.0.0.1", "PORT": "0",
         "TLS": "off", "AGENT_DIR": str(tmp_path), "PYTHONPATH": str(ROOT),
     }  # fmt: skip
@@ -187,7 +188,7 @@ def test_a_malicious_agent_gets_no_data_of_others(site: Site, got: dict[str, Any
     assert set(got["plain"].values()) == {403}
     assert set(got["other servers"]) == {403}
     assert got["token as credential"] == 403
-    assert not any(secret in json.dumps(got) for secret in SECRETS)
+    assert not any(secret in json.dumps(got) for secret in (*SECRETS, site.token(site.alice)))
 
 
 def test_a_malicious_agents_own_requests_cannot_be_changed_to_others(got: dict[str, Any]) -> None:

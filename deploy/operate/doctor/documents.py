@@ -58,8 +58,7 @@ def _projects(context: CheckContext) -> Iterator[Finding]:
 
 def _secret(context: CheckContext) -> Iterator[Finding]:
     """Check that the installation's secret exists. Only functions may read it."""
-    needed = any(project.salt for project in context.projects)
-    if needed and not any(entry.key == secret.KEY for entry in context.platform.documents.list(secret.KEY)):
+    if context.projects and not any(entry.key == secret.KEY for entry in context.platform.documents.list(secret.KEY)):
         yield bad(
             "secret",
             f"{secret.KEY} is gone: pages answer with an error.",

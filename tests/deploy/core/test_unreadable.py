@@ -15,7 +15,7 @@ from deploy.operate.doctor import documents
 from hippodrome.model import ids, server
 from hippodrome.model.participant import participant_key
 from hippodrome.model.project import MASTER_LIST, Project, step_key
-from hippodrome.storage.secret import SecretCache
+from hippodrome.storage.secret import KEY, SecretCache
 from protocol.keys import session_key
 from protocol.session import Member, SessionDocument
 from testing.studies import PAGES, study
@@ -86,7 +86,8 @@ def test_doctor_looks_for_the_pages_of_an_entry_that_hippo_wrote(world: Installe
 
 
 def test_doctor_names_the_missing_secret(installed: Installed, account: Account) -> None:
-    prepare(installed, study(secret="", salt="s"))
+    prepare(installed, study())
+    installed.platform.documents.delete(KEY)
     (line,) = findings_of(account)
     assert (line.mark, line.check, line.text) == (
         Mark.BAD,

@@ -430,24 +430,6 @@ def test_a_foreign_stack_of_that_name_is_left_alone(world: World, status: str) -
     assert write_calls(world) == []
 
 
-@pytest.mark.parametrize("update", [True, False])
-def test_an_update_removes_secrets_from_the_list_of_projects(
-    world: World, monkeypatch: pytest.MonkeyPatch, update: bool
-) -> None:
-    """test_register_function.py tests how the secrets are removed."""
-    asked: list[str] = []
-    monkeypatch.setattr(
-        applying.register_function, "hide_secrets", lambda _, installation: asked.append(installation.stack)
-    )
-    world.cloud.outputs = OUTPUTS
-    if update:
-        world.stand()
-        world.functions = [function("next_step", b"new\n"), function("sweep")]
-        world.cloud.operations.append(happy("UPDATE"))
-    assert apply(world.account, "hippodrome", FIRST).changed
-    assert asked == (["hippodrome"] if update else [])
-
-
 def test_an_installation_without_our_tag_is_recognized(world: World) -> None:
     world.stand()
     assert world.cloud.stack

@@ -16,7 +16,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import MASTER_LIST
 from hippodrome.storage.secret import SecretCache
 from lambdas import update_project_master_list
-from testing.studies import PAGES, study
+from testing.studies import PAGES, SECRET, study
 from testing.visitors import Browser
 from tests.deploy.installation import CommandResult
 from tests.deploy.registering import RegisterWorld
@@ -158,7 +158,7 @@ def test_links_needs_participants_and_a_known_project_and_says_if_links_are_not_
 
 def test_links_are_made_without_reading_the_secret(world: RegisterWorld, capsys: Any) -> None:
     SecretCache(world.platform.documents).get_or_create()
-    world.register(msgspec.structs.replace(SIGNED, secret="", salt="s"))
+    world.register(SIGNED)
     world.asked.clear()
     (made,) = run(world, capsys, "--new", "1", "--json").json
     assert [told["Key"] for action, told in world.asked if action == "s3:GetObject"] == [MASTER_LIST]
@@ -173,12 +173,12 @@ def test_many_links_are_requested_in_several_messages(
     found = run(world, capsys, "--new", "7", "--json").json
     assert world.made.count("lambda:Invoke") == 3
     for one in found:
-        assert one["link"].endswith(f"&signature={ids.link_signature('secret', 'maze', one['userId'])}")
+        assert one["link"].endswith(f"&signature={ids.link_signature(SECRET, 'maze', one['userId'])}")
 
 
-def test_an_installation_that_signs_no_links_yet_says_so(
+def test_if_the_function_signs_no_links_its_reason_is_shown(
     world: RegisterWorld, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(update_project_master_list, "handler", lambda *_: {"problems": ["project: missing"]})
+    monkeypatch.setattr(update_project_master_list, "handler", lambda *_: {"problems": ["links: no project"]})
     ran = run(world, capsys, "--new", "1")
-    assert (ran.code, "python -m deploy apply" in ran.err) == (Exit.FAILED, True)
+    assert (ran.code, "links: no project" in ran.err) == (Exit.FAILED, True)

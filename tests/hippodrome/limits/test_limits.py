@@ -45,7 +45,7 @@ USERS = tuple(f"u{n}" for n in range(40))
 
 def claimed(project: Project, user: str, attempt: int = 1) -> Server:
     platform = FakePlatform()
-    return server.new_attempt(project, user, attempt, token="t", settings=platform.settings, now=platform.clock)
+    return server.new_attempt(project, user, attempt, nonce="t", settings=platform.settings, now=platform.clock)
 
 
 def server_slots(platform: FakePlatform) -> ServerSlots:

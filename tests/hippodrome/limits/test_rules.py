@@ -22,7 +22,7 @@ WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 def claimed(user: str = "alice", attempt: int = 1) -> Server:
     """Return a server that reserves 1800 seconds; a warm server, 3600."""
-    record = server.new_attempt(study(), user, attempt, token="t", settings=SETTINGS, now=NOW)
+    record = server.new_attempt(study(), user, attempt, nonce="t", settings=SETTINGS, now=NOW)
     lasts = timedelta(hours=1) if record.is_warm_server else timedelta(minutes=30)
     return msgspec.structs.replace(record, deadline=NOW + lasts)
 

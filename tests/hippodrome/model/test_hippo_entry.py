@@ -110,7 +110,7 @@ def test_any_entry_is_kept_and_affects_no_other(entry: dict[str, Any]) -> None:
 
 
 def test_of_two_entries_with_one_id_hippodromes_counts_and_both_are_kept() -> None:
-    ours = json.loads(write_list(MasterList([study(id="flight", secret="")])))["projects"][0]
+    ours = json.loads(write_list(MasterList([study(id="flight")])))["projects"][0]
     listed = read(ENTRY, ours)
     assert [len(found.steps) for found in listed.projects] == [5]
     assert json.loads(write_list(listed))["projects"] == [ours, ENTRY]

@@ -8,7 +8,7 @@ from hippodrome.model.participant import Progress
 from hippodrome.model.project import Events, Step
 from hippodrome.ports import Entry
 from protocol.keys import answer_key, participant_folder
-from testing.studies import study
+from testing.studies import SECRET, study
 
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
 FOLDER = "maze/users/alice/"
@@ -108,7 +108,7 @@ def test_a_new_participant_gets_a_group_and_a_code_and_keeps_the_fields_of_the_l
         user_id="alice",
         arrived=NOW,
         group=project.group("alice"),
-        completion_code=ids.completion_code("secret", "alice"),
+        completion_code=ids.completion_code(SECRET, "alice"),
         link={"SESSION_ID": "7"},
     )
 

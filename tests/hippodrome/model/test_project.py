@@ -8,7 +8,7 @@ import pytest
 from hippodrome.model import ids
 from hippodrome.model.project import AwsSetup, Events, MasterList, Project, Step, step_key
 from hippodrome.model.records import from_json, to_json
-from testing.studies import study
+from testing.studies import SECRET, study
 
 
 def test_steps_are_found_by_their_keys() -> None:
@@ -25,12 +25,12 @@ def test_steps_are_found_by_their_keys() -> None:
 
 
 def test_a_ticket_proves_the_step_that_was_shown() -> None:
-    project, ticket = study(), ids.ticket("secret", "alice", "2")
+    project, ticket = study(), ids.ticket(SECRET, "alice", "2")
     assert project.step_of_ticket("alice", "2", ticket) == project.steps[1]
     for user, step, proof in (
         ("bob", "2", ticket),
         ("alice", "1", ticket),
-        ("alice", "9", ids.ticket("secret", "alice", "9")),
+        ("alice", "9", ids.ticket(SECRET, "alice", "9")),
     ):
         assert project.step_of_ticket(user, step, proof) is None
     for step, proof in (("2", None), ("2", ""), (None, ticket)):

@@ -10,7 +10,6 @@ import pytest
 
 from hippodrome.model import ids, server
 from hippodrome.model.project import AwsSetup
-from hippodrome.model.records import from_json
 from hippodrome.model.server import Reason, Server, ServerState, TaskStopped
 from hippodrome.ports import Address, DnsRecord
 from hippodrome.servers.causes import Cause
@@ -25,7 +24,7 @@ WARM_SERVER = ids.warm_id("maze", NOW, 0)
 
 
 def new_record(user: str = "alice", attempt: int = 1, **project: object) -> Server:
-    return server.new_attempt(study(**project), user, attempt, token="t", nonce="n", settings=SETTINGS, now=NOW)
+    return server.new_attempt(study(**project), user, attempt, nonce="n", settings=SETTINGS, now=NOW)
 
 
 def changes(before: Server, after: Server) -> dict[str, object]:
@@ -41,7 +40,6 @@ def test_a_new_record_holds_all_that_is_known_before_anything_starts() -> None:
         user_id="alice",
         attempt=1,
         state=ServerState.STARTING,
-        token="t",
         requested=NOW,
         deadline=NOW + timedelta(minutes=30),
         cluster=SETTINGS.cluster,
@@ -82,14 +80,14 @@ def test_only_a_sessions_server_has_players_and_may_call_match(players: int, mat
 )
 def test_only_an_id_that_is_a_host_label_names_a_server(user: str, first: str | None) -> None:
     settings = replace(SETTINGS, user_id_names=True)
-    record = server.new_attempt(study(subdomain="userId"), user, 1, token="t", settings=settings, now=NOW)
+    record = server.new_attempt(study(subdomain="userId"), user, 1, nonce="t", settings=settings, now=NOW)
     assert record.dns == f"{first or record.name}.{SETTINGS.servers_domain}"
     assert record.has_default_name is (first is None)
 
 
 def test_a_server_whose_name_is_refused_gets_its_default_name() -> None:
     record = server.new_attempt(
-        study(subdomain="userId"), "alice", 2, token="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
+        study(subdomain="userId"), "alice", 2, nonce="t", settings=replace(SETTINGS, user_id_names=True), now=NOW
     )
     assert changes(record, server.with_default_name(record)) == {"dns": f"{LABEL}-2.{SETTINGS.servers_domain}"}
     assert server.with_default_name(record).has_default_name
@@ -171,7 +169,6 @@ def test_a_tombstone_is_closed_from_the_beginning() -> None:
         user_id="alice",
         attempt=2,
         state=ServerState.CLOSED,
-        token="",
         requested=NOW,
         deadline=NOW,
         cluster="",
@@ -315,17 +312,3 @@ def test_the_values_of_states_and_reasons_stay_as_they_are_in_stored_records() -
     assert list(ServerState) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
     assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
     assert server.key(LABEL) == f"_servers/{LABEL}.json"
-
-
-def test_fields_that_an_earlier_version_did_not_write_have_defaults() -> None:
-    old = (
-        b'{"projectId": "maze", "userId": "alice", "attempt": 1, "state": "starting", "token": "t",'
-        b' "requested": "2026-11-21T12:00:00Z", "deadline": "2026-11-21T12:30:00Z", "cluster": "c"}'
-    )
-    found = msgspec.structs.asdict(from_json(old, Server))
-    added = {name: found[name] for name in ("dns", "spot", "cause", "cpu", "memory", "earlier", "counted")}
-    assert added == {"dns": "", "spot": True, "cause": "", "cpu": 0, "memory": 0, "earlier": (), "counted": False}
-    unknown = ("task", "host", "port", "running", "ready", "closed", "reason", "warm_server_name", "assigned_to")
-    assert [found[name] for name in unknown] == [None] * 9
-    run = from_json(b'{"attempt": 1, "requested": "2026-11-21T12:00:00Z"}', server.PastAttempt)
-    assert run == server.PastAttempt(1, NOW, None, None, 0, 0, True, None, "", None)

@@ -27,7 +27,7 @@ from testing.aws_events import FORM, http_event
 from testing.exploration import examples
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import SECRET, installed, study
 from testing.visitors import Browser, hidden
 
 
@@ -204,7 +204,7 @@ def test_the_ticket_of_another_participant_does_not_count(platform: FakePlatform
     to_game(alice)
     bob = Browser(platform, "projectId=maze&userId=bob")
     bob.get()
-    bob.post(**{"hippodrome-step": "2", "hippodrome-ticket": ids.ticket("secret", "alice", "2"), "age": "1"})
+    bob.post(**{"hippodrome-step": "2", "hippodrome-ticket": ids.ticket(SECRET, "alice", "2"), "age": "1"})
     assert stored(platform, "answers/2.json", "bob") is None
 
 
@@ -410,7 +410,7 @@ def test_a_participant_whose_game_failed_goes_on_without_it(platform: FakePlatfo
     failed(platform, alice)
     page = alice.get()
     alice.post(**hidden(page), **{"hippodrome-action": "without"})
-    code = ids.completion_code("secret", "alice", "failed")
+    code = ids.completion_code(SECRET, "alice", "failed")
     assert answer_of(platform, "3") == {
         "episodes": 0, "score": 0, "frames": 0, "seconds": 0, "outcome": "failed", "completionCode": code
     }  # fmt: skip
@@ -428,7 +428,7 @@ def test_the_last_page_shows_the_code_of_a_game_that_failed(platform: FakePlatfo
         if "code: " in page:
             break
         alice.answer(page)
-    assert f"code: {ids.completion_code('secret', 'alice', 'failed')}" in page
+    assert f"code: {ids.completion_code(SECRET, 'alice', 'failed')}" in page
 
 
 def test_the_answer_that_the_trial_has_stored_stays(platform: FakePlatform, alice: Browser) -> None:
@@ -538,10 +538,10 @@ def test_a_program_goes_on_without_a_game_that_failed_once_there_are_no_more_ser
 def test_nobody_gets_past_the_game_by_stopping_their_own_servers(platform: FakePlatform, alice: Browser) -> None:
     to_game(alice)
     used_up(platform, *[Reason.STOPPED] * (MAX_ATTEMPTS - 1))
-    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket("secret", "alice", "3")}
+    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket(SECRET, "alice", "3")}
     alice.post(**proof, **{"hippodrome-action": "without"})
     assert "maze/users/alice/answers/3.json" not in platform.documents.kept
-    assert ids.completion_code("secret", "alice", "failed") not in alice.get()
+    assert ids.completion_code(SECRET, "alice", "failed") not in alice.get()
 
 
 def test_a_participant_gets_at_most_eight_servers(platform: FakePlatform, alice: Browser) -> None:
@@ -550,7 +550,7 @@ def test_a_participant_gets_at_most_eight_servers(platform: FakePlatform, alice:
     platform.documents.put(server.key(last.label), to_json(last))
     platform.bus.sent.clear()
     alice.get()
-    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket("secret", "alice", "3")}
+    proof = {"hippodrome-step": "3", "hippodrome-ticket": ids.ticket(SECRET, "alice", "3")}
     alice.post(**proof, **{"hippodrome-action": "restart"})
     assert platform.bus.sent == []
     assert not poll(alice)["again"]

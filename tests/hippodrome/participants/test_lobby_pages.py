@@ -26,7 +26,7 @@ from protocol.session import member_token
 from testing.aws_events import FORM, http_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import SECRET, installed, study
 from testing.visitors import Browser, hidden
 
 STUDY: dict[str, Any] = {"players": 2, "patience": 60, "trial": {"game": "x", "players": {"a": "human", "b": "human"}}}
@@ -499,5 +499,5 @@ def test_a_function_with_an_old_registration_reads_the_new_one_for_a_poll_of_the
     ann = Player(for_one, "ann").to_game()
     assert ann.data["state"]["state"] == "queued"
     for_one.documents.keep(MASTER_LIST, to_json(MasterList([study(**STUDY).following(study(**ONE))])))
-    ticket = ids.ticket("secret", "ann", "3")
+    ticket = ids.ticket(SECRET, "ann", "3")
     assert ann.poll(f"?projectId=maze&userId=ann&poll=3&ticket={ticket}")["state"] == "lobby"

@@ -12,7 +12,7 @@ from hippodrome.model import ids
 from hippodrome.model.project import Events, Project
 from protocol.keys import NAME
 from testing.fake_platform import FakePlatform
-from testing.studies import installed, study
+from testing.studies import SECRET, installed, study
 from testing.visitors import Browser
 
 LINK = "projectId=maze&userId=alice"
@@ -93,7 +93,7 @@ def test_a_prefetch_of_a_browser_is_refused_and_not_cached(platform: FakePlatfor
 def test_a_form_that_is_sent_is_no_preview(platform: FakePlatform, headers: dict[str, str]) -> None:
     alice = Browser(platform, LINK)
     alice.get()
-    form = f"hippodrome-step=1&hippodrome-ticket={ids.ticket('secret', 'alice', '1')}&consent=yes"
+    form = f"hippodrome-step=1&hippodrome-ticket={ids.ticket(SECRET, 'alice', '1')}&consent=yes"
     alice.send("POST", form, content_type="application/x-www-form-urlencoded", **headers)
     assert "maze/users/alice/answers/1.json" in platform.documents.kept
 
@@ -122,7 +122,7 @@ def test_any_user_agent_gets_an_answer(agent: str) -> None:
 # Signed links
 
 
-def invited(user: str = "alice", project: str = "maze", secret: str = "secret") -> str:
+def invited(user: str = "alice", project: str = "maze", secret: str = SECRET) -> str:
     return f"projectId={project}&userId={user}&signature={ids.link_signature(secret, project, user)}"
 
 
@@ -138,7 +138,7 @@ def test_a_signed_link_leads_through_the_study(closed: FakePlatform) -> None:
     alice.query = answer["headers"]["Location"].partition("?")[2]
     assert "Age" in alice.get()
     kept = closed.documents.kept["maze/users/alice/participant.json"][0]
-    assert ids.link_signature("secret", "maze", "alice").encode() not in kept
+    assert ids.link_signature(SECRET, "maze", "alice").encode() not in kept
 
 
 @pytest.mark.parametrize(
@@ -147,18 +147,18 @@ def test_a_signed_link_leads_through_the_study(closed: FakePlatform) -> None:
         "projectId=maze",
         LINK,
         f"{LINK}&signature=",
-        f"{LINK}&signature={ids.link_signature('secret', 'maze', 'bob')}",
-        f"{LINK}&signature={ids.link_signature('secret', 'other', 'alice')}",
+        f"{LINK}&signature={ids.link_signature(SECRET, 'maze', 'bob')}",
+        f"{LINK}&signature={ids.link_signature(SECRET, 'other', 'alice')}",
         f"{LINK}&signature={ids.link_signature('another', 'maze', 'alice')}",
-        f"{LINK}&signature={ids.ticket('secret', 'alice', '1')}",
-        f"{LINK}&signature={ids.completion_code('secret', 'alice')}",
+        f"{LINK}&signature={ids.ticket(SECRET, 'alice', '1')}",
+        f"{LINK}&signature={ids.completion_code(SECRET, 'alice')}",
         f"{invited()}&signature=x",
         f"{invited().replace('userId', 'workerId')}&userId=bob",
     ],
 )
 @pytest.mark.parametrize("method", ["GET", "HEAD", "POST"])
 def test_a_visitor_without_a_valid_signature_gets_nothing(closed: FakePlatform, query: str, method: str) -> None:
-    body = f"hippodrome-step=1&hippodrome-ticket={ids.ticket('secret', 'alice', '1')}" if method == "POST" else None
+    body = f"hippodrome-step=1&hippodrome-ticket={ids.ticket(SECRET, 'alice', '1')}" if method == "POST" else None
     answer = Browser(closed, query).send(method, body, content_type="application/x-www-form-urlencoded")
     assert answer["statusCode"] in (400, 403)
     assert "agree" not in answer["body"]
@@ -182,15 +182,15 @@ IDS = st.from_regex(NAME, fullmatch=True)
 
 @given(IDS, IDS, st.text(max_size=40), st.integers(0, 31), st.sampled_from("0123456789abcdef"))
 def test_no_other_signature_opens_a_link(user: str, other: str, guess: str, at: int, digit: str) -> None:
-    right = ids.link_signature("secret", "maze", user)
+    right = ids.link_signature(SECRET, "maze", user)
     assert re.fullmatch(r"[0-9a-f]{32}", right)
     for wrong in (
         guess,
         f"{right[:at]}{digit}{right[at + 1 :]}",
         right[:at],
-        ids.link_signature("secret", "maze", other),
+        ids.link_signature(SECRET, "maze", other),
     ):
         assert ids.secrets_equal(wrong, right) is (wrong == right)
-    assert (ids.link_signature("secret", "maze", other) == right) is (other == user)
+    assert (ids.link_signature(SECRET, "maze", other) == right) is (other == user)
     # Values that the secret signs for one purpose are no proof for another.
-    assert right not in (ids.ticket("secret", "maze", user), ids.ticket("secret", user, other))
+    assert right not in (ids.ticket(SECRET, "maze", user), ids.ticket(SECRET, user, other))

@@ -18,8 +18,9 @@ from lambdas import send_start_server_message, send_stop_server_message
 from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
+from testing.studies import SECRET
 
-PROOF = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
+PROOF = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "alice", "1")}
 START, STOP = send_start_server_message, send_stop_server_message
 
 
@@ -45,8 +46,8 @@ def test_a_participant_may_ask_for_their_server(platform: FakePlatform) -> None:
 
 @pytest.mark.parametrize("proof", [
     {}, {"hippodrome-step": "1", "hippodrome-ticket": "0" * 32}, {"token": "guess"}, {"token": ""}, {"token": None},
-    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")},
-    {"hippodrome-step": "nope", "hippodrome-ticket": ids.ticket("secret", "alice", "nope")},
+    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "bob", "1")},
+    {"hippodrome-step": "nope", "hippodrome-ticket": ids.ticket(SECRET, "alice", "nope")},
 ])  # fmt: skip
 def test_a_request_without_a_valid_proof_may_not_start_or_stop_a_server(
     platform: FakePlatform, proof: dict[str, object]
@@ -61,7 +62,7 @@ def test_a_server_can_be_asked_for_only_at_steps_that_have_one(platform: FakePla
     for key in "23":
         platform.documents.put(f"maze/users/alice/answers/{key}.json", b"{}")
     assert ask(START, **PROOF) == 409
-    bobs = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")}
+    bobs = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "bob", "1")}
     assert ask(START, "projectId=maze&userId=bob", **bobs) == 409  # never opened the link
     assert platform.bus.sent == []
 
@@ -121,7 +122,7 @@ def test_a_request_without_a_proof_is_refused_with_the_fields_to_send(platform: 
 
 
 @pytest.mark.parametrize("fields", [
-    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "bob", "1")}, {"token": "guess"},
+    {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "bob", "1")}, {"token": "guess"},
     {"hippodrome-step": "1", "hippodrome-ticket": ""}, {"hippodrome-step": "nope", "hippodrome-ticket": "0" * 32},
 ])  # fmt: skip
 def test_a_false_proof_stops_nothing_in_any_project(platform: FakePlatform, fields: dict[str, str]) -> None:
@@ -131,9 +132,10 @@ def test_a_false_proof_stops_nothing_in_any_project(platform: FakePlatform, fiel
 
 
 def test_looking_for_the_project_of_a_ticket_reads_no_records(platform: FakePlatform) -> None:
-    get(STOP, platform, "userId=alice")
+    false = {"hippodrome-step": "1", "hippodrome-ticket": "0" * 32}
+    get(STOP, platform, "userId=alice", **false)
     before = len(platform.documents.calls)
-    get(STOP, platform, "userId=alice", **{"hippodrome-step": "1", "hippodrome-ticket": "0" * 32})
+    get(STOP, platform, "userId=alice", **false)
     assert platform.documents.calls[before:] == []
 
 

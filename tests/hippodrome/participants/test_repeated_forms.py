@@ -22,7 +22,7 @@ from hippodrome.ports import Topic
 from lambdas import installed as place
 from testing.aws_events import FORM
 from testing.fake_platform import FakePlatform
-from testing.studies import installed, study
+from testing.studies import SECRET, installed, study
 from testing.visitors import Program
 
 PAGES = ["1", "2", "3", "4", "finalStep"]
@@ -104,7 +104,7 @@ def test_a_form_with_any_difference_is_another_answer(platform: FakePlatform, ot
 
 def test_a_form_that_a_browser_sent_is_not_accepted_again_from_a_program(platform: FakePlatform) -> None:
     program = asking(platform)
-    proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", "alice", "1")}
+    proof = {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, "alice", "1")}
     program.ask("POST", urlencode({"agree": "yes", **proof}), FORM)
     program.post({"agree": "yes"})
     program.ask("POST", "agree=yes", FORM)
@@ -279,7 +279,7 @@ class Participant:
     def send(self, at: int, names: str) -> None:
         step = PAGES[at]
         ours = {"step": {"hippodrome-step": step}, "nothing": {}, "ticket": {
-            "hippodrome-step": step, "hippodrome-ticket": ids.ticket("secret", "alice", step),
+            "hippodrome-step": step, "hippodrome-ticket": ids.ticket(SECRET, "alice", step),
         }}[names]  # fmt: skip
         self.flights.append(self.turns.begin(lambda: self.program.post({**self.forms[at], **ours})))
 

@@ -29,7 +29,7 @@ from protocol.session import Member, SessionDocument, member_token
 from testing.aws_events import JSON, http_event
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
-from testing.studies import installed, study
+from testing.studies import SECRET, installed, study
 from tests.hippodrome.servers.delivery import deliver, events
 
 SESSION = "s." + "0" * 19 + "1"
@@ -361,7 +361,7 @@ def ask(function: Any, user: str, **body: object) -> int:
 
 
 def proof(user: str) -> dict[str, str]:
-    return {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket("secret", user, "1")}
+    return {"hippodrome-step": "1", "hippodrome-ticket": ids.ticket(SECRET, user, "1")}
 
 
 def test_a_member_cannot_stop_the_server_of_the_others(relays: FakePlatform, servers: Servers) -> None:

@@ -60,7 +60,7 @@ class World(FakePlatform):
         """Return the record of a server that has just been started."""
         made = server.new_attempt(
             project or study(id=PROJECT), user, attempt,
-            token="the-token", nonce=f"nonce-{user}-{attempt}", settings=self.settings, now=self.now(),
+            nonce=f"nonce-{user}-{attempt}", settings=self.settings, now=self.now(),
         )  # fmt: skip
         return msgspec.structs.replace(made, **change)
 

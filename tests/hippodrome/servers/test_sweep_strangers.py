@@ -209,7 +209,7 @@ class Place(MotoWorld):
         project = msgspec.structs.replace(STUDY, cluster="participant" if own_cluster else "shared")
         now = datetime.now(UTC) - ago
         user = f"R_{self.number}"
-        return server.new_attempt(project, user, attempt, token="t" * 32, settings=self.platform.settings, now=now)
+        return server.new_attempt(project, user, attempt, nonce="t" * 32, settings=self.platform.settings, now=now)
 
     def save(self, record: Server) -> None:
         self.put(server.key(record.label), to_json(record))

@@ -58,7 +58,7 @@ class RehearsalContext:
         membership = self.repository.membership(self.copy.id, user) if self.copy.project.players > 1 else None
         found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
         if found is not None:
-            self.transcript.hide(found.token, found.nonce, found.name, found.label, found.host, found.task)
+            self.transcript.hide(found.nonce, found.name, found.label, found.host, found.task)
         return found
 
     def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
