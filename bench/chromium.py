@@ -19,6 +19,7 @@ import psutil
 
 from bench.row import Row, row
 from bench.study import folder, running, write_game
+from testing.browser import chromium
 
 RATE = 30  # frames a second
 SECONDS = 6.0  # for which frames are counted
@@ -249,21 +250,6 @@ def cpu_seconds(pid: int) -> float:
     `/proc/PID/stat` counts in hundredths of a second, which is too coarse: a server can send dozens of pictures in one.
     """
     return time.clock_gettime((~pid << 3) | 2)
-
-
-@contextlib.contextmanager
-def chromium() -> Iterator[Any]:
-    """Run Chromium within the block, as a Browser of Playwright."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu"]
-        )
-        try:
-            yield browser
-        finally:
-            browser.close()
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from deploy.cost.prices import FARGATE_MINIMUM, Prices
 from testing import template
 from testing.quiet_log import quiet
 from testing.simulation import session_checks
+from testing.simulation.assumptions import assumptions
 from testing.simulation.aws_bound import aws_alone, aws_alone_together
 from testing.simulation.conditions import Conditions
 from testing.simulation.members import SimulatedMember
@@ -50,7 +51,11 @@ def thousand() -> Iterator[Row]:
         yardstick=quantile(alone, 0.95),
         at_most=1.25,
         decides=WAIT,
-        detail={"p50, p95, max": spread(waits), "AWS alone": spread(alone)},
+        detail={
+            "p50, p95, max": spread(waits),
+            "AWS alone": spread(alone),
+            **{f"assumed: {what}": text for what, text in assumptions(world.conditions).items()},
+        },
     )
     parts = bill(world)
     yield row(

@@ -22,7 +22,7 @@ MAY: dict[str, set[str]] = {
     "local": {"hippodrome", "lambdas", "protocol", "bots", "trial"},
     "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "bots", "trial"},
     "testing": {"deploy", "hippodrome", "lambdas", "local", "protocol", "trial"},
-    "bench": {"console", "deploy", "export", "hippodrome", "lambdas", "local", "protocol", "testing", "trial"},
+    "bench": {"deploy", "hippodrome", "lambdas", "protocol", "testing", "trial"},
 }
 PRODUCT = set(MAY) - {"testing", "bench"}
 ROOMS = {
@@ -78,11 +78,7 @@ def test_only_tests_of_the_bench_import_it() -> None:
         for path in (ROOT / "tests").rglob("*.py")
         if any(name.partition(".")[0] == "bench" for name in imported(path))
     }
-    assert importing == {
-        "tests/bench/test_bench.py",
-        "tests/browser/test_bench_browser.py",
-        "tests/infra/test_functions.py",
-    }
+    assert importing == {"tests/bench/test_bench.py"}
 
 
 def test_every_folder_of_deploy_has_its_rank() -> None:

@@ -1,7 +1,7 @@
 """Estimates what a study will cost: a line for each thing that AWS bills. Pure.
 
-The numbers of calls come from `make bench`, which counts them for the example study of five steps: 30 from the link to
-the clean-up in a running study, 39 for a participant alone (docs/architecture.md, "What a participant costs"). They are
+The numbers of calls come from `make bench`, which counts them for the example study of five steps: 31 from the link to
+the clean-up in a running study, 40 for a participant alone (docs/architecture.md, "What a participant costs"). They are
 scaled by the number of steps. A figure that is not measured is assumed, low, likely and high; `assumptions` says which.
 """
 
@@ -28,9 +28,9 @@ NEXT_STEP_SECONDS = Range(0.05, 0.12, 0.6)  # of a request; high: with a cold st
 WORKER_SECONDS = Range(0.2, 0.5, 2.0)
 SWEEP_SECONDS = Range(0.3, 0.7, 2.0)
 NEXT_STEP_GB, WORKER_GB = 1.0, 0.5  # the functions' memory in infra/template.yml
-PAGE_KB = 14  # the largest page of the example, with gzip, by `python -m bench pages`
+PAGE_KB = 14  # the largest page of the example, with gzip, by `make bench`
 PAGE_LOADS = Range(1.0, 1.5, 3.0)
-FRAME_KB = Range(0.4, 0.5, 77.0)  # `python -m bench trial`: Ms. Pac-Man; high: a JPEG of a scrolling texture, 600 x 400
+FRAME_KB = Range(0.4, 0.5, 77.0)  # `make bench`: Ms. Pac-Man; high: a JPEG of a scrolling texture, 600 x 400
 PLAYED = Range(0.4, 0.6, 1.0)  # the share of a server's time in which it sends frames
 RECORDED_KB = Range(0.02, 0.06, 0.2)  # of a step, with gzip, without pictures; each frame counts as a step
 PICTURE_KB = Range(1.0, 4.0, 30.0)  # of a step's picture, with `recordObservations`

@@ -51,8 +51,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         f"highest count of its messages; allowed to {' and '.join(sorted(LOOPS)) or 'none'} (Lambda Developer Guide, "
         "recursive loop detection)",
         "cold start": f"{_span(functions.COLD)} ({OURS})",
-        "processor time of functions": "0 s: calls and cold starts alone take time (rows of `functions` and `control` "
-        "measure it)",
+        "processor time of functions": "0 s: calls and cold starts alone take time",
         "functions end after": ", ".join(f"{name} {seconds} s" for name, seconds in TIMEOUTS.items()),
         "functions at once": f"{CONCURRENCY:,} in the account (Lambda quotas; a new account may have 10)",
         "waiting page asks": f"every {POLLS['first']:g} s at first, every {POLLS['longest']:g} s later, every "
@@ -61,12 +60,6 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "sweep": f"every {SWEEP_EVERY:g} s (infra/template.yml)",
         "addresses": f"{ADDRESSES:,}: what the subnets of infra/template.yml hold",
     }
-
-
-def changed(conditions: Conditions) -> Mapping[str, str]:
-    """Return the assumptions that differ from those of the usual conditions."""
-    usual = assumptions(Conditions())
-    return {name: text for name, text in assumptions(conditions).items() if usual[name] != text}
 
 
 def _spot(conditions: Conditions) -> str:

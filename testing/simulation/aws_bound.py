@@ -16,21 +16,15 @@ from testing.simulation.cloud import QUOTAS
 from testing.simulation.conditions import Conditions, address_lag, draws, propagation, start_time
 from testing.simulation.ports import MAX_CHANGES
 
-ATTACHED = (5.0, 15.0)  # seconds from RunTask until the network interface has its address: our assumption
 
-
-def aws_alone(
-    asked: Sequence[float], seed: int, conditions: Conditions | None = None, *, early: bool = False
-) -> list[float]:
+def aws_alone(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> list[float]:
     """Return the seconds that each participant waits; `asked` are the seconds at which they request a server.
 
     The seed is that of the simulated run, whose start times and DNS times are drawn in the same order. The same
     arguments give the same result. Interruptions are left out, since they only make waits longer. Spot that is sold out
     changes nothing, since Fargate on demand has the same quotas and start times.
-
-    With `early`, a task's name is made as soon as its network interface has an address, while the task still starts.
     """
-    return [ready - came for came, ready in _served(asked, seed, conditions, early=early)]
+    return [ready - came for came, ready in _served(asked, seed, conditions)]
 
 
 def aws_alone_together(
@@ -51,20 +45,15 @@ def aws_alone_together(
     return [max(members[-1], server) - one for members, server in pairs for one in members]
 
 
-def _served(
-    asked: Sequence[float], seed: int, conditions: Conditions | None = None, *, early: bool = False
-) -> Iterator[tuple[float, float]]:
-    """Yield, for each server that is requested at these seconds, this second and the second at which it is ready.
-
-    `early` is that of `aws_alone`.
-    """
+def _served(asked: Sequence[float], seed: int, conditions: Conditions | None = None) -> Iterator[tuple[float, float]]:
+    """Yield, for each server that is requested at these seconds, this second and the second at which it is ready."""
     conditions, starts, spreads = conditions or Conditions(), draws(seed, "starts"), draws(seed, "propagation")
-    chance, lags, interfaces = random.Random(seed), draws(seed, "addresses"), draws(seed, "interfaces")
+    chance, lags = random.Random(seed), draws(seed, "addresses")
     arrivals = sorted(asked)
     runs = []  # for each task: when its address is known, when the task runs, and when the participant came
     for launched, came in zip(_admitted(arrivals), arrivals, strict=True):
         task_runs = launched + start_time(starts, conditions.starts)
-        known = launched + interfaces.uniform(*ATTACHED) if early else task_runs + address_lag(lags, conditions)
+        known = task_runs + address_lag(lags, conditions)
         runs.append((known, task_runs, came))
     runs.sort()
     free, change = 0.0, QUOTAS["route53"]

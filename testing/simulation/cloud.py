@@ -94,7 +94,6 @@ class Cloud:
         self.concurrency = concurrency
         self.dropped: Counter[str] = Counter()  # RecursiveInvocationsDropped, by function
         self.calls: Counter[str] = Counter()  # attempts by action, throttled ones included
-        self.lobby_calls: Counter[str] = Counter()  # the calls of S3 for lobbies, sessions and memberships
         self.throttled: Counter[str] = Counter()
         self.conflicts: Counter[str] = Counter()  # conditional writes that were refused, by key
         self.number = 0  # the number of the functions' calls so far

@@ -77,11 +77,9 @@ class SimulatedFunction:
         self._loops = loops
         self._clock, self._timeout = cloud.clock, timeout
         self._free: list[Container] = []
-        self.containers = 0
         self.invocations = 0
         self.crashed = 0  # invocations that ended by a crash or a timeout
         self.billed = 0.0
-        self.longest = 0.0  # seconds of the longest invocation
 
     def invoke(self, event: dict[str, Any], lineage: Lineage = NO_LINEAGE) -> Any:
         """Run the handler in the greenlet of the caller, and return its answer. A crash loses the container.
@@ -120,7 +118,6 @@ class SimulatedFunction:
             container = self._free.pop()
         else:
             container = Container(self._platform)
-            self.containers += 1
             self._clock.sleep(self._clock.random.uniform(*COLD))
         container.ends, container.lineage = self._clock.seconds + self._timeout, lineage
         me.owner = container
@@ -141,7 +138,6 @@ class SimulatedFunction:
             me.owner = before
             enter(before)
             self.billed += self._clock.seconds - begun
-            self.longest = max(self.longest, self._clock.seconds - begun)
 
 
 def enter(owner: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
 
@@ -46,7 +46,6 @@ class SimulatedVisit:
     waiting: float | None = None  # when they came to the game
     ready: float | None = None  # when their page first got the address of a server that it reached
     interruptions: int = 0  # servers that were lost while they played
-    waits_again: list[float] = field(default_factory=list)  # seconds from each such loss until they played again
     pages: int = 0  # pages that they requested, without polls
     unanswered: int = 0  # requested pages that did not come at the first try
     finished: float | None = None
@@ -64,7 +63,6 @@ class SimulatedParticipant:
         self.answered: list[str] = []  # the steps of which they were told that the answer is stored
         self._read, self._play, self._leaves_at = read, play, leaves_at
         self._first_ask = self._step_before_server()
-        self._lost: float | None = None  # when they lost the server, if they do not play again yet
         world.people += 1
         self._query = urlencode({"projectId": world.project.id, "userId": self.visit.user})
 
@@ -157,7 +155,7 @@ class SimulatedParticipant:
                     return True
                 if outcome == "lost":
                     self.visit.interruptions += 1
-                    since = self._lost = self.clock.seconds
+                    since = self.clock.seconds
             elif state.get("state") in ("failed", "ended"):
                 if self._is_over():
                     return True
@@ -191,9 +189,6 @@ class SimulatedParticipant:
         """Note that their page has reached a server."""
         if self.visit.ready is None:
             self.visit.ready = self.clock.seconds
-        if self._lost is not None:
-            self.visit.waits_again.append(self.clock.seconds - self._lost)
-            self._lost = None
 
     def _play_on(self, state: dict[str, Any]) -> str:
         """Connect and play. Return `done`, `lost` if the server was lost before the game was over, or `unreachable`."""

@@ -12,7 +12,6 @@ from typing import TypeVar
 
 from hippodrome.aws.dns import BATCH
 from hippodrome.aws.retry import retry_while_busy
-from hippodrome.lobby import decisions, entries
 from hippodrome.model import ids
 from hippodrome.ports import (
     Conflict,
@@ -33,7 +32,6 @@ from testing.simulation.tasks import SimTasks
 
 PAGE = 1000  # keys in one page of a listing: S3 API Reference, ListObjectsV2
 MAX_CHANGES = 1000  # changes of a zone in one call, an UPSERT counts twice: Route 53 Developer Guide, "Quotas"
-LOBBY = (entries.FOLDER, decisions.LOBBIES)  # the folders of the lobbies' entries and decisions
 T = TypeVar("T")
 
 
@@ -85,9 +83,6 @@ class SimDocuments:
         self._call("s3:DeleteObject", key, effect)
 
     def _call(self, action: str, key: str, effect: Callable[[], T]) -> T:
-        """Make a call, and count it in `lobby_calls` if it is about a lobby, a session or a membership."""
-        if key.startswith(LOBBY) or key.endswith("/session.json"):
-            self._cloud.lobby_calls[action] += 1
         return self._cloud.call(action, effect)
 
     def keep(self, key: str, body: bytes, etag: str | None = None) -> str:
@@ -125,7 +120,6 @@ class SimDns:
         self._in_sync: dict[str, float] = {}
         self._busy_until = 0.0
         self.strangers: dict[str, str] = {}  # records that belong to no server of ours
-        self.most_records = 0  # the most records at once
         self.spreads: dict[str, float] = {}  # by name: the seconds until its change was in sync
 
     def change(self, add: Sequence[DnsRecord] = (), remove: Sequence[DnsRecord] = ()) -> str:
@@ -185,7 +179,6 @@ class SimDns:
             if self.records.get(record.name) == record.host:
                 del self.records[record.name]
         self.records.update({record.name: record.host for record in add})
-        self.most_records = max(self.most_records, len(self.records))
         change = f"C{len(self._in_sync)}"
         chance = self._propagation if add else clock.random  # `aws_bound.py` draws the times of additions again
         spread = propagation(chance, self._conditions, clock.seed, clock.seconds)

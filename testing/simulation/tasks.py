@@ -58,7 +58,6 @@ class SimTasks:
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
         self.interfaces = 0  # network interfaces that exist now, each with an address of a subnet
-        self.most_interfaces = 0
         # Returns the id of the participant or formed session to whom a server belongs; empty until there is one.
         self.owner: Callable[[TimedTask], str] = lambda task: ""
 
@@ -147,7 +146,6 @@ class SimTasks:
         )
         self._by_name.setdefault(task.name, []).append(task)
         self.interfaces += 1
-        self.most_interfaces = max(self.most_interfaces, self.interfaces)
         if self.interfaces > ADDRESSES:
             self.end(task.arn, "TaskFailedToStart", "The subnet does not have enough free addresses.")
             return task

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.functions import CLIENTS
 from local.backend.platform import HANDLERS as QUEUES_AND_TIMERS
 from local.study import FUNCTIONS
 from testing import template as cfn
@@ -60,7 +59,6 @@ def test_a_function(name: str) -> None:
         assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
     assert REFUSALS.get(name), "tests/ministack/test_installation.py: nothing is said that it must not do"
     assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), "local/ has no such function, and AWS_ONLY does not say why"
-    assert name in CLIENTS, "bench/functions.py measures no cold start of it"
     assert name in rows("functions.md"), "docs/functions.md has no row for it"
     assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"
     written = ast.parse((ROOT / "lambdas" / f"{name}.py").read_text(encoding="utf-8"))
@@ -69,5 +67,5 @@ def test_a_function(name: str) -> None:
 
 
 def test_every_list_names_exactly_the_deployed_functions() -> None:
-    assert set(cfn.functions()) == set(CLIENTS) == rows("permissions.md") == set(HANDLERS)
+    assert set(cfn.functions()) == rows("permissions.md") == set(HANDLERS)
     assert set.union(*WHO_MAY.values()) <= set(HANDLERS)

@@ -20,7 +20,7 @@ class Encoder:
 
     With `lossy`, `encode` sends a JPEG unless a difference or a key frame takes no more bytes. Packing stops as soon as
     the result is larger than the last JPEG. Packing (by isal) is quick if the result is small: whenever it was smaller
-    than the JPEG, it took no longer either (`python -m bench trial` measures three kinds of picture). So the number of
+    than the JPEG, it took no longer either. So the number of
     bytes decides, and the same frames give the same bytes on every machine. A coding that was too large is tried again
     sixteen frames later.
 

@@ -17,7 +17,7 @@ def imported(program: str) -> set[str]:
 
 
 def test_the_process_that_listens_imports_neither_numpy_nor_gymnasium() -> None:
-    """Its memory is that of 500 idle connections (make bench)."""
+    """Its memory is that of idle connections."""
     found = imported("import trial.gym.__main__, trial.gym.server")
     assert "trial.gym.server" in found
     assert not found & {"numpy", "gymnasium", "PIL"}
