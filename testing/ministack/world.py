@@ -199,14 +199,6 @@ class MinistackWorld:
             )
         return self._clients[service, who]
 
-    def assume(self, role: str, session: str) -> dict[str, str]:
-        """Return credentials of a role, by its ARN or name.
-
-        Gap: on AWS only the service that a role trusts may assume it; here root may, too (`emulator.py`).
-        """
-        arn = role if role.startswith("arn:") else f"arn:aws:iam::{ACCOUNT}:role/{role}"
-        return dict(self.client("sts").assume_role(RoleArn=arn, RoleSessionName=session)["Credentials"])
-
     def user(self, name: str, policy: str) -> dict[str, str]:
         """Create an IAM user with this managed policy, and return its access key."""
         iam = self.client("iam")
@@ -345,11 +337,6 @@ class MinistackInstallation:
         body = json.loads(answer["Payload"].read())
         assert "FunctionError" not in answer, body
         return body
-
-    def role(self, name: str) -> str:
-        """Return the ARN of a function's role."""
-        found = self.world.client("lambda").get_function_configuration(FunctionName=self.function(name))
-        return str(found["Role"])
 
     # -- S3
 

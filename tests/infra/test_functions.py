@@ -12,7 +12,6 @@ from local.backend.platform import HANDLERS as QUEUES_AND_TIMERS
 from local.study import FUNCTIONS
 from testing import template as cfn
 from testing.iam.enforcement import WHO_MAY
-from tests.ministack.test_installation import REFUSALS
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = {"__init__", "installed", "queue", "web"}  # modules of lambdas/ that are no functions
@@ -57,7 +56,6 @@ def test_a_function(name: str) -> None:
     assert cfn.functions()[name] in watched, "no alarm watches its errors"
     if calls(one["Role"]["Fn::GetAtt"][0]):
         assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
-    assert REFUSALS.get(name), "tests/ministack/test_installation.py: nothing is said that it must not do"
     assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), "local/ has no such function, and AWS_ONLY does not say why"
     assert name in rows("functions.md"), "docs/functions.md has no row for it"
     assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"

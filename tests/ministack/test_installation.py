@@ -10,14 +10,12 @@ from __future__ import annotations
 import csv
 import json
 import time
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import botocore.exceptions
 import pytest
 
 from hippodrome.model import ids, server
@@ -29,7 +27,6 @@ from testing.ministack.world import (
     ACCOUNT,
     DOMAIN,
     FUNCTIONS,
-    REGION,
     CommandRun,
     MinistackInstallation,
     MinistackWorld,
@@ -64,7 +61,6 @@ OUTPUTS = [
     "TaskQueue",
     "TrialLogGroup",
 ]
-TRESPASSER = "trespasser"  # the session name of callers that are meant to be refused
 
 
 def label(user: str) -> str:
@@ -344,173 +340,6 @@ def test_dead_letters_and_errors_raise_alarms_that_are_delivered(installed: Mini
     world.client("sqs").delete_queue(QueueUrl=mailbox)
 
 
-# -- roles ------------------------------------------------------------------------------------------------------------
-
-Call = tuple[str, str, dict[str, Any]]  # service, operation, arguments
-
-
-def refused(installed: MinistackInstallation, role: str, call: Call) -> bool:
-    """Return whether a caller with this role is refused the call."""
-    service, operation, arguments = call
-    keys = installed.world.assume(role, TRESPASSER)
-    try:
-        getattr(installed.world.client(service, keys), operation)(**arguments)
-    except botocore.exceptions.ClientError as error:
-        code = error.response["Error"]["Code"]
-        assert code in {"AccessDenied", "AccessDeniedException", "AuthorizationError", "UnauthorizedOperation"}, code
-        return True
-    return False
-
-
-def calls(installed: MinistackInstallation) -> dict[str, Call]:
-    """Calls that some of the functions may make, and others not."""
-    out, bucket = installed.outputs, installed.bucket
-    network = {"subnets": out["Subnets"].split(","), "securityGroups": [out["SecurityGroup"]]}
-    run = {
-        "cluster": out["Cluster"],
-        "taskDefinition": f"{installed.stack}-{PROJECT}",
-        "networkConfiguration": {"awsvpcConfiguration": network},
-        "launchType": "FARGATE",
-        "startedBy": TRESPASSER,
-    }
-    record = {"Name": f"www.{DOMAIN}", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "198.51.100.9"}]}
-    change = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
-    schedule = {
-        "GroupName": out["ScheduleGroup"],
-        "Name": TRESPASSER,
-        "ScheduleExpression": "at(2040-01-01T00:00:00)",
-        "FlexibleTimeWindow": {"Mode": "OFF"},
-        "Target": {"Arn": out["StopServerTopic"], "RoleArn": out["ScheduleRole"], "Input": "{}"},
-    }
-    task = f"arn:aws:ecs:{installed.world.client('ecs').meta.region_name}:{ACCOUNT}:task/{out['Cluster']}/{'0' * 32}"
-    answer = f"{PROJECT}/users/R_mallory/answers/{uuid.uuid4()}.json"
-    return {
-        "run a server": ("ecs", "run_task", run),
-        "run it with another role": ("ecs", "run_task", {**run, "overrides": {"taskRoleArn": installed.role("sweep")}}),
-        "stop a server": ("ecs", "stop_task", {"cluster": out["Cluster"], "task": task}),
-        "name a server": ("route53", "change_resource_record_sets", {"HostedZoneId": installed.world.zone, "ChangeBatch": change}),
-        "set a timer": ("scheduler", "create_schedule", schedule),
-        "send a start message": ("sns", "publish", {"TopicArn": out["StartServerTopic"], "Message": "{}"}),
-        "send a stop message": ("sns", "publish", {"TopicArn": out["StopServerTopic"], "Message": "{}"}),
-        "write an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}", "IfNoneMatch": "*"}),
-        "write over an answer": ("s3", "put_object", {"Bucket": bucket, "Key": answer, "Body": b"{}"}),
-        "read an answer": ("s3", "get_object", {"Bucket": bucket, "Key": f"{PROJECT}/users/R_alice/answers/1.json"}),
-        "read the certificate's key": ("s3", "get_object", {"Bucket": bucket, "Key": "SSL/privkey.pem"}),
-        "read the projects' secrets": ("s3", "get_object", {"Bucket": bucket, "Key": "project_master_list.json"}),
-        "change the projects": ("s3", "put_object", {"Bucket": bucket, "Key": "project_master_list.json", "Body": b"{}"}),
-        "delete an answer": ("s3", "delete_object", {"Bucket": bucket, "Key": answer}),
-        "read another bucket": ("s3", "list_objects_v2", {"Bucket": code_bucket(installed.world)}),
-        "change a role": ("iam", "delete_role", {"RoleName": "hippodrome-anything"}),
-    }  # fmt: skip
-
-
-EVERYBODY = (
-    "write over an answer",
-    "delete an answer",
-    "read another bucket",
-    "change a role",
-    "run it with another role",
-)
-REFUSALS = {
-    "next_step": ["run a server", "stop a server", "name a server", "set a timer", "read the certificate's key",
-                  "change the projects"],
-    "send_start_server_message": ["run a server", "send a stop message", "write an answer", "set a timer"],
-    "send_stop_server_message": ["stop a server", "send a start message", "write an answer"],
-    "start_server": ["name a server", "change the projects", "write an answer", "read the certificate's key"],
-    "task_changed": ["run a server", "set a timer", "write an answer", "change the projects"],
-    "stop_server": ["run a server", "set a timer", "write an answer", "send a stop message"],
-    "sweep": ["run a server", "set a timer", "write an answer", "read the certificate's key"],
-    "update_project_master_list": ["run a server", "name a server", "send a stop message", "read the certificate's key"],
-    "renew_certificate": ["run a server", "read an answer", "write an answer", "read the projects' secrets"],
-    "sign_requests": ["run a server", "name a server", "send a start message", "change the projects",
-                      "read the projects' secrets"],
-    "TaskExecutionRole": ["run a server", "read an answer", "read the certificate's key"],
-    "ScheduleRole": ["send a start message", "read an answer"],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("who", REFUSALS)
-def test_each_role_refuses_calls_of_other_functions(installed: MinistackInstallation, people: People, who: str) -> None:
-    role = installed.outputs[who] if who in installed.outputs else installed.role(who)
-    known = calls(installed)
-    allowed = [what for what in (*REFUSALS[who], *EVERYBODY) if not refused(installed, role, known[what])]
-    assert allowed == []
-
-
-# What AWS's services do with our roles, of their own accord. Gap: ministack's services do not ask, so IAM is asked here.
-LAYERS = ["ecr:BatchGetImage", "ecr:GetDownloadUrlForLayer"]
-PUSH = ["ecr:InitiateLayerUpload", "ecr:UploadLayerPart", "ecr:CompleteLayerUpload", "ecr:PutImage"]
-SERVICES: list[tuple[str, list[str], str]] = [
-    *[(name, ["logs:CreateLogStream", "logs:PutLogEvents"], f"log:{name}") for name in FUNCTIONS],
-    *[
-        (name, ["sqs:ReceiveMessage", "sqs:DeleteMessage", "sqs:GetQueueAttributes"], f"queue:{name}")
-        for name in ("start_server", "stop_server", "task_changed")
-    ],
-    ("ScheduleRole", ["sns:Publish"], "StopServerTopic"),
-    ("TaskExecutionRole", ["ecr:GetAuthorizationToken"], "*"),
-    ("TaskExecutionRole", LAYERS, "repository"),
-    ("TaskExecutionRole", ["logs:CreateLogStream", "logs:PutLogEvents"], "log:trial"),
-    ("ImageBuilder", ["ecr:GetAuthorizationToken"], "*"),
-    ("ImageBuilder", [*LAYERS, *PUSH, "ecr:BatchCheckLayerAvailability"], "repository"),
-    ("ImageBuilder", ["s3:GetObject"], "bundle"),
-]
-
-
-@pytest.mark.parametrize(("who", "actions", "what"), SERVICES, ids=[f"{who}-{what}" for who, _, what in SERVICES])
-def test_services_of_aws_may_make_their_calls_with_our_roles(
-    installed: MinistackInstallation, who: str, actions: list[str], what: str
-) -> None:
-    iam, mine = installed.world.client("iam"), resource(installed, what)
-    asked = iam.simulate_principal_policy(
-        PolicySourceArn=role_of(installed, who), ActionNames=actions, ResourceArns=[mine]
-    )
-    assert {r["EvalActionName"]: r["EvalDecision"] for r in asked["EvaluationResults"]} == dict.fromkeys(
-        actions, "allowed"
-    )
-    if what == "*":
-        return
-    theirs = mine.replace(f"{installed.stack}-", "another-").replace(f"/{installed.stack}/", "/another/")
-    assert theirs != mine
-    asked = iam.simulate_principal_policy(
-        PolicySourceArn=role_of(installed, who), ActionNames=actions, ResourceArns=[theirs]
-    )
-    assert {r["EvalDecision"] for r in asked["EvaluationResults"]} == {"implicitDeny"}
-
-
-def role_of(installed: MinistackInstallation, who: str) -> str:
-    if who == "ImageBuilder":
-        names = [installed.outputs["ImageBuilder"]]
-        return str(installed.world.client("codebuild").batch_get_projects(names=names)["projects"][0]["serviceRole"])
-    return installed.outputs[who] if who in installed.outputs else installed.role(who)
-
-
-def resource(installed: MinistackInstallation, what: str) -> str:
-    """Return the ARN of a thing of the stack."""
-    kind, _, name = what.partition(":")
-    place = f"{REGION}:{ACCOUNT}"
-    if kind == "log":
-        return f"arn:aws:logs:{place}:log-group:/hippodrome/{installed.stack}/{name}:log-stream:2026/11/21/[$LATEST]0"
-    if kind == "queue":
-        return f"arn:aws:sqs:{place}:{installed.queue(name).rpartition('/')[2]}"
-    return {
-        "repository": f"arn:aws:ecr:{place}:repository/{installed.outputs['Repository'].partition('/')[2]}",
-        "bundle": f"arn:aws:s3:::{installed.bucket}/_builds/tiny.zip",
-        "*": "*",
-    }.get(what) or installed.outputs[what]
-
-
-def test_each_role_allows_its_own_calls(installed: MinistackInstallation, people: People) -> None:
-    """If every role refused every call, the refusals above would prove nothing."""
-    known = calls(installed)
-    assert not refused(installed, installed.role("next_step"), known["write an answer"])
-    assert not refused(installed, installed.role("next_step"), known["send a stop message"])
-    assert not refused(installed, installed.role("sign_requests"), calls(installed)["write an answer"])
-    assert not refused(installed, installed.outputs["ScheduleRole"], known["send a stop message"])
-    assert not refused(installed, installed.role("start_server"), known["set a timer"])
-    group = installed.outputs["ScheduleGroup"]
-    installed.world.client("scheduler").delete_schedule(GroupName=group, Name=TRESPASSER)
-
-
 # -- ready, done, stopped ---------------------------------------------------------------------------------------------
 
 
@@ -697,9 +526,15 @@ def test_the_sweep_removes_leftovers_of_ours_and_nothing_else(installed: Minista
     ]
     changes = {"Changes": [{"Action": "UPSERT", "ResourceRecordSet": one} for one in record]}
     world.client("route53").change_resource_record_sets(HostedZoneId=world.zone, ChangeBatch=changes)
-    _, _, run = calls(installed)["run a server"]
+    network = {"subnets": out["Subnets"].split(","), "securityGroups": [out["SecurityGroup"]]}
     for name in (ours, theirs):
-        world.client("ecs").run_task(**{**run, "startedBy": name})
+        world.client("ecs").run_task(
+            cluster=out["Cluster"],
+            taskDefinition=f"{installed.stack}-{PROJECT}",
+            networkConfiguration={"awsvpcConfiguration": network},
+            launchType="FARGATE",
+            startedBy=name,
+        )
     swept = installed.invoke("sweep", {})
     assert {what: n for what, n in swept.items() if n and what in {"tasks", "names", "failed"}} == {
         "tasks": 1,
@@ -733,8 +568,8 @@ def test_all_functions_ran_with_their_own_roles_without_a_refusal(
     made = {one["who"].rpartition("/")[2] for one in world.decisions(":assumed-role/")}
     worked = [name for name in FUNCTIONS if name != "renew_certificate"]  # it has no certificate authority here
     assert [name for name in worked if installed.function(name) not in made] == []
-    denied = [one for one in world.decisions(allowed=False) if not one["who"].endswith(f"/{TRESPASSER}")]
     # `logs` asks for a list that knows no resources, and does without it where it may not have it.
+    denied = world.decisions(allowed=False)
     assert [one for one in denied if one["action"] != "logs:DescribeLogGroups"] == []
 
 
@@ -837,9 +672,6 @@ def test_two_installations_work_side_by_side(world: MinistackWorld, installed: M
     assert second.outputs["Site"] == f"https://study.second.{DOMAIN}"
     assert second.bucket != installed.bucket
     assert MinistackInstallation(world).status == status
-    known = calls(installed)
-    theirs = world.client("lambda").get_function_configuration(FunctionName=second.function("start_server"))["Role"]
-    assert refused(installed, theirs, known["run a server"]), "a role of one stack has no say in the other"
     gone = world.deploy("destroy", "--data", "--yes", stack="second")
     assert gone.code == 0, gone.err
     assert world.inventory() == before
