@@ -1,13 +1,12 @@
 """Fills values into researchers' pages (`fragments.py`) in Jinja's sandbox. Jinja is imported once it is needed.
 
-The sandbox keeps pages from Python's internals. Between the pieces of a page it looks whether the page is too long or
-takes too long; what a single expression does is up to its author (docs/security.md).
+The sandbox keeps pages from Python's internals, and ends a page that is too long or whose loops are; what a single
+expression does is up to its author (docs/security.md).
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 LIMIT = 2_000_000  # characters of a rendered page
-SECONDS = 10.0  # for filling in a page
+ROUNDS = 100_000  # of all loops over range() in a page
 READING = frozenset({"copy", "get", "items", "keys", "values"})
 """The methods of Python's dictionaries that a page may call, unless the dictionary has a value of that name."""
 VALUES_READ = frozenset({"participant", "answers"})  # the values that cost reads of the participant's documents
@@ -76,24 +75,35 @@ def _answers(parsed: Any) -> set[str]:
 def render(text: str, values: Mapping[str, Any]) -> str:
     """Return the page with these values. Raises FragmentError."""
     parts: list[str] = []
-    length, until = 0, time.monotonic() + SECONDS
+    length = 0
     try:
-        for part in _compile(text).generate(values):
+        for part in _compile(text).generate({"range": _counted_range(), **values}):
             parts.append(part)
             length += len(part)
             if length > LIMIT:
                 raise FragmentError(
                     "the page is larger than 2 MB with its values filled in; look for a loop that repeats too much"
                 )
-            if time.monotonic() > until:
-                raise FragmentError(
-                    f"the page takes longer than {SECONDS:g} seconds; look for a loop that repeats too much"
-                )
     except FragmentError:
         raise
     except Exception as error:  # a template can fail in any way
         raise FragmentError(f"{type(error).__name__}: {error}", _line(error)) from error
     return "".join(parts)
+
+
+def _counted_range() -> Callable[..., range]:
+    """Return the function `range` of one page. A page that loops for hours would hold up everything else."""
+    left = ROUNDS
+
+    def counted(*bounds: int) -> range:
+        nonlocal left
+        numbers = range(*bounds)
+        left -= len(numbers)
+        if left < 0:
+            raise OverflowError(f"the page's loops over range() have more than {ROUNDS} rounds")
+        return numbers
+
+    return counted
 
 
 @lru_cache(maxsize=64)
