@@ -39,7 +39,6 @@ CREATE TABLE IF NOT EXISTS episodes (
   key TEXT NOT NULL, place INTEGER NOT NULL, document TEXT NOT NULL, PRIMARY KEY (key, place)) WITHOUT ROWID;
 """
 _LETTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # characters that are not mistaken for others
-_DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt") for n in range(1, 10))}
 
 
 class ExportedFile(NamedTuple):
@@ -170,13 +169,11 @@ class ExportState:
             return ExportedParticipant(user, number, folder, {})
 
     def _free_folder(self, number: str) -> str:
-        """A name for the participant's folder. Names that differ only by case are one folder on some systems, and
-        others reserve some names for devices."""
-        base = f"{number}~" if number.lower() in _DEVICES else number
-        name, count = base, 1
+        """A name for the participant's folder. Names that differ only by case are one folder on some systems."""
+        name, count = number, 1
         while self._db.execute("SELECT 1 FROM participants WHERE folder=?", (name,)).fetchone():
             count += 1
-            name = f"{base}~{count}"
+            name = f"{number}~{count}"
         return name
 
     def participants(self) -> Iterator[ExportedParticipant]:

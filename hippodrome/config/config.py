@@ -9,7 +9,7 @@ from typing import Any
 
 from hippodrome.config.diagnostics import Diagnostic
 from hippodrome.config.each_value import Checked
-from hippodrome.config.project_keys import AwsSetupKeys, EventsKeys, ProjectKeys, SslKeys
+from hippodrome.config.project_keys import AwsSetupKeys, EventsKeys, ProjectKeys
 from hippodrome.config.step_files import CLOSING
 from hippodrome.config.step_order import resolve_events, step_name
 from hippodrome.model.project import number_of_groups
@@ -65,11 +65,10 @@ class Config:
 
     def registration(self) -> dict[str, Any]:
         """Return the project's registration: JSON values by the keys of config.yml, with every default filled in."""
-        data = self.project.model_dump(mode="json", by_alias=True)
+        data = self.project.model_dump(mode="json", by_alias=True, exclude={"ssl"})
         return data | {
             "name": self.project.name or self.project.id,
-            "awsSetup": _complete(self.project.aws_setup, "cpu", "memory"),
-            "ssl": _complete(self.project.ssl, "sslBucket", "fullchain", "privkey"),
+            "awsSetup": _sized(self.project.aws_setup),
             "events": self.events.model_dump(by_alias=True),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
             "texts": self.project.own_texts,
@@ -114,9 +113,9 @@ class Config:
         return ", ".join(parts)
 
 
-def _complete(section: AwsSetupKeys | SslKeys, *needed: str) -> dict[str, Any] | None:
-    """The section if it has all of these keys, otherwise None."""
-    data = section.model_dump(by_alias=True)
-    if any(data[key] is None for key in needed):
+def _sized(setup: AwsSetupKeys) -> dict[str, Any] | None:
+    """The section if it has the servers' size, otherwise None."""
+    data = setup.model_dump(by_alias=True)
+    if setup.cpu is None or setup.memory is None:
         return None
     return {key: int(v) if isinstance(v, float) and v.is_integer() else v for key, v in data.items()}

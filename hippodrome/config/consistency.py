@@ -28,7 +28,6 @@ def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
     checks = (
         _missing,
         _aws,
-        _ssl,
         _step_numbers,
         _game_step,
         _event_steps,
@@ -119,16 +118,6 @@ def _aws(checked: Checked) -> Iterator[Mistake]:
     if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
         fitting = fargate.memory_choices(setup.cpu)
         yield Mistake((*path, "memory"), f"{setup.memory:g} GB do not go with cpu {setup.cpu:g}; choose {fitting}")
-
-
-def _ssl(checked: Checked) -> Iterator[Mistake]:
-    """With `useAWS: true`, `ssl` has all three keys or none."""
-    ssl = checked.project.ssl
-    if not checked.project.use_aws or not ssl.model_fields_set:
-        return
-    for key in ("sslBucket", "fullchain", "privkey"):
-        if not ssl.given(key) and checked.valid(("project", "ssl", key)):
-            yield Mistake(("project", "ssl", key), "missing; give sslBucket, fullchain and privkey, or none of them")
 
 
 def _keys_known(checked: Checked) -> bool:

@@ -24,7 +24,6 @@ SSL_NO_EFFECT = "no effect: servers get the certificate of the installation"
 """The remark on the section `ssl`."""
 
 _CPU, _MEMORY = 2, 10  # vCPUs and GB: the defaults of HIPPO's updateProject.py
-_SSL = ("sslBucket", "fullchain", "privkey")
 _SPELLINGS: dict[KeyPath, str] = {
     ("project", "step"): "steps",  # in HIPPO's documentation
     ("project", "team_members"): "teamMembers",  # in HIPPO's update_project_master_list
@@ -91,7 +90,6 @@ def adapt(document: Mapping[str, Any], name: str = "") -> Adapted:
         _steps,
         _stop_step,
         _size,
-        _certificate,
         _no_game,
         _controls,
         _actions,
@@ -271,17 +269,6 @@ def _flag(value: object) -> bool | None:
         return flag(value)
     except ValueError:
         return None
-
-
-def _certificate(adapted: Adapted) -> None:
-    """Removes an incomplete section `ssl`, which would have no effect."""
-    project, path = adapted.section(("project",)), ("project", "ssl")
-    ssl = project.get("ssl")
-    if not isinstance(ssl, dict) or not any(is_blank(ssl.get(key)) for key in _SSL):
-        return
-    del project["ssl"]
-    if any(not is_blank(value) for value in ssl.values()) and _flag(project.get("useAWS")):
-        adapted.remark(path, SSL_NO_EFFECT)
 
 
 # trial

@@ -38,9 +38,6 @@ _DOMAIN = re.compile(rf"({_LABEL}\.)+(?![0-9]+$){_LABEL}", re.IGNORECASE)
 _ORIGIN = re.compile(rf"https://(?P<host>(({_LABEL}\.)+(?![0-9]+(:|$)){_LABEL}|localhost))(:[0-9]{{1,5}})?")
 _HERE = re.compile(rf"http://(({_LABEL}\.)*localhost|127\.0\.0\.1)(:[0-9]{{1,5}})?")
 _REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
-_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
-_BUCKET_STARTS = ("xn--", "sthree-", "amzn-s3-demo-")
-_BUCKET_ENDS = ("-s3alias", "--ol-s3", ".mrap", "--x-s3", "--table-s3")
 _HEADER = re.compile(r"[a-z0-9-]{1,64}")
 _SECRET_HEADERS = ("authorization", "cookie", "proxy-authorization")
 _STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
@@ -72,23 +69,6 @@ def project_id(value: object) -> str:
     if found.startswith("_"):
         raise ValueError(f"must not begin with an underscore{hint}")
     raise ValueError(f"may hold only letters, digits, dashes and underscores, not {show(found)}{hint}")
-
-
-def bucket(value: object) -> str:
-    """Check the name of an S3 bucket. Raises ValueError."""
-    found = as_text(value, "the name of an S3 bucket")
-    if found.startswith(("s3://", "arn:", "http")) or "/" in found:
-        raise ValueError(f"must be the bucket's name alone, without s3:// or folders, not {show(found)}")
-    if found != found.lower() and _BUCKET.fullmatch(found.lower()):
-        raise ValueError(f"bucket names have small letters only; is it {show(found.lower())}?")
-    numeric = all(part.isdigit() for part in found.split(".")) and found.count(".") == 3
-    reserved = found.startswith(_BUCKET_STARTS) or found.endswith(_BUCKET_ENDS)
-    if not _BUCKET.fullmatch(found) or ".." in found or numeric or reserved:
-        raise ValueError(
-            "must be the name of an S3 bucket: 3 to 63 small letters, digits, dots and dashes, "
-            f"with a letter or digit at both ends, not {show(found)}"
-        )
-    return found
 
 
 def region(value: object) -> str:
@@ -138,16 +118,6 @@ def page_origin(value: object) -> str:
     if _HERE.fullmatch(found):
         return found.removesuffix(":80")
     return origin(value).removesuffix(":443")
-
-
-def object_key(value: object) -> str:
-    """Check the path of a file within a bucket."""
-    found = as_text(value, "the path of a file in the bucket, such as SSL/fullchain.pem")
-    if "://" in found or found.startswith("/"):
-        raise ValueError(f"must be the path within the bucket, such as SSL/fullchain.pem, not {show(found)}")
-    if len(found.encode()) > 1024 or ".." in found.split("/"):
-        raise ValueError("must be the path of a file in the bucket, such as SSL/fullchain.pem")
-    return found
 
 
 def step_key(value: object) -> str:
@@ -220,17 +190,15 @@ _MATCHING: dict[str, object] = {
 }
 _Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
 _Text = Annotated[str, Rule(values.text())]
-_Bucket = Annotated[str, Rule(bucket, {"type": "string", "pattern": "^[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]$"})]
 _Region = Annotated[str, Rule(region)]
-_ObjectKey = Annotated[str, Rule(object_key)]
 _StepName = Annotated[str, Rule(step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
 
 
 class AwsSetupKeys(Model):
     """The project's place on AWS, and the size of its servers."""
 
-    bucket: _Bucket | None = None
-    """S3 bucket that holds the project's pages and data. Default: the installation's."""
+    bucket: _Text | None = None
+    """HIPPO's name of the S3 bucket. No effect: pages and data lie in the installation's."""
     region: _Region | None = None
     """AWS region, such as ca-central-1. Default: the installation's."""
     root_domain: Annotated[str, Rule(domain)] | None = None
@@ -251,14 +219,14 @@ class EventsKeys(Model):
 
 
 class SslKeys(Model):
-    """HIPPO's section for the servers' certificate: three keys or none. It has no effect."""
+    """HIPPO's section for the servers' certificate. It has no effect."""
 
-    ssl_bucket: _Bucket | None = None
-    """S3 bucket that holds the certificate."""
-    fullchain: _ObjectKey | None = None
-    """Path of fullchain.pem within sslBucket."""
-    privkey: _ObjectKey | None = None
-    """Path of privkey.pem within sslBucket."""
+    ssl_bucket: _Text | None = None
+    """No effect."""
+    fullchain: _Text | None = None
+    """No effect."""
+    privkey: _Text | None = None
+    """No effect."""
 
 
 class ProjectKeys(Model):

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from hippodrome.config.config import Config
 from hippodrome.config.diagnostics import Mistake, Remark
 from hippodrome.config.each_value import Checked
-from hippodrome.config.english import is_not_english, words_of
 from hippodrome.config.project_keys import TEXTS
 from hippodrome.model.texts import ENGLISH, LANGUAGE, is_language, places, texts_of
 from protocol.values import KeyPath, show
@@ -17,6 +16,7 @@ _BRACES = re.compile(r"\{[^{}]*\}")
 _HTML = re.compile(r"</?[A-Za-z][^<>]*>|&(#[0-9]+|[A-Za-z]+);")
 _QUOTED = re.compile("[“„«].*[”“»]")
 _PAGE_LANGUAGE = re.compile(r"""<html\b[^>]*?\blang\s*=\s*["']?([A-Za-z0-9-]{2,35})""", re.IGNORECASE)
+_WORD = re.compile(r"[^\W\d_]+")
 _SHOWN = 3  # the most names of texts in a remark
 _SENTENCE = 3  # a text with at least so many words is not the same in two languages
 
@@ -52,28 +52,12 @@ def shown_as_they_are(config: Config) -> Iterator[Remark]:
 
 
 def left_in_english(config: Config) -> Iterator[Remark]:
-    """Yield a remark if a study in another language leaves texts of Hippodrome in English.
-
-    The study's `texts` or its pages may name its language. If neither names one, their words tell whether the
-    study is in English.
-    """
+    """Yield a remark if the study names another language, in `texts` or a page, and leaves texts in English."""
     own = config.project.own_texts
     pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
     languages = [found[1] for page in pages if (found := _PAGE_LANGUAGE.search(page))]
-    if not (languages or LANGUAGE in own) and (is_not_english(pages) or is_not_english(own.values())):
-        yield _unnamed(own)
-        return
     needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions)
     yield from _left(own, languages, needed)
-
-
-def _unnamed(own: Mapping[str, str]) -> Remark:
-    """The remark on a study that is not in English, and names no language."""
-    message = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are"
-    if own:
-        return Remark(TEXTS, f"{message}; give the language of these texts, such as language: fr")
-    how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
-    return Remark(TEXTS[:1], f"{message}; {how}")
 
 
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
@@ -94,7 +78,7 @@ def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str
 
 def _is_untouched(name: str, text: str) -> bool:
     """Whether a text was copied and not translated. Short texts, such as Pause, can be the same in both languages."""
-    return text == ENGLISH[name] and len(words_of(text)) >= _SENTENCE
+    return text == ENGLISH[name] and len(_WORD.findall(_BRACES.sub("", text))) >= _SENTENCE
 
 
 def _is_english(language: str) -> bool:

@@ -59,17 +59,6 @@ class AwsSetup(Record, frozen=True):
     memory: float = 2
 
 
-class Ssl(Record, frozen=True):
-    """HIPPO's section `ssl`: the bucket and the keys of a certificate.
-
-    It is stored and has no effect: servers get the installation's certificate.
-    """
-
-    ssl_bucket: str | None = None
-    fullchain: str | None = None
-    privkey: str | None = None
-
-
 class ForPlayers(Record, frozen=True):
     """The last registration for this number of players, before another number was registered.
 
@@ -99,7 +88,6 @@ class Project(Record, frozen=True):
     max_runtime: int = 60  # minutes
     use_a_w_s: bool = msgspec.field(default=False, name="useAWS")
     aws_setup: AwsSetup | None = None
-    ssl: Ssl | None = None
     events: Events = Events()
     cluster: str = "installation"
     subdomain: str = "hash"

@@ -11,7 +11,6 @@ FEEDBACK = "on_feedback"
 JOIN = "on_join"
 LEAVE = "on_leave"
 RETURN = "on_return"
-LOBBY_TIMEOUT = "on_lobby_timeout"
 NAMES = (
     SESSION_START,
     SESSION_END,
@@ -22,5 +21,4 @@ NAMES = (
     JOIN,
     LEAVE,
     RETURN,
-    LOBBY_TIMEOUT,
 )

@@ -146,8 +146,6 @@ def test_missing_sections_get_a_message(folder: Path) -> None:
         ("allowedHosts: [a.org]", "allowedHosts item 1: must begin with https://; write https://a.org"),
         ("allowedHosts: [https://a.org/x]", "allowedHosts item 1: must be the host only, without a path; write https://a.org"),
         ("allowedHosts: [https://a.org; script-src *]", 'allowedHosts item 1: must be an address such as https://example.org, without path and without *, not "https://a.org; script-src *"'),
-        ("awsSetup: {bucket: s3://lab}", 'awsSetup.bucket: must be the bucket\'s name alone, without s3:// or folders, not "s3://lab"'),
-        ("awsSetup: {bucket: Lab}", 'awsSetup.bucket: bucket names have small letters only; is it "lab"?'),
         ("awsSetup: {region: eu-west-1b}", "awsSetup.region: eu-west-1b is an availability zone; the region is eu-west-1"),
         ("awsSetup: {region: Ireland}", 'awsSetup.region: must be an AWS region such as ca-central-1, not "Ireland"'),
         ("awsSetup: {rootDomain: 'https://A.lab.org/x'}", "awsSetup.rootDomain: must be the domain name only, without https:// or a path; write a.lab.org"),
@@ -156,7 +154,6 @@ def test_missing_sections_get_a_message(folder: Path) -> None:
         ("awsSetup: {cpu: 3}", "awsSetup.cpu: must be a number of vCPUs: 0.25, 0.5, 1, 2, 4, 8 or 16, not 3"),
         ("awsSetup: {cpu: 1024}", "awsSetup.cpu: must be a number of vCPUs: 0.25, 0.5, 1, 2, 4, 8 or 16, not 1024 (1024 CPU units are 1 vCPU)"),
         ("awsSetup: {memory: 8192}", "awsSetup.memory: must be a number of GB from 0.5 to 120, not 8192 (8192 MB are 8 GB)"),
-        ("ssl: {sslBucket: lab, privkey: b.pem, fullchain: s3://lab/a.pem}", 'ssl.fullchain: must be the path within the bucket, such as SSL/fullchain.pem, not "s3://lab/a.pem"'),
         ("events: {startServerStep: first}", 'events.startServerStep: must be the number of a step or finalStep, not "first"'),
     ],
 )  # fmt: skip
@@ -228,13 +225,6 @@ def test_an_id_has_at_most_64_characters(folder: Path) -> None:
     assert read(folder, SMALL.replace("id: small", f"id: {'a' * 64}")).project.id == "a" * 64
     expected = "project.id: must be at most 64 characters long, not 65"
     assert only_mistake(folder, SMALL.replace("id: small", f"id: {'a' * 65}")) == expected
-
-
-@pytest.mark.parametrize(
-    "name", ["ab", "a" * 64, "-lab", "lab-", "a..b", "10.0.0.1", "xn--lab", "lab-s3alias", "la_b", "sthree-lab"]
-)
-def test_buckets_follow_the_rules_of_s3(folder: Path, name: str) -> None:
-    assert "must be the name of an S3 bucket" in only_mistake(folder, small(project=f"awsSetup: {{bucket: {name}}}\n"))
 
 
 # Values against each other

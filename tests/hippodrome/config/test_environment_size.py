@@ -36,7 +36,7 @@ def request_of(registration: dict[str, Any]) -> TaskRequest:
     project = from_json(
         to_json(
             {
-                **{key: registration[key] for key in ("maxRuntime", "events", "trial", "ssl")},
+                **{key: registration[key] for key in ("maxRuntime", "events", "trial")},
                 **{key: registration[key] for key in ("subdomain", "plainClients", "frontEnd")},
                 **kept,
                 "steps": steps,

@@ -96,7 +96,6 @@ def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
         "maxRuntime": 60,
         "useAWS": False,
         "awsSetup": None,
-        "ssl": None,
         "events": {"startServerStep": "2", "stopServerStep": "3"},
         "steps": [
             {"key": "1", "page": "consent", "variants": 0},
@@ -240,8 +239,8 @@ def test_a_ui_section_shows_only_what_it_names(folder: Path) -> None:
 
 
 def test_aws_keys_may_stay_incomplete_without_aws(folder: Path) -> None:
-    found = read(folder, small(project="awsSetup: {bucket: lab, memory: 30}\nssl: {fullchain: a.pem}\n"))
-    assert (found.registration()["awsSetup"], found.registration()["ssl"]) == (None, None)
+    found = read(folder, small(project="awsSetup: {bucket: lab, memory: 30}\n"))
+    assert found.registration()["awsSetup"] is None
 
 
 def test_anchors_are_understood(folder: Path) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from hippodrome.config import english, parse_registration, read_project
+from hippodrome.config import parse_registration, read_project
 from hippodrome.config.remarks import remarks_on
 from hippodrome.model.project import Project
 from hippodrome.model.texts import ENGLISH, texts_of
-from tests.hippodrome.config.folder import SMALL, mistakes, only_mistake, read, small
+from tests.hippodrome.config.folder import SMALL, only_mistake, read, small
 
 ROOT = Path(__file__).parents[3]
 GERMAN = (ROOT / "docs" / "texts.de.yml").read_text(encoding="utf-8")
@@ -157,91 +157,3 @@ def test_a_language_with_its_script_region_and_variant(folder: Path, language: s
     assert read(folder, with_lines_of_texts(SMALL, f"    language: {language}\n")).project.own_texts == {
         "language": language
     }
-
-
-FRENCH = (
-    "<h1>Souhaitez-vous participer ?</h1><p>Vous allez jouer à un petit jeu avec une autre personne. Cela dure environ "
-    "cinq minutes. Nous enregistrons vos réponses et vos actions dans le jeu, sans votre nom. Vous pouvez arrêter à tout "
-    "moment en fermant cette page.</p>{# the and you to #}<script>with the and you</script><p class='to you and the'>Merci beaucoup de votre "
-    "aide, et à bientôt !"
-)
-NOT_ENGLISH = "the study does not seem to be in English, but its pages tell browsers and screen readers that they are; "
-
-
-def remarks_on_language(folder: Path, config: str) -> list[str]:
-    """Return the remarks of this configuration that are about a missing language."""
-    found = [str(said) for said in remarks_on(folder, read(folder, config))]
-    return [said for said in found if NOT_ENGLISH in said]
-
-
-def test_a_study_in_another_language_that_does_not_name_it_gets_a_remark(folder: Path) -> None:
-    (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
-    how = "what Hippodrome says there is English, too; give the language and your own words in texts, see docs/texts.md"
-    assert remarks_on_language(folder, PAGES) == [f"config.yml:1: remark: project: {NOT_ENGLISH}{how}"]
-    how = "give the language of these texts, such as language: fr"
-    texts = with_lines_of_texts(PAGES, "    continue: Continuer\n")
-    assert remarks_on_language(folder, texts) == [f"config.yml:2: remark: project.texts: {NOT_ENGLISH}{how}"]
-    assert remarks_on_language(folder, with_lines_of_texts(PAGES, "    language: en\n")) == []
-    assert remarks_on_language(folder, with_lines_of_texts(PAGES, "    language: fr\n")) == []
-    (folder / "steps" / "thanks.html").write_text("<html lang=fr><p>Merci.", encoding="utf-8")
-    assert remarks_on_language(folder, PAGES) == []
-
-
-def test_texts_without_a_language_get_a_remark_whatever_the_pages_are(folder: Path) -> None:
-    texts = GERMAN[GERMAN.index("  texts:\n") :].replace("    language: de\n", "")
-    (said,) = remarks_on_language(folder, PAGES.replace("  id: small\n", f"  id: small\n{texts}"))
-    assert said.startswith("config.yml:3: remark: project.texts: ")
-    (folder / "steps" / "consent.html").write_text(FRENCH, encoding="utf-8")
-    (said,) = remarks_on_language(folder, PAGES.replace("  id: small\n", f"  id: small\n{ALL_ENGLISH}"))
-    assert said.endswith("; give the language of these texts, such as language: fr")
-
-
-STEPS = [ROOT / "steps", *sorted(ROOT.glob("examples/*/steps"))]
-
-
-@pytest.mark.parametrize("steps", STEPS, ids=lambda path: path.parent.name)
-def test_english_pages_are_clearly_recognized_as_english(steps: Path) -> None:
-    words = [word for file in steps.glob("*.html") for word in english.words_of(file.read_text(encoding="utf-8"))]
-    assert len(words) >= english.ENOUGH
-    assert english.share(words) > 1.5 * english.LEAST
-
-
-def test_texts_in_other_languages_are_clearly_recognized_as_not_english() -> None:
-    dutch = "Wilt u meedoen? U speelt een spel met een ander. Het is kort. We bewaren of u dat wilt uw antwoorden in de data."
-    for text in (FRENCH, GERMAN[GERMAN.index("language: de") :], dutch):
-        assert english.share(english.words_of(text)) < english.LEAST / 4
-    assert not english.is_not_english(["Zu wenig, als dass man es wissen kann."])
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("<b>Weiter</b>", "participants read <b> as it stands here: a text is no HTML"),
-        ("Weiter&nbsp;!", "participants read &nbsp; as it stands here: a text is no HTML"),
-        ("“Weiter”", 'participants read the quotation marks, too; YAML\'s own are "…", not “…”'),
-        ("« Weiter »", 'participants read the quotation marks, too; YAML\'s own are "…", not «…»'),
-        ("Wenn 1 < 2 & 3 > 2, „weiter“!", None),
-    ],
-)
-def test_characters_that_are_meant_for_a_program_get_a_remark(folder: Path, text: str, said: str | None) -> None:
-    found = [
-        str(each) for each in remarks_on(folder, read(folder, with_lines_of_texts(SMALL, f"    continue: '{text}'\n")))
-    ]
-    expected = [f"config.yml:3: remark: project.texts.continue: {said}"] if said else []
-    assert [each for each in found if "project.texts.continue" in each] == expected
-
-
-def test_texts_with_too_little_indentation_get_a_message_on_where_they_belong(folder: Path) -> None:
-    belongs = "unknown key; it belongs under project.texts (check the indentation)"
-    text = SMALL.replace("project:\n", "project:\n  texts:\n  language: de\n  waited: Gewartet\n", 1)
-    expected = [f"config.yml:3: project.language: {belongs}", f"config.yml:4: project.waited: {belongs}"]
-    assert mistakes(folder, text) == expected
-    assert only_mistake(folder, f"{SMALL}continue: Weiter\n") == f"continue: {belongs}"
-
-
-def test_a_study_needs_only_the_texts_that_its_participants_may_read() -> None:
-    pages = texts_of(has_game=False, has_sessions=False)
-    alone, together = texts_of(has_game=True, has_sessions=False), texts_of(has_game=True, has_sessions=True)
-    assert {"continue", "studyFull"} <= set(pages) < set(alone) < set(together) == ENGLISH.keys()
-    assert {"start", "saidGameFailed"} <= set(alone) - set(pages)
-    assert {"firstOf", "you", "saidPing"} <= set(together) - set(alone)

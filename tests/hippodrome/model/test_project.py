@@ -88,7 +88,6 @@ def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
         "max_runtime": 60,
         "use_a_w_s": False,
         "aws_setup": None,
-        "ssl": None,
         "events": Events(None, None),
         "cluster": "installation",
         "subdomain": "hash",
