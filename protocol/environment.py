@@ -24,7 +24,7 @@ STORE = "STORE"
 USER_ID = "USER_ID"
 GROUP = "GROUP"
 """The participant's group, a whole number; empty in a study without groups. The researcher's agent may read it."""
-WARM_SERVER = "SPARE"
+WARM_SERVER = "WARM_SERVER"
 """`on` for a warm server, which has no participant when it starts."""
 SESSION = "SESSION"
 """The session's id, if several participants play on this server. Such a server has no USER_ID and no GROUP: it reads
@@ -78,7 +78,7 @@ RECORDINGS_FIRST_SECONDS = "RECORDINGS_FIRST_SECONDS"
 """Seconds for which an answer waits at most until the recordings before it are stored; 120 by default."""
 LINGER_SECONDS = "LINGER_SECONDS"
 """Seconds from when the answer is stored until the process ends; 2 by default."""
-WARM_SERVER_SECONDS = "SPARE_SECONDS"
+ASSIGNMENT_SECONDS = "ASSIGNMENT_SECONDS"
 """Seconds after which a server without participants looks again for the document that names them (its handover, or its
 session's document); 20 by default."""
 

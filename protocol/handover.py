@@ -1,4 +1,4 @@
-"""The handover: `{projectId}/spares/{server name}.json` assigns a warm server to a participant.
+"""The handover: `{projectId}/handovers/{server name}.json` assigns a warm server to a participant.
 
     {"userId": "…", "group": 0 or null, "server": "…"}
 

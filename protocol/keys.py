@@ -80,7 +80,7 @@ def groups_key(project_id: str, question: str) -> str:
 
 def handovers_folder(project_id: str) -> str:
     """Return the folder of the handovers of a project's warm servers."""
-    return f"{project_id}/spares/"
+    return f"{project_id}/handovers/"
 
 
 def handover_key(project_id: str, server_name: str) -> str:

@@ -100,7 +100,7 @@ _KINDS = (
     (re.compile(r"[0-9a-f]{8}-[0-9a-f-]{27}\.\d"), "MESSAGE"),
     (re.compile(r"\.[0-9a-f]{16}\.new"), "NEW"),
     (re.compile(r"(?<=locks/)\d+"), "KEY"),
-    (re.compile(r"(?<=places/)\d+"), "PLACE"),
+    (re.compile(r"(?<=slots/)\d+"), "SHARD"),
 )
 
 

@@ -56,7 +56,7 @@ class Task:
     @property
     def is_warm_server(self) -> bool:
         """Whether it was started as a warm server, for no participant yet."""
-        return self.request.environment.get("SPARE") == "on"
+        return self.request.environment.get("WARM_SERVER") == "on"
 
     @property
     def alive(self) -> bool:

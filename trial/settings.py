@@ -168,7 +168,7 @@ class TrialSettings:
             linger_seconds=_number(env, variables.LINGER_SECONDS, 2.0),
             recordings_first_seconds=_number(env, variables.RECORDINGS_FIRST_SECONDS, 120.0),
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
-            warm_server_seconds=_number(env, variables.WARM_SERVER_SECONDS, 20.0),
+            warm_server_seconds=_number(env, variables.ASSIGNMENT_SECONDS, 20.0),
             plain_origins=frozenset() if warm_server or session else frozenset(origins),
             credential=_required(env, variables.CREDENTIAL) if "://" in store else "",
         )

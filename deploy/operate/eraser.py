@@ -77,7 +77,7 @@ class FoundOfParticipant:
 
     def counts(self) -> dict[str, int]:
         """Return how many documents and resources were found, by kind."""
-        counts = {"documents": self.documents, **self.resources.counts(), "places": self.slots}
+        counts = {"documents": self.documents, **self.resources.counts(), "slots": self.slots}
         counts["tasks"] += len(self.draining)
         if self.sessions:
             counts["sessions"] = len(self.sessions)

@@ -51,7 +51,7 @@ class FoundServers:
 
     def counts(self) -> dict[str, int]:
         """Return how many servers, resources and stopping tasks were found, by kind."""
-        return {"servers": len(self.servers), **self.leftovers.counts(), "leaving": len(self.draining)}
+        return {"servers": len(self.servers), **self.leftovers.counts(), "draining": len(self.draining)}
 
 
 class Stopper:

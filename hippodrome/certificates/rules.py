@@ -115,7 +115,7 @@ class FailedOrder(Record, frozen=True):
 
     at: UtcDatetime
     directory: str
-    reason: str = msgspec.field(name="trouble")
+    reason: str
     text: str = ""
     until: UtcDatetime | None = None
 

@@ -29,7 +29,7 @@ MIN_BILLED_SECONDS = 60  # the least that Fargate bills
 
 def participant_slots_folder(project_id: str) -> str:
     """Return the folder of the participants' slots."""
-    return f"{project_id}/places/"
+    return f"{project_id}/slots/"
 
 
 def participant_slots_key(project_id: str, shard: int) -> str:
@@ -37,7 +37,7 @@ def participant_slots_key(project_id: str, shard: int) -> str:
     return f"{participant_slots_folder(project_id)}{shard}.json"
 
 
-SERVER_SLOTS = "_places/"
+SERVER_SLOTS = "_slots/"
 """The folder of the slots of all projects' servers."""
 
 
@@ -47,7 +47,7 @@ def server_slots_key(project_id: str) -> str:
 
 
 class ParticipantSlots(Record, frozen=True):
-    """`{projectId}/places/{shard}.json`: the labels of participants who hold a slot, and the room for them.
+    """`{projectId}/slots/{shard}.json`: the labels of participants who hold a slot, and the room for them.
 
     A label is a hash of a participant's id (`ids.server_label`). `room` is how many participants may hold a slot in
     this shard. The rooms of all shards add up to the limit; a registration with another limit divides it anew. A shard
@@ -115,13 +115,13 @@ class ServerSlot(Record, frozen=True):
 
     attempt: int
     reserved: int = 0
-    is_warm_server: bool = msgspec.field(default=False, name="spare")
+    is_warm_server: bool = False
 
 
 class ServerSlots(Record, frozen=True):
-    """`_places/{projectId}.json`: the slots of servers, by label, and the seconds that ended servers have used."""
+    """`_slots/{projectId}.json`: the slots of servers, by label, and the seconds that ended servers have used."""
 
-    slots: Mapping[str, ServerSlot] = msgspec.field(default_factory=dict, name="held")
+    slots: Mapping[str, ServerSlot] = msgspec.field(default_factory=dict)
     used: int = 0  # the seconds of ended servers, added up
 
     @property

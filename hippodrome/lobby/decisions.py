@@ -21,13 +21,13 @@ LOBBIES = "_lobbies/"
 class OpenSession(Record, frozen=True):
     """A session without members, whose server was started ahead.
 
-    `asked`: when its server was requested. `by`: the label of the participant for whom it was requested; "" if the
+    `requested`: when its server was requested. `by`: the label of the participant for whom it was requested; "" if the
     sweep requested it, or the participant is erased. `players`: for how many participants it is; its server runs the
     registration for that number. 0 in documents of earlier versions.
     """
 
     id: str
-    asked: datetime
+    requested: datetime
     by: str = ""
     players: int = 0
 
@@ -37,7 +37,7 @@ class OpenSession(Record, frozen=True):
         It may until `open_for` after its server was requested. A session of an earlier version, which does not name its
         number of players, fits any number.
         """
-        return now - self.asked < open_for and self.players in (0, players)
+        return now - self.requested < open_for and self.players in (0, players)
 
 
 class Proposal(Record, frozen=True):
@@ -185,4 +185,4 @@ def next_version(before: Decisions, after: Decisions) -> Decisions:
 
 def by_age(sessions: Iterable[OpenSession]) -> tuple[OpenSession, ...]:
     """Return these open sessions in the order in which their servers were requested. The first is used first."""
-    return tuple(sorted(sessions, key=lambda each: (each.asked, each.id)))
+    return tuple(sorted(sessions, key=lambda each: (each.requested, each.id)))

@@ -81,8 +81,8 @@ class Repair:
             self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, session_id)))
         waits_for = (each.waits_for for each in after.formed if each.waits_for)
         for each in [*after.open, *waits_for]:
-            is_new = each.by == "" and each.asked == run.now
-            is_lost = each.id in servers and servers[each.id] is None and run.now - each.asked > NO_RECORD_AFTER
+            is_new = each.by == "" and each.requested == run.now
+            is_lost = each.id in servers and servers[each.id] is None and run.now - each.requested > NO_RECORD_AFTER
             if is_new or is_lost:
                 self._store.start_server(project, each.id, each.players)
         formed = tuple(each for each in after.for_good().formed if each not in known.formed)

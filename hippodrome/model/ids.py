@@ -39,7 +39,7 @@ def is_user_id(text: object) -> bool:
 
 def warm_id(project_id: str, asked: datetime, number: int) -> str:
     """Return the user id in the record of this warm server. It is no valid participant's id, so no link can name it."""
-    return "~" + hashlib.sha256(f"spare\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
+    return "~" + hashlib.sha256(f"warm\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_warm_id(text: object) -> bool:

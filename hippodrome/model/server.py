@@ -6,7 +6,7 @@ server that ended by itself (`servers/termination.py`).
 
 A *warm server* is started ahead of its participant (`warmServers`), under a warm id. When it is ready, it is either
 assigned to a participant, whose record then owns its resources (the warm server's own record is closed with the reason
-`taken`), or it is drained (`leaving`) and can no longer be assigned. One compare-and-swap decides between the two.
+`assigned`), or it is drained (`draining`) and can no longer be assigned. One compare-and-swap decides between the two.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ServerState(StrEnum):
     STARTING = "starting"
     NAMING = "naming"
     READY = "ready"
-    DRAINING = "leaving"  # a warm server that can no longer be assigned
+    DRAINING = "draining"  # a warm server that can no longer be assigned
     CLOSED = "closed"
 
 
@@ -53,7 +53,7 @@ class Reason(StrEnum):
     REFUSED = "refused"  # AWS refuses to run it as it is configured
     NO_CAPACITY = "no capacity"
     FULL = "full"  # the project's limits left no slot: it was never started
-    ASSIGNED = "taken"  # a warm server whose resources a participant's record owns now
+    ASSIGNED = "assigned"  # a warm server whose resources a participant's record owns now
 
 
 CANNOT_START = ("cannot begin", "ended at once", "never ready", "no port")
@@ -78,7 +78,7 @@ class PastAttempt(Record, frozen=True):
     spot: bool = True
     reason: Reason | None = None
     cause: str = ""
-    warm_server_name: str | None = msgspec.field(default=None, name="spare")
+    warm_server_name: str | None = None
     nonce: str = ""
     game_steps: tuple[str, ...] = ()
 
@@ -110,8 +110,8 @@ class Server(Record, frozen=True):
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
     counted: bool = False  # whether it holds one of its project's slots until it is closed
-    warm_server_name: str | None = msgspec.field(default=None, name="spare")  # the name of its assigned warm server
-    assigned_to: str | None = msgspec.field(default=None, name="takenBy")
+    warm_server_name: str | None = None  # the name of its assigned warm server
+    assigned_to: str | None = None
     """For a warm server: the label of the record that owns its resources now."""
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # the steps whose answers it may store: the project's when it was started

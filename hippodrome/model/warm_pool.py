@@ -13,7 +13,7 @@ from hippodrome.model.project import Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Settings
 
-POOLS = "_spares/"
+POOLS = "_warm/"
 MAX_WAIT = timedelta(hours=12)  # after this time a warm server is replaced
 COUNTED_WAIT = timedelta(hours=1)  # the same with maxServerHours, from which the waiting time is reserved
 MIN_LONGEST_WAIT = timedelta(minutes=10)  # if warm servers can only wait for a shorter time, none is started
@@ -43,15 +43,15 @@ class WarmServer(Record, frozen=True):
     """A warm server in the pool. `version` is the project's when the server was requested."""
 
     version: str
-    requested: datetime = msgspec.field(name="asked")
+    requested: datetime
     ready: bool = False
 
 
 class Pool(Record, frozen=True):
-    """`_spares/{projectId}.json`: warm servers that wait or start, by warm id; `made` counts all ever requested."""
+    """`_warm/{projectId}.json`: warm servers that wait or start, by warm id; `total` counts all ever requested."""
 
-    warm_servers: Mapping[str, WarmServer] = msgspec.field(default_factory=dict, name="spares")
-    made: int = 0
+    warm_servers: Mapping[str, WarmServer] = msgspec.field(default_factory=dict)
+    total: int = 0
 
     def first(self, version: str) -> str | None:
         """Return the id of the oldest warm server that is ready and of this version; None if there is none."""
@@ -104,12 +104,12 @@ class Pool(Record, frozen=True):
 
     def with_new(self, project: Project, count: int, now: datetime) -> Pool:
         """Return the pool with `count` new warm servers, which are to be started."""
-        made = self.made + max(0, count)
-        new = {ids.warm_id(project.id, now, n): WarmServer(project.version, now) for n in range(self.made, made)}
-        return Pool({**self.warm_servers, **new}, made)
+        total = self.total + max(0, count)
+        new = {ids.warm_id(project.id, now, n): WarmServer(project.version, now) for n in range(self.total, total)}
+        return Pool({**self.warm_servers, **new}, total)
 
     def _with(self, warm_servers: Mapping[str, WarmServer]) -> Pool:
-        return Pool(warm_servers, self.made)
+        return Pool(warm_servers, self.total)
 
 
 def target_size(project: Project | None, settings: Settings, waiting: int, room: int | None) -> int:

@@ -135,7 +135,7 @@ class ActivityLog:
         found, together, record = _PERSON.fullmatch(key), _SESSION.fullmatch(key), _json(body)
         if key.startswith("_servers/"):
             folder = folder_of(str(record.get("projectId")), str(record.get("userId")))
-            self._reserved(str(record.get("spare")), folder)
+            self._reserved(str(record.get("warmServerName")), folder)
             self._catch_up(folder)
             self._server(record)
         elif found and found[2] == "participant":
@@ -207,7 +207,7 @@ class ActivityLog:
             self._show_held(user_id)
             if user_id in self._failing:
                 return  # it listens, but no game will begin on it
-            which = "has a warm server" if record.get("spare") else "server ready"
+            which = "has a warm server" if record.get("warmServerName") else "server ready"
             # A server's name may be a participant's id, so it is not shown.
             where = "its name, port " if self.named else f"ws://{record.get('host')}:"
             self.participant(user_id, f"{which} at {where}{record.get('port')}")
@@ -227,7 +227,7 @@ class ActivityLog:
             self.say(f"a warm server {'starts' if state == 'starting' else 'is ready'}")
         elif state == "closed" and reason == "full":
             self.say("no slot for another warm server just now: maxServers or maxServerHours is reached")
-        elif state == "closed" and reason != "taken":
+        elif state == "closed" and reason != "assigned":
             text = f"a warm server is gone ({_REASONS.get(reason, reason)})"
             (self.say if reason in ("stopped", "deadline") else self.warn)(text)
 

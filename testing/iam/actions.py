@@ -75,7 +75,7 @@ def about_key(key: str) -> str:
         return f"lobby/{parts[2]}"
     if len(parts) == 2 and key.endswith(".html"):
         return "steps"  # a page that HIPPO's script uploaded
-    return parts[1] if len(parts) > 2 and parts[1] in ("steps", "places", "spares") else parts[0]
+    return parts[1] if len(parts) > 2 and parts[1] in ("steps", "slots", "handovers") else parts[0]
 
 
 def _object(action: str, params: Params, context: Mapping[str, Any] | None = None) -> Ask:

@@ -74,7 +74,7 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:GetObject trials": {SIGN},
     "s3:PutObject trials": {SIGN},
     "s3:GetObject SSL": {SIGN, RENEW},
-    "s3:GetObject spares": {SIGN},
+    "s3:GetObject handovers": {SIGN},
     # Sessions: a lobby's entries and its decisions, and the documents of sessions and of their members, which are written
     # once. start_server and stop_server note whether a participant is under way; the sweep finishes decisions that were
     # interrupted. A lost server is replaced unless all members have played; the relays look up a participant's session.
@@ -107,16 +107,16 @@ WHO_MAY: dict[str, set[str]] = {
     # Slots of projects with limits. next_step takes a slot for a new participant, and registering counts the
     # participants who came before the limit; a function that starts a server takes a slot, and one that ends a server
     # releases it.
-    "s3:GetObject places": {NEXT, REGISTER},
-    "s3:PutObject places": {NEXT, REGISTER},
-    "s3:GetObject _places": {START, TASK, STOP, SWEEP},
-    "s3:PutObject _places": {START, TASK, STOP, SWEEP},
-    # Warm servers: the pools (_spares), and the handover of each assigned server. The function that ends the server
+    "s3:GetObject slots": {NEXT, REGISTER},
+    "s3:PutObject slots": {NEXT, REGISTER},
+    "s3:GetObject _slots": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _slots": {START, TASK, STOP, SWEEP},
+    # Warm servers: the pools (_warm), and the handover of each assigned server. The function that ends the server
     # deletes its handover.
-    "s3:GetObject _spares": {START, TASK, STOP, SWEEP},
-    "s3:PutObject _spares": {START, TASK, STOP, SWEEP},
-    "s3:PutObject spares": {START},
-    "s3:DeleteObject spares": {START, TASK, STOP, SWEEP},
+    "s3:GetObject _warm": {START, TASK, STOP, SWEEP},
+    "s3:PutObject _warm": {START, TASK, STOP, SWEEP},
+    "s3:PutObject handovers": {START},
+    "s3:DeleteObject handovers": {START, TASK, STOP, SWEEP},
     # A step or a relay requests a server; a function that finds a lost server requests the next attempt. Registering, and
     # assigning or ending a warm server, request that the pool is adjusted, which may stop servers. The sweep stops
     # servers by messages, and sends the messages of servers that make no progress again.

@@ -184,9 +184,11 @@ class SimulatedWorld:
             "names": len(self.platform.dns.records) - len(self.platform.dns.strangers),
             "timers": len(self.platform.timers.due),
             "places": sum(
-                len(json.loads(kept[key][0]).get("held", ())) for key in kept if key.startswith(SERVER_SLOTS)
+                len(json.loads(kept[key][0]).get("slots", ())) for key in kept if key.startswith(SERVER_SLOTS)
             ),
-            "waiting": sum(len(json.loads(kept[key][0]).get("spares", ())) for key in kept if key.startswith(POOLS)),
+            "waiting": sum(
+                len(json.loads(kept[key][0]).get("warmServers", ())) for key in kept if key.startswith(POOLS)
+            ),
             "lobby": len(lobby.left_over(kept, self.project)),
             "handovers": sum(key.startswith(handovers_folder(self.project.id)) for key in kept),
             "open records": sum(record["state"] != "closed" for record in records),

@@ -144,11 +144,11 @@ def test_a_pair_is_handed_a_warm_server() -> None:
         states = meet(*pair)
         assert [state["state"] for state in states] == ["ready", "ready"]
         session = session_of(study, pair[0])
-        name = study.record(session)["spare"]
-        assert study.stored(f"{PROJECT}/spares/{name}.json")["userId"] == session
+        name = study.record(session)["warmServerName"]
+        assert study.stored(f"{PROJECT}/handovers/{name}.json")["userId"] == session
         play_together(study, *pair)
         study.deliver()
-        assert study.stored(f"{PROJECT}/spares/{name}.json") is None
+        assert study.stored(f"{PROJECT}/handovers/{name}.json") is None
 
 
 def test_a_server_ahead_is_stopped_if_its_participant_gives_up(study: StudyOnMoto) -> None:

@@ -148,7 +148,7 @@ def test_a_page_that_does_not_render_affects_no_other_project(platform: FakePlat
     assert page(platform, "alice", "other")[0] == 200
 
 
-@pytest.mark.parametrize("document", ["_places/maze.json", "_spares/maze.json", "maze/places/0.json"])
+@pytest.mark.parametrize("document", ["_slots/maze.json", "_warm/maze.json", "maze/slots/0.json"])
 def test_unreadable_slots_of_one_project_do_not_affect_another(platform: FakePlatform, document: str) -> None:
     limited = study(max_servers=2, max_participants=16, warm_servers=1)
     other = study(id="other", max_servers=2)

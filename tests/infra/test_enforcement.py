@@ -74,7 +74,7 @@ def served(world: MotoWorld, user: str, *wishes: tuple[str, str]) -> None:
     """
     label = ids.server_label(PROJECT, user)
     record = json.loads(world.client("s3").get_object(Bucket=world.env["BUCKET"], Key=server.key(label))["Body"].read())
-    name = record.get("spare") or ids.server_name(label, record["attempt"])
+    name = record.get("warmServerName") or ids.server_name(label, record["attempt"])
     task = next(world.task(arn) for arn in world.task_arns() if world.task(arn).started_by == name)
     told = {one["name"]: one["value"] for one in task.overrides["containerOverrides"][0]["environment"]}
     places = {"folder": f"{PROJECT}/users/{user}", "label": label, "attempt": record["attempt"], "name": name}
@@ -209,17 +209,17 @@ def limited(world: MotoWorld) -> None:
     study.deliver()
     study.lose(study.living()[0])
     study.deliver()
-    kept = world.platform.documents.get(f"_places/{PROJECT}.json")
+    kept = world.platform.documents.get(f"_slots/{PROJECT}.json")
     assert kept is not None
     places = json.loads(kept.body)
-    places["held"]["saaaaaaaaaaaaaaaaaaaa"] = {"attempt": 1}
-    study.put(f"_places/{PROJECT}.json", json.dumps(places).encode())
+    places["slots"]["saaaaaaaaaaaaaaaaaaaa"] = {"attempt": 1}
+    study.put(f"_slots/{PROJECT}.json", json.dumps(places).encode())
     assert sweep.handler({}, None)["slots"] == 1
     alice.play()
     alice.answer(fun="5")
     study.settle()
-    assert study.stored(f"_places/{PROJECT}.json")["used"] > 0
-    assert "held" not in study.stored(f"_places/{PROJECT}.json")
+    assert study.stored(f"_slots/{PROJECT}.json")["used"] > 0
+    assert "slots" not in study.stored(f"_slots/{PROJECT}.json")
 
 
 def waiting(world: MotoWorld) -> None:
@@ -230,12 +230,12 @@ def waiting(world: MotoWorld) -> None:
     alice.to_the_game()
     study.deliver()
     assert alice.poll()["state"] == "ready"
-    served(world, alice.user, ("GET", f"{PROJECT}/spares/{{name}}.json"), ("PUT", f"{{folder}}/answers/{GAME}.json"))
-    first = study.record(alice.user)["spare"]
+    served(world, alice.user, ("GET", f"{PROJECT}/handovers/{{name}}.json"), ("PUT", f"{{folder}}/answers/{GAME}.json"))
+    first = study.record(alice.user)["warmServerName"]
     study.lose(study.record(alice.user)["task"])
     study.deliver()
     assert alice.poll()["state"] == "ready"
-    assert study.record(alice.user)["spare"] != first
+    assert study.record(alice.user)["warmServerName"] != first
     alice.play()
     alice.answer(fun="5")
     study.deliver()
@@ -246,7 +246,7 @@ def waiting(world: MotoWorld) -> None:
 
     bob.to_the_game()
     study.deliver("start")
-    study.put(f"{PROJECT}/spares/{first}.json", b"{}")  # of a server that has ended
+    study.put(f"{PROJECT}/handovers/{first}.json", b"{}")  # of a server that has ended
     assert sweep.handler({}, None)["handovers"] == 1
     study.deliver()
     bob.play()
@@ -254,7 +254,7 @@ def waiting(world: MotoWorld) -> None:
     study.deliver()
     StudyOnMoto(world, warmServers=1, live=False)
     study.settle()
-    assert study.stored(f"_spares/{PROJECT}.json").get("spares", {}) == {}
+    assert study.stored(f"_warm/{PROJECT}.json").get("warmServers", {}) == {}
 
 
 def together(world: MotoWorld) -> None:
@@ -542,11 +542,11 @@ def test_a_participant_with_the_id_lobby_is_a_participant(judge: Judge, key: str
     assert judge.who_may(Ask("s3:PutObject", theirs, {"s3:if-none-match": "*"})) == alices
 
 
-def test_places_are_written_only_with_if_match_or_if_none_match(judge: Judge) -> None:
+def test_slots_are_written_only_with_if_match_or_if_none_match(judge: Judge) -> None:
     theirs = {
-        f"{PROJECT}/places/3.json": {"next_step", "update_project_master_list"},
-        f"_places/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
-        f"_spares/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
+        f"{PROJECT}/slots/3.json": {"next_step", "update_project_master_list"},
+        f"_slots/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
+        f"_warm/{PROJECT}.json": {"start_server", "task_changed", "stop_server", "sweep"},
     }
     for key, who in theirs.items():
         for context in ({"s3:if-none-match": "*"}, {"s3:if-match": '"e"'}):
@@ -583,11 +583,11 @@ BUILDERS = [
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/privkey.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/fullchain.pem", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/trials/a.jsonl.gz", {}),
-                ("s3:GetObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {}),
+                ("s3:GetObject", f"{BUCKET}/p/handovers/sabcdefghijklmnopqrst-1.json", {}),
                 *(
                     ("s3:PutObject", f"{BUCKET}/{project}/users/{user}/{name}", {"s3:if-none-match": "*"})
-                    for project in ("p", "places", "spares", "steps", "SSL-study")
-                    for user in ("u", "users", "places", "spares", "steps", "lobby", "_places")
+                    for project in ("p", "slots", "handovers", "steps", "SSL-study")
+                    for user in ("u", "users", "slots", "handovers", "steps", "lobby", "_slots")
                     for name in ("answers/3.json", "trials/a-0001.jsonl.gz")
                 ),
             ],
@@ -596,7 +596,7 @@ BUILDERS = [
                 ("s3:PutObject", f"{BUCKET}/_servers/s.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/_secret.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/SSL/privkey.pem", {"s3:if-none-match": "*"}),
-                ("s3:PutObject", f"{BUCKET}/p/spares/sabcdefghijklmnopqrst-1.json", {"s3:if-none-match": "*"}),
+                ("s3:PutObject", f"{BUCKET}/p/handovers/sabcdefghijklmnopqrst-1.json", {"s3:if-none-match": "*"}),
                 ("s3:GetObject", f"{BUCKET}/project_master_list.json", {}),
                 ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
                 ("s3:DeleteObject", f"{BUCKET}/p/users/u/answers/3.json", {}),
@@ -607,16 +607,16 @@ BUILDERS = [
                 *(
                     ("s3:PutObject", f"{BUCKET}/{folder}/users/x/{name}", {"s3:if-none-match": "*"})
                     for folder in (
-                        "_places", "_servers", "_spares", "_builds", "_", "_places/p/q", "SSL", "SSL/a",
-                        "p/places", "p/places/a", "p/spares", "p/spares/sabcdefghijklmnopqrst-1.json", "p/steps", "p/steps/a/b",
+                        "_slots", "_servers", "_warm", "_builds", "_", "_slots/p/q", "SSL", "SSL/a",
+                        "p/slots", "p/slots/a", "p/handovers", "p/handovers/sabcdefghijklmnopqrst-1.json", "p/steps", "p/steps/a/b",
                     )
                     for name in ("answers/y.json", "trials/y.json")
                 ),
-                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_places", "_spares", "_lobby", "_lobbies")),
+                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_slots", "_warm", "_lobby", "_lobbies")),
                 ("s3:PutObject", f"{BUCKET}/p/sessions/s.1/session.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/_match/p/waiting.json", {"s3:if-none-match": "*"}),
-                *(("s3:PutObject", f"{BUCKET}/{folder}/lobby/groups/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/places", "p/spares")),
-                *(("s3:PutObject", f"{BUCKET}/{folder}/sessions/s.1/trials/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/places", "p/spares")),
+                *(("s3:PutObject", f"{BUCKET}/{folder}/lobby/groups/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/slots", "p/handovers")),
+                *(("s3:PutObject", f"{BUCKET}/{folder}/sessions/s.1/trials/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/slots", "p/handovers")),
                 ("ecs:StopTask", "arn:aws:ecs:us-east-1:123456789012:task/hippodrome/1", {}),
             ],
         ),

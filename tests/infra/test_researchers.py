@@ -174,8 +174,8 @@ SECRET_KEYS = (
     "SSL/privkey.pem",
     "SSL/servers.example.org/privkey.pem",
     "SSL/account.json",
-    "_places/p.json",
-    "_spares/p.json",
+    "_slots/p.json",
+    "_warm/p.json",
 )
 CLUSTER = {"ecs:cluster": f"arn:aws:ecs:{HERE}:cluster/hippodrome"}
 TASK = f"arn:aws:ecs:{HERE}:task/hippodrome/0123456789abcdef"
@@ -269,8 +269,8 @@ def test_the_policy_allows_no_other_way_to_a_secret(judge: Judge) -> None:
         "p/users/steps/participant.json",
         "p/users/u/trials/steps/3-trial.jsonl.gz",
         "_servers/steps/x.json",
-        "_places/steps/x.json",
-        "_spares/steps/x.json",
+        "_slots/steps/x.json",
+        "_warm/steps/x.json",
         "SSL/steps/x.pem",
     ],
 )

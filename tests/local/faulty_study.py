@@ -214,7 +214,7 @@ class FaultyStudy:
 
     def servers(self, page: dict[str, Any]) -> list[Any]:
         record = self.record()
-        name = record.get("spare") or f"{self.label()}-{page['attempt']}"
+        name = record.get("warmServerName") or f"{self.label()}-{page['attempt']}"
         return [p for p in marked(self.state).get(name, ()) if "quick_trial.py" in " ".join(p.cmdline()[:8])]
 
     def label(self) -> str:

@@ -20,7 +20,7 @@ def whose() -> tuple[str, str]:
         return told["USER_ID"], told["SERVER"]
     import json
 
-    with open(f"{told['STORE']}/{project}/spares/{told['SERVER']}.json") as document:
+    with open(f"{told['STORE']}/{project}/handovers/{told['SERVER']}.json") as document:
         given = json.load(document)
     return given["userId"], given["server"]
 

@@ -93,7 +93,14 @@ def test_a_game_on_a_warm_server_that_ended_before_the_next_look_is_printed(tmp_
     warm = TaskRecord("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
     given = replace(warm, folder=folder_of("study", "P1"))
     answer(tmp_path, "P1", "1")
-    record = {"projectId": "study", "userId": "P1", "attempt": 1, "state": "starting", "nonce": "n", "spare": "warm-1"}
+    record = {
+        "projectId": "study",
+        "userId": "P1",
+        "attempt": 1,
+        "state": "starting",
+        "nonce": "n",
+        "warmServerName": "warm-1",
+    }
     log._look(cast(ProcessTasks, Running(warm)), tmp_path)
     log.wrote("_servers/s.json", json.dumps(record).encode())
     log._look(cast(ProcessTasks, Running(warm)), tmp_path)  # its document does not exist yet

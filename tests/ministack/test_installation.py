@@ -426,18 +426,18 @@ def test_a_participant_gets_a_warm_server_and_none_is_left_at_the_end(
     keep_warm(installed, 1)
     (name, task) = until(lambda: [*installed.tasks().items()], "a server is started for nobody")[0]
     environment = {e["name"]: e["value"] for e in task["overrides"]["containerOverrides"][0]["environment"]}
-    assert environment["SPARE"] == "on"
+    assert environment["WARM_SERVER"] == "on"
     assert "USER_ID" not in environment
     installed.runs(task)
-    pool = f"_spares/{PROJECT}.json"
-    until(lambda: all(s.get("ready") for s in installed.stored(pool)["spares"].values()), "its name is known", 75)
+    pool = f"_warm/{PROJECT}.json"
+    until(lambda: all(s.get("ready") for s in installed.stored(pool)["warmServers"].values()), "its name is known", 75)
 
     dave = Person(people.alice.browser, "R_dave")
     dave.to_the_game()
     told = until(lambda: dave.is_told("ready"), "dave has it at once")
     assert told["url"] == f"wss://{name}.servers.{DOMAIN}:443/"
     assert told["token"] == environment["TOKEN"]
-    handover = f"{PROJECT}/spares/{name}.json"
+    handover = f"{PROJECT}/handovers/{name}.json"
     trial = Trial(dave.browser, task)
     learnt = trial.does("GET", handover).json()
     assert (learnt["userId"], learnt["server"]) == (dave.user, server_of(dave.user))
@@ -453,7 +453,7 @@ def test_a_participant_gets_a_warm_server_and_none_is_left_at_the_end(
     assert (installed.tasks(), installed.names()) == ({}, {})
     until(lambda: name not in installed.timers(), "the timer goes last")
     assert installed.stored(handover) is None
-    assert "spares" not in installed.stored(pool)
+    assert "warmServers" not in installed.stored(pool)
 
 
 def test_a_pair_has_one_server_and_each_member_an_answer(installed: MinistackInstallation, people: People) -> None:

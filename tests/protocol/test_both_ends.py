@@ -153,7 +153,7 @@ def test_a_warm_server_reads_the_handover_that_was_written_for_it() -> None:
         written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
         assert parse(written.to_json()) == written
     env = {"PROJECT_ID": "maze", "SERVER": "s-1", "TOKEN": "t", "GAME_STEPS": "3", "STORE": "x", "TLS": "off"}
-    waiting = TrialSettings.from_env({**env, "SPARE": "on", "TRIAL": "{}"})
+    waiting = TrialSettings.from_env({**env, "WARM_SERVER": "on", "TRIAL": "{}"})
     own = assignment.with_handover(waiting, parse(Handover("P1", 3, "a-2").to_json()))
     assert own == TrialSettings.from_env({**env, "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2", "TRIAL": "{}"})
 

@@ -45,7 +45,7 @@ WEB = {
 SECRETS = (hostile.study().secret, hostile.token(VICTIM), VICTIM)
 WRITTEN = re.compile(
     rf"{PROJECT}/users/[A-Za-z0-9_-]{{1,64}}/(participant|answers/(1|2|4|finalStep))\.json"
-    rf"|_servers/s[a-z2-7]{{20}}\.json|{PROJECT}/places/[0-9]+\.json|_places/{PROJECT}\.json"
+    rf"|_servers/s[a-z2-7]{{20}}\.json|{PROJECT}/slots/[0-9]+\.json|_slots/{PROJECT}\.json"
 )
 
 texts = st.sampled_from(TEXTS) | st.text(max_size=30)

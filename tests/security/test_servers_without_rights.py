@@ -143,7 +143,7 @@ class Site(StrictS3):
             "maze/users/alice/answers/3.json", "other/users/mallory/answers/3.json", "maze/users/mallory/answers/4.json",
             "maze/users/mallory/participant.json", f"maze/users/alice/trials/{self.alice.name}/3-episode-0001.jsonl.gz",
             f"maze/users/mallory/trials/{self.alice.name}/3-trial.jsonl.gz", "maze/steps/debrief.html",
-            "_places/users/x/answers/3.json", "_places/maze.json", "_spares/maze.json", "SSL/account.json", "invented",
+            "_slots/users/x/answers/3.json", "_slots/maze.json", "_warm/maze.json", "SSL/account.json", "invented",
             "maze/users/mallory/answers/../../alice/answers/3.json", "maze/users/mallory/answers/3.json/../1.json",
         ]  # fmt: skip
         kept = [key for key in self.before if key not in ("SSL/privkey.pem", "SSL/fullchain.pem")]

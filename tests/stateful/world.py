@@ -209,12 +209,12 @@ class World:
             "places": [
                 self.who(label)
                 for key in account.kept
-                if key.startswith("_places/")
-                for label in json.loads(account.kept[key][0]).get("held", {})
+                if key.startswith("_slots/")
+                for label in json.loads(account.kept[key][0]).get("slots", {})
             ],
             "open records": [self.who(record.name) for record in self.records() if not record.is_closed],
             "handovers": [self.who(name) for name in self.handovers()],
-            "spares": [self._whose(id) for id in self.pool().warm_servers],
+            "warm servers": [self._whose(id) for id in self.pool().warm_servers],
             "dead letters": [str(message) for message in self.dead if not self._hopeless(message)],
         }
 

@@ -65,7 +65,7 @@ def put(store: Path, key: str, body: bytes) -> None:
 
 def launch_session(launch: Any, *, trial: dict[str, Any] | None = None, agent: str | None = None, **env: str) -> Any:
     """Start the server of the session. `form` writes the session's document."""
-    told = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60", **env}
+    told = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "ASSIGNMENT_SECONDS": "60", **env}
     return launch(agent=agent or two_players(), trial={**TRIAL, **(trial or {})}, **told)
 
 

@@ -35,7 +35,7 @@ from trial.server import assignment, handshake
 from trial.server.server import TrialServer
 from trial.settings import SettingsError, TrialSettings
 
-WARM = {"SESSION": "", "SPARE": "on", "SERVER": "warm-1"}
+WARM = {"SESSION": "", "WARM_SERVER": "on", "SERVER": "warm-1"}
 
 
 # ---- before the session is formed
@@ -59,7 +59,7 @@ async def test_a_member_who_comes_at_once_is_let_in_as_soon_as_the_session_is_fo
 
 
 def test_the_server_looks_for_the_session_by_itself(launch):
-    server = launch_formed(launch, SPARE_SECONDS="0.1")
+    server = launch_formed(launch, ASSIGNMENT_SECONDS="0.1")
     until(lambda: "the members of the session are known now: 2 of 2" in server.log_text())
 
 
@@ -71,7 +71,7 @@ def test_a_server_whose_session_is_not_formed_waits_until_its_deadline(launch):
 
 
 def test_a_session_whose_members_never_come_ends_the_server(launch):
-    server = launch_formed(launch, SPARE_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
+    server = launch_formed(launch, ASSIGNMENT_SECONDS="0.1", IDLE_SECONDS="1", GRACE_SECONDS="1")
     assert server.wait() == 0
     assert "ending: idle" in server.log_text()
 
@@ -193,7 +193,7 @@ async def test_a_warm_server_that_is_handed_to_a_session_plays_that_session(laun
 
 
 async def test_a_warm_server_that_is_handed_to_a_participant_takes_no_member_token(launch, open_client):
-    server = launch(trial={}, **{**WARM, "SESSION": "", "SPARE_SECONDS": "60", "USER_ID": ""})
+    server = launch(trial={}, **{**WARM, "SESSION": "", "ASSIGNMENT_SECONDS": "60", "USER_ID": ""})
     await refused(server, open_client, 1013, **hello_of("P1"))
     put(server.store, handover_key("study", "warm-1"), Handover("P1", None, "a-1").to_json())
     await refused(server, open_client, **hello_of("P1"))

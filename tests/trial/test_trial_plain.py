@@ -344,7 +344,7 @@ def test_a_warm_server_lets_no_page_in_without_the_token():
         "PLAIN_ORIGINS": HERE,
     }
     assert TrialSettings.from_env({**env, "USER_ID": "b"}).plain_origins == {HERE}
-    assert TrialSettings.from_env({**env, "SPARE": "on"}).plain_origins == frozenset()
+    assert TrialSettings.from_env({**env, "WARM_SERVER": "on"}).plain_origins == frozenset()
 
 
 async def test_a_refused_page_shows_the_sentence_and_stays_connected(launch):

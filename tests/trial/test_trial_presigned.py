@@ -36,19 +36,19 @@ class Town(StrictS3):
 
     def start(self, user=USER, attempt=1, before=None, **change):
         """Write the record of a server that starts; return its environment variables."""
-        made = self._new(user, attempt, token=f"token-{user}-{attempt}", nonce=f"nonce-{attempt}")
+        made = self._new(user, attempt, nonce=f"nonce-{attempt}")
         return self.keep(server.replacing(before, made) if before else made, **change)
 
-    def start_warm(self, token):
+    def start_warm(self):
         """Write the record of a warm server, which is ready."""
         owner = "~" + "0" * 20
-        return self.keep(server.ready(self._new(owner, token=token, nonce="n"), self.now()))
+        return self.keep(server.ready(self._new(owner, nonce="n"), self.now()))
 
     def hand_over(self, warm, user):
         """Assign the warm server to the participant or session, as `start_server` does; the server's new name."""
         label = ids.server_label("study", user)
         self.keep(server.handed_over(warm, label, self.now()))
-        mine = server.reserving(self._new(user, token="t", nonce="m"), warm)
+        mine = server.reserving(self._new(user, nonce="m"), warm)
         self.keep(server.assigned(mine, warm, self.now()))
         own = ids.server_name(label, 1)
         with self.lock:
@@ -177,8 +177,10 @@ async def test_the_answer_of_a_game_that_ended_before_the_stop_message_is_stored
 
 
 async def test_a_warm_server_learns_its_participant_and_stores_in_their_folder(town, launch, open_client):
-    warm_server = town.start_warm("the-secret-token")
-    running = launch(trial={"ui": UI}, SPARE="on", USER_ID="", SPARE_SECONDS="0.2", **town.variables(warm_server))
+    warm_server = town.start_warm()
+    running = launch(
+        trial={"ui": UI}, WARM_SERVER="on", USER_ID="", ASSIGNMENT_SECONDS="0.2", **town.variables(warm_server)
+    )
     time.sleep(0.5)
     own = town.hand_over(warm_server, USER)
     await play_game(running, open_client)
@@ -308,7 +310,7 @@ def test_a_presigned_request_is_used_again_until_it_is_refused(town):
     """A document that is read every two seconds is not signed every two seconds."""
     project = study(id="study", players=2, matching="match")
     record = town.keep(
-        server.new_attempt(project, "s." + "0" * 20, 1, token="t", nonce="n", settings=town.settings, now=town.now())
+        server.new_attempt(project, "s." + "0" * 20, 1, nonce="n", settings=town.settings, now=town.now())
     )
     store, key = town.store(record), waiting_key("study")
     assert [store.look(key), store.look(key)] == [None, None]

@@ -66,8 +66,8 @@ async def test_a_session_is_stored_by_presigned_requests_alone_and_goes_on_on_th
 
 
 async def test_a_warm_server_that_a_session_gets_stores_what_the_session_leaves(town, launch, open_client):
-    warm = town.start_warm(TOKEN)
-    told = {"SPARE": "on", "SESSION": "", "SPARE_SECONDS": "0.2"}
+    warm = town.start_warm()
+    told = {"WARM_SERVER": "on", "SESSION": "", "ASSIGNMENT_SECONDS": "0.2"}
     running = launch_session(launch, **{**town.variables(warm), **told})
     own = town.hand_over(warm, SID)
     form(town)

@@ -46,7 +46,7 @@ def launch_warm_server(launch):
     """Start a warm server: without USER_ID and GROUP."""
 
     def start(agent=None, trial=None, **env):
-        told = {"SPARE": "on", "SERVER": WARM_SERVER, "USER_ID": "", "SPARE_SECONDS": "60", **env}
+        told = {"WARM_SERVER": "on", "SERVER": WARM_SERVER, "USER_ID": "", "ASSIGNMENT_SECONDS": "60", **env}
         return launch(trial={"ui": UI, **(trial or {})}, **({} if agent is None else {"agent": agent}), **told)
 
     return start
@@ -59,7 +59,7 @@ def hand_over(server, user_id="P1", group=None, own=OWN, warm_server=WARM_SERVER
 
 
 def write_handover(server, body, warm_server=WARM_SERVER):
-    path = server.store / f"study/spares/{warm_server}.json"
+    path = server.store / f"study/handovers/{warm_server}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".new")
     unfinished.write_bytes(body)
@@ -230,7 +230,7 @@ async def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_l
     async def hand_over(settings, given):
         given_to.append(given)
 
-    search = assignment.Search(store, TrialSettings.from_env({**ENV, "SPARE_SECONDS": "60"}))
+    search = assignment.Search(store, TrialSettings.from_env({**ENV, "ASSIGNMENT_SECONDS": "60"}))
     searching = asyncio.create_task(search.run(hand_over))
     async with asyncio.timeout(PATIENCE):
         await until_async(lambda: store.looks)
@@ -248,7 +248,7 @@ async def test_a_client_that_asks_during_a_look_waits_for_the_next_one_if_that_l
 
 
 def test_the_idle_time_begins_at_the_handover(launch_warm_server):
-    server = launch_warm_server(IDLE_SECONDS="2", SPARE_SECONDS="0.1")
+    server = launch_warm_server(IDLE_SECONDS="2", ASSIGNMENT_SECONDS="0.1")
     time.sleep(2.5)
     assert server.process.poll() is None
     given_at = time.monotonic()
@@ -282,7 +282,7 @@ async def test_a_study_without_groups_has_an_empty_one(launch_warm_server, open_
 
 
 async def test_a_server_that_is_no_warm_server_does_not_look(launch, open_client):
-    server = launch(SPARE="off", SERVER=WARM_SERVER)
+    server = launch(WARM_SERVER="off", SERVER=WARM_SERVER)
     hand_over(server, user_id="P2")
     await refused(server, open_client, 4401, userId="P2")
 
@@ -362,7 +362,7 @@ def test_a_warm_server_reads_the_handover_that_the_control_plane_writes():
     for group in (None, 0, 3):
         written = Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2").to_json()
         assert handover.parse(written) == Handover("P1", group, "saaaaaaaaaaaaaaaaaaaa-2")
-    assert handover_key("study", WARM_SERVER) == f"study/spares/{WARM_SERVER}.json"
+    assert handover_key("study", WARM_SERVER) == f"study/handovers/{WARM_SERVER}.json"
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -398,8 +398,8 @@ async def test_a_half_written_document_is_looked_at_again(launch_warm_server, op
 
 
 async def test_the_server_asks_a_store_that_fails_again(launch_warm_server, open_client):
-    server = launch_warm_server(SPARE_SECONDS="0.1")
-    blocked = server.store / "study/spares"
+    server = launch_warm_server(ASSIGNMENT_SECONDS="0.1")
+    blocked = server.store / "study/handovers"
     blocked.parent.mkdir(parents=True)
     blocked.write_text("a file where a folder must be")
     await refused(server, open_client, 1013)
@@ -414,7 +414,7 @@ async def test_the_server_asks_a_store_that_fails_again(launch_warm_server, open
 
 async def test_clients_do_not_wait_long_for_a_store_that_hangs(launch_warm_server, open_client):
     server = launch_warm_server(HELLO_SECONDS="3")
-    path = server.store / f"study/spares/{WARM_SERVER}.json"
+    path = server.store / f"study/handovers/{WARM_SERVER}.json"
     path.parent.mkdir(parents=True)
     os.mkfifo(path)  # a process that opens it waits for one that writes
     try:
@@ -439,7 +439,7 @@ ENV = {
     "STORE": "x",
     "TLS": "off",
     "TRIAL": "{}",
-    "SPARE": "on",
+    "WARM_SERVER": "on",
 }
 
 
@@ -452,11 +452,13 @@ def test_a_warm_server_needs_no_participant_and_ignores_one_in_its_variables():
 
 def test_after_the_handover_a_warm_server_has_the_settings_of_an_ordinary_one():
     settings = assignment.with_handover(TrialSettings.from_env(ENV), Handover("P1", 3, "a-2"))
-    ordinary = {**ENV, "SPARE": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
+    ordinary = {**ENV, "WARM_SERVER": "off", "USER_ID": "P1", "GROUP": "3", "SERVER": "a-2"}
     assert settings == TrialSettings.from_env(ordinary)
 
 
-@pytest.mark.parametrize("change", [{"SPARE": "yes"}, {"SPARE": "off"}, {"SPARE": ""}, {"SERVER": ""}])
+@pytest.mark.parametrize(
+    "change", [{"WARM_SERVER": "yes"}, {"WARM_SERVER": "off"}, {"WARM_SERVER": ""}, {"SERVER": ""}]
+)
 def test_without_a_participant_only_a_warm_server_can_start(change):
     with pytest.raises(SettingsError):
         TrialSettings.from_env({**ENV, **change})

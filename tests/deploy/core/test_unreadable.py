@@ -134,7 +134,7 @@ def test_doctor_counts_unreadable_records_of_participants(world: Installed, acco
 
 @pytest.mark.parametrize(
     ("key", "mark"),
-    [("_places/maze.json", Mark.BAD), ("maze/places/3.json", Mark.BAD), ("_spares/maze.json", Mark.LOOK)],
+    [("_slots/maze.json", Mark.BAD), ("maze/slots/3.json", Mark.BAD), ("_warm/maze.json", Mark.LOOK)],
 )
 def test_doctor_names_unreadable_places_and_pools(world: Installed, account: Account, key: str, mark: Mark) -> None:
     world.register(study(max_servers=4, max_participants=16, warm_servers=1))
@@ -207,11 +207,11 @@ def test_erase_names_unreadable_documents_and_goes_on(
     add_broken_entry(world)
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)
-    world.put("maze/places/3.json", b"[")
+    world.put("maze/slots/3.json", b"[")
     ran = world.run(capsys, "erase", USER, "--project", "maze", "--yes")
     assert ran.code == Exit.DONE, ran.err
     assert not [key for key in world.keys("maze/users/") if USER in key]
-    assert "maze/places/3.json cannot be read" in " ".join(ran.err.split())
+    assert "maze/slots/3.json cannot be read" in " ".join(ran.err.split())
 
 
 @pytest.mark.parametrize(("project", "warned"), [("maze", False), ("broken", True)])

@@ -619,7 +619,7 @@ def test_a_rehearsal_says_that_it_got_a_warm_server(world: Installed) -> None:
     assert found[0].text.startswith("A warm server of ms-pacman, on Spot: ")
     assert name not in [task.name for task in world.platform.tasks.list()]
     assert not any("rehearsal" in key for key in world.keys("ms-pacman/"))
-    assert world.keys("ms-pacman/spares/") == []
+    assert world.keys("ms-pacman/handovers/") == []
 
 
 def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_a_session(world: Installed) -> None:

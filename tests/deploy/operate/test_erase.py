@@ -487,7 +487,7 @@ def test_the_warm_server_of_the_participant_is_erased_too(world: Installed, caps
     (waiting,) = world.warm(WARM, 1)
     world.participant(ANN, answered=1)
     label, kept = hers.rpartition("-")[0], others.rpartition("-")[0]
-    about = [f"maze/spares/{hers}.json", f"_servers/{label}.json"]
+    about = [f"maze/handovers/{hers}.json", f"_servers/{label}.json"]
     assert ANN.encode() in world.get(about[0])
     assert ids.server_label("maze", ANN).encode() in world.get(about[1])
     ran = run(world, capsys, "--receipt", "receipt.json")
@@ -495,11 +495,11 @@ def test_the_warm_server_of_the_participant_is_erased_too(world: Installed, caps
     left = versions(world)
     assert not [key for key in left if key in about]
     assert traces(world, ANN) == []
-    assert {f"maze/spares/{others}.json", f"_servers/{kept}.json"} <= set(left)
+    assert {f"maze/handovers/{others}.json", f"_servers/{kept}.json"} <= set(left)
     assert {task.name for task in world.platform.tasks.list()} == {others, waiting}
     receipt = Path("receipt.json").read_text()
     assert label not in receipt
-    assert json.loads(receipt)["projects"][0]["keys"]["maze/spares/{server}.json"] == 2  # and a delete marker
+    assert json.loads(receipt)["projects"][0]["keys"]["maze/handovers/{server}.json"] == 2  # and a delete marker
 
 
 def test_warm_servers_of_earlier_attempts_are_erased_too(world: Installed, capsys: Any) -> None:
@@ -518,7 +518,7 @@ def test_warm_servers_of_earlier_attempts_are_erased_too(world: Installed, capsy
     assert not [key for key in versions(world) if first.rpartition("-")[0] in key]
 
 
-@pytest.mark.parametrize("refused", ["maze/spares/", "_servers/"])
+@pytest.mark.parametrize("refused", ["maze/handovers/", "_servers/"])
 def test_the_record_that_names_a_warm_server_is_erased_last(
     world: Installed, capsys: Any, monkeypatch: Any, refused: str
 ) -> None:

@@ -77,7 +77,7 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(ma
     machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
     gone = Unmatched(LABEL, ANN, datetime.now(UTC))
     machine.put(decisions.key("maze"), to_json(Decisions(1, unmatched=(gone,))))
-    machine.put("maze/places/0.json", to_json(ParticipantSlots((LABEL, "sother"), 3)))
+    machine.put("maze/slots/0.json", to_json(ParticipantSlots((LABEL, "sother"), 3)))
     theirs = {key: body for key, body in machine.contents().items() if key.startswith(f"maze/users/{BOB}/")}
     ran = machine.erase("--yes")
     assert ran.code == Exit.DONE, ran.err
@@ -86,7 +86,7 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(ma
     assert theirs.items() <= after.items()
     assert said(BOB).encode() in after[recording_key()]
     assert [each.user_id for each in parse(after[session_key("maze", SID)]).members] == ["", BOB]
-    assert from_json(after["maze/places/0.json"], ParticipantSlots) == ParticipantSlots(("sother",), 3)
+    assert from_json(after["maze/slots/0.json"], ParticipantSlots) == ParticipantSlots(("sother",), 3)
     assert from_json(after[decisions.key("maze")], Decisions).unmatched == ()
     assert not (machine.data / "maze/users" / ANN).exists()
     again = machine.erase("--yes")

@@ -151,7 +151,7 @@ def test_warm_servers_are_stopped_too_and_stop_says_that_a_live_study_gets_new_o
     assert "3 servers were stopped; nothing is left" in ran.err
     assert "maze will have warm ones again within five minutes; `register --no-live` closes it" in ran.err
     assert (running_servers(world), world.records(), world.timers(), dict(pool(world).warm_servers)) == ([], {}, {}, {})
-    assert world.keys("maze/spares/") == []
+    assert world.keys("maze/handovers/") == []
     assert reasons(world, "maze", "alice") == {Reason.STOPPED}
 
 

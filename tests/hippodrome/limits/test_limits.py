@@ -49,7 +49,7 @@ def claimed(project: Project, user: str, attempt: int = 1) -> Server:
 
 
 def server_slots(platform: FakePlatform) -> ServerSlots:
-    found = platform.documents.kept.get("_places/maze.json")
+    found = platform.documents.kept.get("_slots/maze.json")
     return from_json(found[0], ServerSlots) if found else ServerSlots()
 
 
@@ -58,7 +58,7 @@ def labels_with_slots(platform: FakePlatform) -> list[str]:
     return [
         label
         for key in kept
-        if key.startswith("maze/places/")
+        if key.startswith("maze/slots/")
         for label in from_json(kept[key][0], ParticipantSlots).labels
     ]
 
@@ -299,7 +299,7 @@ def test_the_sweep_frees_a_slot_only_if_its_server_is_known_to_be_gone(monkeypat
     platform.documents.delete(server.key(ids.server_label("maze", "alice")))  # erased
     assert Sweep(platform).run().slots == 1
     assert server_slots(platform) == ServerSlots(used=1800)  # the time that it used is not known
-    platform.documents.put("_places/other.json", b"what is this")
+    platform.documents.put("_slots/other.json", b"what is this")
     Sweep(platform).run()
 
 
@@ -367,7 +367,7 @@ def test_the_slots_of_many_servers_are_given_back_with_one_write() -> None:
     replace = platform.documents.replace
     platform.documents.replace = lambda key, body, etag: writes.append(key) or replace(key, body, etag)  # type: ignore
     Servers(platform).stop([StopServer("maze", user) for user in USERS[:20]])
-    assert writes.count("_places/maze.json") == 1
+    assert writes.count("_slots/maze.json") == 1
     assert set(platform.documents.kept) == set(before)
     assert server_slots(platform).slots == {}
 
@@ -407,7 +407,7 @@ def test_without_limits_no_document_of_slots_is_read_or_written() -> None:
     Servers(platform).start(StartServer("maze", "alice", 2))
     Servers(platform).stop([StopServer("maze", "alice")])
     Sweep(platform).run()
-    assert not [key for key in touched if "places" in key]
+    assert not [key for key in touched if "slots" in key]
 
 
 # At the same time
@@ -437,11 +437,11 @@ def test_a_crowd_gets_exactly_as_many_slots_as_there_are(documents: Documents) -
     records = [claimed(project, user) for user in USERS[:16]]
     assert sum(at_once([lambda r=r: Slots(platform).acquire(project, r) for r in records])) == 7
     # While they leave, others come: every place is taken again, until the hours are used up.
-    held = from_json(documents.get("_places/maze.json").body, ServerSlots).slots  # type: ignore[union-attr]
+    held = from_json(documents.get("_slots/maze.json").body, ServerSlots).slots  # type: ignore[union-attr]
     leaving = [r for r in records if r.label in held]
     acts: list[Callable[[], bool]] = [lambda r=r: _leave(platform, r) for r in leaving]
     at_once([*acts, *[lambda r=r: Slots(platform).acquire(project, r) for r in records if r not in leaving]])
-    after = from_json(documents.get("_places/maze.json").body, ServerSlots)  # type: ignore[union-attr]
+    after = from_json(documents.get("_slots/maze.json").body, ServerSlots)  # type: ignore[union-attr]
     assert len(after.slots) <= 7
     assert after.used == 7 * limits.MIN_BILLED_SECONDS
     assert not set(after.slots) & {r.label for r in leaving}
@@ -459,12 +459,12 @@ def test_after_a_conflict_the_document_is_read_and_decided_again() -> None:
     project = study(max_servers=1)
 
     def other_function_writes() -> None:
-        platform.documents.kept["_places/maze.json"] = (b'{"held": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
+        platform.documents.kept["_slots/maze.json"] = (b'{"slots": {"sother": {"attempt": 1}}}', '"x"', platform.clock)
 
     platform.documents.before_write = [other_function_writes]
     assert not Slots(platform).acquire(project, claimed(project, "alice"))
     with pytest.raises(Conflict):
-        platform.documents.create("_places/maze.json", b"")
+        platform.documents.create("_slots/maze.json", b"")
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -498,7 +498,7 @@ def test_a_crowd_that_is_larger_than_the_limits_never_exceeds_them(seed: int) ->
     assert most == 8
     assert sum(visit.finished is not None for visit in visits) >= 8
     assert not any(world.left().values()), world.left()
-    total = from_json(kept["_places/study.json"][0], ServerSlots)
+    total = from_json(kept["_slots/study.json"][0], ServerSlots)
     assert total.slots == {}
     assert 0 < total.used <= 9 * 3600
     ran = sum((task.closed or 0) - task.born for task in tasks.tasks.values())

@@ -31,9 +31,9 @@ ALICE, BOB = claimed().label, claimed("bob").label
 
 
 def test_the_keys_of_the_documents_of_slots() -> None:
-    assert limits.participant_slots_folder("maze") == "maze/places/"
-    assert limits.participant_slots_key("maze", 3) == "maze/places/3.json"
-    assert limits.server_slots_key("maze") == "_places/maze.json"
+    assert limits.participant_slots_folder("maze") == "maze/slots/"
+    assert limits.participant_slots_key("maze", 3) == "maze/slots/3.json"
+    assert limits.server_slots_key("maze") == "_slots/maze.json"
 
 
 # Participants

@@ -449,7 +449,7 @@ def test_fields_that_the_document_leaves_out_have_defaults() -> None:
 
 def test_a_document_of_an_earlier_version_has_no_number_of_players_and_no_code() -> None:
     when = '"2026-03-04T12:00:00Z"'
-    told = f"""{{"open": [{{"id": "o", "asked": {when}}}], "formed": [{{"id": "f", "members": [], "at": {when}}}],
+    told = f"""{{"open": [{{"id": "o", "requested": {when}}}], "formed": [{{"id": "f", "members": [], "at": {when}}}],
         "proposed": [{{"id": "p", "labels": [], "at": {when}}}], "unmatched": [{{"label": "a", "userId": "A", "at": {when}}}]}}"""
     found = from_json(told.encode(), Decisions)
     assert [each.players for each in (*found.open, *found.proposed, *found.formed)] == [0, 0, 0]
@@ -530,7 +530,7 @@ def opened(number: int, *asked: float) -> list[tuple[str, datetime, str]]:
     )
     changes = number > len(asked) or any(seconds >= OPEN_FOR.total_seconds() for seconds in asked)
     assert (found is not document) is changes
-    return [(each.id, each.asked, each.by) for each in found.open]
+    return [(each.id, each.requested, each.by) for each in found.open]
 
 
 def test_as_many_sessions_are_opened_as_are_still_wanted() -> None:

@@ -309,6 +309,6 @@ def test_the_reason_of_a_closed_server_follows_from_how_its_task_ended(
 
 
 def test_the_values_of_states_and_reasons_stay_as_they_are_in_stored_records() -> None:
-    assert list(ServerState) == ["queued", "starting", "naming", "ready", "leaving", "closed"]
-    assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "taken"]
+    assert list(ServerState) == ["queued", "starting", "naming", "ready", "draining", "closed"]
+    assert list(Reason) == ["stopped", "deadline", "ended", "lost", "refused", "no capacity", "full", "assigned"]
     assert server.key(LABEL) == f"_servers/{LABEL}.json"

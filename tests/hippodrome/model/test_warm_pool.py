@@ -30,9 +30,9 @@ def warm_server(minutes: int, *, ready: bool = False, version: str = "v1") -> Wa
 
 
 def test_the_keys_of_pools_and_handovers() -> None:
-    assert warm_pool.pool_key("maze") == "_spares/maze.json"
-    assert handovers_folder("maze") == "maze/spares/"
-    assert handover_key("maze", "s1-1") == "maze/spares/s1-1.json"
+    assert warm_pool.pool_key("maze") == "_warm/maze.json"
+    assert handovers_folder("maze") == "maze/handovers/"
+    assert handover_key("maze", "s1-1") == "maze/handovers/s1-1.json"
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_the_button_under_a_message_answers_no_step_of_the_study() -> None:
     bob = "projectId=maze&userId=bob"
     ask(platform)
     page = ask(platform, bob)[1]["page"]
-    del platform.documents.kept["maze/places/0.json"]
+    del platform.documents.kept["maze/slots/0.json"]
     assert ask(platform, bob)[1]["step"] == "1"
     assert ask(platform, bob, hidden(page))[1]["step"] == "1"
     assert "maze/users/bob/answers/1.json" not in platform.documents.kept

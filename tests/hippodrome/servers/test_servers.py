@@ -326,7 +326,7 @@ def test_a_warm_server_accepts_no_front_end_without_a_token() -> None:
     platform.settings = replace(platform.settings, plain_clients=True)
     Servers(platform).start(StartServer("maze", ids.warm_id("maze", platform.now(), 1)))
     (request,) = platform.tasks.running.values()
-    assert request.environment["SPARE"] == "on"
+    assert request.environment["WARM_SERVER"] == "on"
     assert "PLAIN_ORIGINS" not in request.environment
 
 

@@ -124,7 +124,7 @@ def test_a_sessions_server_gets_the_session_and_no_participant(platform: FakePla
     (request,) = platform.tasks.running.values()
     env = request.environment
     assert env["SESSION"] == SESSION
-    assert env.keys().isdisjoint({"USER_ID", "GROUP", "SPARE"})
+    assert env.keys().isdisjoint({"USER_ID", "GROUP", "WARM_SERVER"})
     assert env["DEADLINE"] == str(int(record(platform).deadline.timestamp()))
 
 

@@ -130,7 +130,7 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
 @pytest.mark.parametrize(
     "wish",
     [
-        get("project_master_list.json"), get(KEY), get(f"_servers/{NAME[:-2]}.json"), get(f"_places/{PROJECT}.json"),
+        get("project_master_list.json"), get(KEY), get(f"_servers/{NAME[:-2]}.json"), get(f"_slots/{PROJECT}.json"),
         get("SSL/account.json"), get("SSL/fullchain.pem"), get("SSL/privkey.pem"), get("SSL/other.example.org/privkey.pem"), put(PRIVKEY), put(FULLCHAIN),
         get(f"{PROJECT}/users/{BOB}/answers/3.json"), put(f"{PROJECT}/users/{BOB}/answers/3.json"),
         get(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"), put(f"{PROJECT}/users/{BOB}/trials/{OTHER}/3-trial.jsonl.gz"),

@@ -218,7 +218,7 @@ def test_a_record_that_cannot_be_read_is_counted_as_failed_and_its_resources_sta
 
 def test_a_pool_that_cannot_be_read_is_one_failure_and_the_rest_is_swept(platform: FakePlatform) -> None:
     leftovers(platform)
-    platform.documents.put("_spares/maze.json", b"{")
+    platform.documents.put("_warm/maze.json", b"{")
     swept = sweep.handler({}, None)
     assert (swept["failed"], swept["warm_servers"], swept["tasks"], swept["names"]) == (1, 0, 1, 1)
 

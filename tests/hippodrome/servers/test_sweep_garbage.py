@@ -20,7 +20,17 @@ from testing.servers import Servers
 from testing.studies import study
 
 MANY = 16_000
-GARBAGE = [b"", b"{", b"[]", b"3", b"\xff", b'{"held": 3}', b'{"spares": []}', b'{"held": {"x": {}}}', b"[" * 100_000]
+GARBAGE = [
+    b"",
+    b"{",
+    b"[]",
+    b"3",
+    b"\xff",
+    b'{"slots": 3}',
+    b'{"warmServers": []}',
+    b'{"slots": {"x": {}}}',
+    b"[" * 100_000,
+]
 SLOTS = limits.server_slots_key("maze")
 STUDY = study(max_servers=3, warm_servers=1, version="1")
 
@@ -37,8 +47,8 @@ def calls(platform: FakePlatform) -> Counter[str]:
     return Counter(platform.documents.calls)
 
 
-FOLDERS = ["_places/", "_places/users/{0}/answers/", "_spares/", "_spares/users/{0}/answers/", "_servers/users/{0}/answers/",
-           "_servers/", "maze/spares/", "maze/spares/users/{0}/answers/", "maze/spares/{0}/"]  # fmt: skip
+FOLDERS = ["_slots/", "_slots/users/{0}/answers/", "_warm/", "_warm/users/{0}/answers/", "_servers/users/{0}/answers/",
+           "_servers/", "maze/handovers/", "maze/handovers/users/{0}/answers/", "maze/handovers/{0}/"]  # fmt: skip
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
@@ -54,7 +64,7 @@ def test_keys_of_no_registered_project_are_never_read(platform: FakePlatform, fo
 def test_a_document_in_a_deeper_folder_is_no_handover(platform: FakePlatform) -> None:
     for number in range(200):
         name = ids.server_name(ids.server_label("maze", f"u{number}"), 1)
-        platform.documents.put(f"maze/spares/users/x/answers/{name}.json", b"{}")
+        platform.documents.put(f"maze/handovers/users/x/answers/{name}.json", b"{}")
     before = dict(platform.documents.kept)
     assert sweep.handler({}, None)["handovers"] == 0
     assert platform.documents.kept == before
@@ -128,7 +138,7 @@ def test_the_sweep_has_an_unreadable_pool_filled_anew(platform: FakePlatform) ->
     assert platform.bus.sent == [(Topic.START, {"keepWarm": "maze"})]
 
 
-@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"spares": []}'])
+@pytest.mark.parametrize("body", [body for body in GARBAGE if body != b'{"warmServers": []}'])
 def test_with_unreadable_slots_no_server_starts_and_the_document_stays(platform: FakePlatform, body: bytes) -> None:
     """The number of running servers is not known, so no other may start: `maxServers` could be exceeded."""
     platform.documents.put(SLOTS, body)

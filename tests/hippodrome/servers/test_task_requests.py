@@ -107,5 +107,5 @@ def test_a_warm_server_gets_its_deadline_and_no_participant() -> None:
     warm_server = ids.warm_id("maze", platform.now(), 0)
     _, request, record = started(study(warm_servers=1), warm_server)
     assert {"USER_ID", "GROUP"} & request.environment.keys() == set()
-    assert request.environment["SPARE"] == "on"
+    assert request.environment["WARM_SERVER"] == "on"
     assert int(request.environment["DEADLINE"]) == int(record.deadline.timestamp()) + 30 * 60

@@ -407,13 +407,13 @@ PLAYED = f"study/users/P1/trials/{OWN}"
 
 
 def warm_server_request(**environment: str) -> TaskRequest:
-    told = request(SPARE="on", SERVER=NAME, **environment)
+    told = request(WARM_SERVER="on", SERVER=NAME, **environment)
     return replace(told, environment={key: value for key, value in told.environment.items() if key != "USER_ID"})
 
 
 def give(here: Here) -> Path:
     """Write the handover, as the control plane does when a participant takes the warm server."""
-    document = here.data / f"study/spares/{NAME}.json"
+    document = here.data / f"study/handovers/{NAME}.json"
     document.parent.mkdir(parents=True)
     document.write_bytes(Handover("P1", None, OWN).to_json())
     return document
@@ -478,7 +478,7 @@ def test_the_next_process_knows_the_participant_of_a_warm_server(here: Here) -> 
 def test_a_warm_servers_record_names_its_handover_as_earlier_versions_did(tmp_path: Path) -> None:
     folder, task = TaskFolder(tmp_path), TaskRecord.of(warm_server_request(), "0" * 32)
     folder.save(task)
-    assert json.loads(folder.file(NAME).read_bytes())["warm_server"] == f"study/spares/{NAME}.json"
+    assert json.loads(folder.file(NAME).read_bytes())["warm_server"] == f"study/handovers/{NAME}.json"
     assert list(folder.load()) == [task]
 
 

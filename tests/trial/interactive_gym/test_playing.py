@@ -113,7 +113,7 @@ async def test_two_people_play_an_experiment(tmp_path: Path, launch: Any, open_c
     made = make_project(tmp_path / "mine", PEOPLE)
     told = yaml.safe_load((made / "config.yml").read_text())["trial"]
     told |= {"instructions": None, "countdown": 0, "callbackSeconds": 10}
-    members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "SPARE_SECONDS": "60"}
+    members = {"SESSION": SID, "USER_ID": "", "SERVER": "pair-1", "ASSIGNMENT_SECONDS": "60"}
     server = launch(
         None, {key: value for key, value in told.items() if value is not None}, AGENT_DIR=str(made), **members
     )

@@ -94,7 +94,7 @@ def warm_server_records(platform: FakePlatform) -> list[Server]:
 
 def handovers(platform: FakePlatform) -> dict[str, Handover]:
     kept = platform.documents.kept
-    return {key: handover.parse(kept[key][0]) for key in kept if key.startswith("maze/spares/")}
+    return {key: handover.parse(kept[key][0]) for key in kept if key.startswith("maze/handovers/")}
 
 
 def nothing_left(platform: FakePlatform) -> bool:
@@ -116,7 +116,7 @@ def test_a_warm_server_gets_no_participants_id_and_has_max_runtime_after_its_wai
     ((_, request),) = platform.tasks.running.items()
     ((at, message),) = platform.timers.due.values()
     (warm_server,) = warm_server_records(platform)
-    assert request.environment["SPARE"] == "on"
+    assert request.environment["WARM_SERVER"] == "on"
     assert "USER_ID" not in request.environment
     assert "GROUP" not in request.environment
     assert at == warm_server.deadline
@@ -173,7 +173,7 @@ def test_the_handover_is_written_before_the_page_gets_the_address() -> None:
     platform = warmed(1)
     Servers(platform).start(START)
     (key,) = handovers(platform)
-    assert key == f"maze/spares/{record(platform).name}.json"
+    assert key == f"maze/handovers/{record(platform).name}.json"
     assert handovers(platform)[key] == Handover("alice", ids.group("maze", "alice", 2), f"{LABEL}-1")
     versions = {key: int(etag.strip('"').rpartition("-")[2]) for key, (_, etag, _) in platform.documents.kept.items()}
     assert versions[key] < versions[server.key(LABEL)]
