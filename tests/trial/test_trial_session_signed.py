@@ -7,7 +7,7 @@ import pytest
 
 from hippodrome.model.server import Reason
 from protocol.keys import answer_key, session_key
-from tests.trial.sessions import MEMBERS, SID, TOKEN, document, hello_of, launch_session
+from tests.trial.sessions import MEMBERS, SID, document, hello_of, launch_session
 from tests.trial.test_trial_presigned import Town
 from trial.recordings import recording
 
