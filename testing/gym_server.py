@@ -5,21 +5,17 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
-
-from testing import processes
 
 ROOT = Path(__file__).resolve().parent.parent
-SECONDS = 60.0  # an answer may take so long: on a participant's server, environments have the lowest priority
+SECONDS = 60.0  # an answer may take so long on a busy machine
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,51 +33,32 @@ class GymServerProcess:
 
 @contextlib.contextmanager
 def gym_server(
-    *arguments: str,
-    program: Sequence[str] = ("-m", "trial.gym"),
-    cwd: Path = ROOT,
-    env: Mapping[str, str] | None = None,
+    *arguments: str, program: Sequence[str] = ("-m", "trial.gym", "--port", "0"), cwd: Path = ROOT
 ) -> Iterator[GymServerProcess]:
-    """Run `python -m trial.gym` with these arguments at a free port for the block.
-
-    At the end it is interrupted, as by Ctrl-C. `program` is run instead, if it is given; `env` is added to the
-    environment. The program prints the server's address first.
-    """
-    process = subprocess.Popen(
-        [sys.executable, *program, *(("--port", "0") if program[0] == "-m" else ()), *arguments],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT), **(env or {})},
-        stdout=subprocess.PIPE,
-        text=True,
-        preexec_fn=processes.interruptible,  # noqa: PLW1509 - it sets a signal and no more
-    )
-    assert process.stdout is not None
-    try:
-        line = process.stdout.readline()
-        yield GymServerProcess(int(line.split("/gym")[0].rpartition(":")[2]), process.pid)
-    finally:
-        process.send_signal(signal.SIGINT)
+    """Run `python -m trial.gym` with these arguments at a free port for the block, or another `program` of Python."""
+    command = [sys.executable, "-W", "ignore", *program, *arguments]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=cwd, env=os.environ | {"PYTHONPATH": f"{ROOT}:{cwd}"}
+    ) as process:
         try:
-            process.wait(SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            yield GymServerProcess(int(line.split("/gym")[0].rpartition(":")[2]), process.pid)
         finally:
-            process.stdout.close()
+            process.terminate()
+            process.wait(SECONDS)
 
 
 class TextClient:
     """A client that sends text and takes the next message for the answer, as Gymie's client does.
 
-    With `arrays`, it asks for the binary subprotocol. All methods raise ConnectionClosed if the server has closed the
-    connection.
+    All methods raise ConnectionClosed if the server has closed the connection.
     """
 
-    def __init__(self, url: str, *, arrays: bool = False) -> None:
-        protocols = [Subprotocol("hippodrome.gym.1")] if arrays else None
+    def __init__(self, url: str) -> None:
         with contextlib.ExitStack() as stack:
             self.websocket: ClientConnection = stack.enter_context(
-                connect(url, compression=None, subprotocols=protocols, max_size=None, close_timeout=SECONDS)
+                connect(url, compression=None, max_size=None, close_timeout=SECONDS)
             )
             self._stack = stack.pop_all()
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from trial.gym.embedded import start
 from trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, InstanceNotFound, WrongAction
 from trial.gym.overrides import override
 
 if TYPE_CHECKING:
     from trial.gym.client import ConnectionLost, RemoteError
-    from trial.gym.remote import RemoteEnv, RemoteVectorEnv
+    from trial.gym.remote import RemoteEnv
+    from trial.gym.server import start
 
 __all__ = [
     "ConnectionLost",
@@ -19,19 +20,21 @@ __all__ = [
     "InstanceNotFound",
     "RemoteEnv",
     "RemoteError",
-    "RemoteVectorEnv",
     "WrongAction",
     "override",
     "start",
 ]
 
-_CLIENTS = {"ConnectionLost": "client", "RemoteError": "client", "RemoteEnv": "remote", "RemoteVectorEnv": "remote"}
+_LATER = {
+    "ConnectionLost": "client",
+    "RemoteError": "client",
+    "RemoteEnv": "remote",
+    "start": "server",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import the clients when they are first used: the process that listens must not import Gymnasium and numpy."""
-    if name not in _CLIENTS:
+    """Import server and clients when they are first used: a server starts numpy without threads (`server.py`)."""
+    if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module  # noqa: PLC0415
-
-    return getattr(import_module(f"{__name__}.{_CLIENTS[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)

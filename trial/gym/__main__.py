@@ -7,26 +7,18 @@ import ipaddress
 import sys
 from collections.abc import Sequence
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 
-from trial.gym.errors import unusable
-from trial.gym.limits import Limits
-from trial.gym.processes import serve, tell
+from trial.gym.server import serve, unusable
+from trial.gym.settings import Limits
 
 _HELP = {
-    "connections": "most connections at a time",
-    "workers": "most connections at a time that have sent a request",
-    "environments": "most environments of a connection",
+    "connections": "most connections at a time; each has a process",
     "seconds": "most seconds for one request",
-    "idle_seconds": "seconds without a request after which a connection that has sent one is closed; 0: never",
+    "idle_seconds": "seconds without a request after which a connection is closed; 0: never",
     "megabytes": "most memory for the environments of a connection",
     "processes": "most processes that the environments of a connection start",
-    "steps_per_second": "most steps of a connection in a second; 0: no limit",
-    "message_bytes": "most bytes of a client's message",
-    "reply_bytes": "most bytes of the observations in one reply",
 }
-_ZERO_ALLOWED = ("idle_seconds", "steps_per_second")
 _HIGHEST = 10**9
 
 
@@ -56,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = vars(parser.parse_args(arguments))
     limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
     for field in fields(Limits):
-        least = 0 if field.name in _ZERO_ALLOWED else 1
+        least = 0 if field.name == "idle_seconds" else 1
         if not least <= given[field.name] <= _HIGHEST:
             parser.error(f"--{field.name.replace('_', '-')} must be a number from {least} to {_HIGHEST:g}")
     if not 0 <= given["port"] <= 65535:
@@ -76,7 +68,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             origins=given["origin"],
             output=given["output"],
             record=given["record"],
-            ready=partial(tell, host),
         )
     except (OSError, UnicodeError) as error:
         print(f"Cannot listen at {host}:{given['port']}: {unusable(error)}.", file=sys.stderr)

@@ -6,15 +6,13 @@ import contextlib
 import ipaddress
 import os
 import ssl
-import threading
-from collections.abc import Callable
-from typing import Any, NoReturn
-from urllib.parse import quote, urlsplit, urlunsplit
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 
-from trial.gym import values
+from trial.gym import exact
 from trial.gym.forms import SUBPROTOCOL
 from trial.gym.spaces import CodecError
 
@@ -22,7 +20,6 @@ TIMEOUT = 90.0
 """The seconds in which an answer must come: more than a server's default limit, so that its sentence comes first."""
 
 _CLOSE_SECONDS = 2.0  # seconds in which the server must answer a close
-_UNFIT = "If it is a server of another version of Hippodrome, use the same version on both sides."
 _MAX_REPLY = 2**30  # the most bytes of a reply
 
 
@@ -37,97 +34,77 @@ class ConnectionLost(RemoteError):
 class GymClient:
     """A connection to a server of environments.
 
-    A request waits for its answer, and other threads' requests wait for it.
-
     `url` begins with `ws://` or `wss://`; without a path it gets `/gym`. `timeout` is in seconds, for connecting and
     for each answer. `ca` is a file of certificates in PEM that are trusted beside the system's. Raises ConnectionLost
     if there is no server, or if it does not speak this subprotocol.
     """
 
-    def __init__(self, url: str, *, token: str | None = None, ca: str | None = None, timeout: float = TIMEOUT) -> None:
-        self.url = _shown(url)
+    def __init__(self, url: str, *, ca: str | None = None, timeout: float = TIMEOUT) -> None:
+        parts = urlsplit(url)
+        address = urlunsplit(parts._replace(path="/gym")) if parts.path in ("", "/") else url
+        # Messages show the address without its password and query, which may be secrets.
+        self.url = urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
         self._timeout = timeout
-        self._turn = threading.Lock()
         self._process = os.getpid()
         self._over: str | None = None
-        address = _address(url, token)
         try:
-            context = _trusting(ca) if ca is not None else None
-            opened = connect(
+            self._connection: ClientConnection = connect(
                 address,
-                ssl=context,
+                ssl=_trusting(ca) if ca is not None else None,
                 subprotocols=[SUBPROTOCOL],
                 compression=None,
                 max_size=_MAX_REPLY,
                 open_timeout=timeout,
                 close_timeout=_CLOSE_SECONDS,
-                proxy=None if _is_this_machine(address) else True,
+                proxy=None if _is_this_machine(parts.hostname or "") else True,
                 ping_interval=None,  # no pings: a step may take longer than their answers may
-            )
-            self._connection: ClientConnection = opened.__enter__()  # `close` ends what begins here
+            ).__enter__()
         except (OSError, InvalidHandshake, InvalidURI, TimeoutError, ValueError) as error:
-            # `from None`, since the error may show the token.
+            # `from None`, since the error may show the query.
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
         if self._connection.subprotocol != SUBPROTOCOL:
             self._end(f"it does not speak {SUBPROTOCOL}")
-            raise ConnectionLost(
-                f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do. {_UNFIT}"
-            )
-
-    @property
-    def closed(self) -> bool:
-        """Whether the connection has ended."""
-        return self._over is not None
+            raise ConnectionLost(f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do.")
 
     def call(self, method: str, **params: Any) -> Any:
-        """Send a request in JSON. Return its result. Raises RemoteError, and ConnectionLost."""
-        answer = self._exchange(values.to_text({"method": method, "params": params}))
-        return self.read(_result, answer) if isinstance(answer, str) else self._confused()
-
-    def send(self, message: bytes) -> bytes:
-        """Send a binary request. Return its binary answer. Raises RemoteError, and ConnectionLost."""
-        answer = self._exchange(message)
-        if isinstance(answer, str):
-            self.read(_result, answer)  # a text should be an error, which this raises
-            self._confused()
-        return answer
-
-    def read(self, reader: Callable[..., Any], *arguments: Any) -> Any:
-        """Read an answer by `reader`. If it raises CodecError, end the connection and raise ConnectionLost."""
+        """Send a request. Return its result. Raises RemoteError, and ConnectionLost."""
+        answer = self._exchange(exact.to_bytes({"method": method, "params": params}))
         try:
-            return reader(*arguments)
+            result = exact.from_bytes(answer if isinstance(answer, bytes) else answer.encode())
         except CodecError as error:
-            self._end(str(error))
-            raise ConnectionLost(
-                f"The answer of {self.url} cannot be read: {str(error).rstrip('.')}. {_UNFIT}"
-            ) from error
+            self.unfit(error)
+        if isinstance(result, dict) and isinstance(result.get("error"), dict):
+            raise RemoteError(str(result["error"].get("message")))
+        return result
+
+    def unfit(self, error: Exception) -> None:
+        """End the connection, and raise ConnectionLost: the server's answer does not fit the request."""
+        self._end(str(error))
+        raise ConnectionLost(
+            f"The answer of {self.url} cannot be read: {str(error).rstrip('.')}. If it is a server of another version "
+            "of Hippodrome, use the same version on both sides."
+        ) from error
 
     def close(self) -> None:
         """Close the connection. The server then closes its environments. May be called again."""
         self._end("it was closed")
 
-    def _exchange(self, message: str | bytes) -> str | bytes:
+    def _exchange(self, message: bytes) -> str | bytes:
         if os.getpid() != self._process:
             raise ConnectionLost(f"The connection to {self.url} is that of another process; make one in this process.")
-        with self._turn:
-            if self._over is not None:
-                raise ConnectionLost(f"There is no connection to {self.url} any more: {self._over}.")
-            try:
-                self._connection.send(message)
-                return self._connection.recv(self._timeout)
-            except TimeoutError:
-                self._end(f"there was no answer within {self._timeout:g} s")
-            except ConnectionClosed as error:
-                self._end(_reason(error))
-            except BaseException:
-                self._end("a request was interrupted")  # otherwise the next request would get its answer
-                raise
-            raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
-
-    def _confused(self) -> NoReturn:
-        """End the connection, and raise ConnectionLost: the server's answer does not fit the request."""
-        self._end("it answered something else than what it was asked")
-        raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}. {_UNFIT}")
+        if self._over is not None:
+            raise ConnectionLost(f"There is no connection to {self.url} any more: {self._over}.")
+        try:
+            self._connection.send(message)
+            return self._connection.recv(self._timeout)
+        except TimeoutError:
+            self._end(f"there was no answer within {self._timeout:g} s")
+        except ConnectionClosed as error:
+            self._end(_reason(error))
+        except BaseException:
+            self._end("a request was interrupted")  # otherwise the next request would get its answer
+            raise
+        raise ConnectionLost(f"The connection to {self.url} is lost: {self._over}.")
 
     def _end(self, why: str) -> None:
         if self._over is None:
@@ -139,22 +116,7 @@ class GymClient:
                     self._connection.socket.close()  # the descriptor of this forked process; nothing is sent
 
 
-def _address(url: str, token: str | None) -> str:
-    """Return the address to connect to, with a path and the token."""
-    parts = urlsplit(url)
-    path = parts.path if parts.path not in ("", "/") else "/gym"
-    query = "&".join(part for part in (parts.query, f"token={quote(token, safe='')}" if token else "") if part)
-    return urlunsplit((parts.scheme, parts.netloc, path, query, ""))
-
-
-def _shown(url: str) -> str:
-    """Return the address as messages show it: without its password and query, which may be secrets."""
-    parts = urlsplit(url)
-    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
-
-
-def _is_this_machine(address: str) -> bool:
-    host = urlsplit(address).hostname or ""
+def _is_this_machine(host: str) -> bool:
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -169,7 +131,9 @@ def _trusting(ca: str) -> ssl.SSLContext:
 
 def _reason(error: BaseException) -> str:
     """Return why there is no connection, for the end of a sentence."""
-    if isinstance(error, ConnectionClosed) and error.rcvd is not None:
+    if isinstance(error, ConnectionClosed):
+        if error.rcvd is None:
+            return "the server has ended"
         return error.rcvd.reason or f"the server closed it with code {error.rcvd.code}"
     if isinstance(error, InvalidStatus):
         words = error.response.body.decode("utf-8", "replace").strip() if error.response.body else ""
@@ -178,15 +142,4 @@ def _reason(error: BaseException) -> str:
         return "the address must begin with ws:// or wss://"
     if isinstance(error, TimeoutError):
         return "it took too long"
-    if isinstance(error, ConnectionClosed):
-        return "the server has ended"
     return str(error).rstrip(".") or type(error).__name__
-
-
-def _result(answer: str) -> Any:
-    """Read the result in an answer. Raises RemoteError if the answer is an error, CodecError if it is no JSON."""
-    result = values.from_text(answer)
-    error = result.get("error") if isinstance(result, dict) else None
-    if isinstance(error, dict):
-        raise RemoteError(str(error.get("message")))
-    return result

@@ -6,24 +6,27 @@ message cannot be read, 1007 for every other error. Its client gives them to the
 
 from __future__ import annotations
 
-import os
-
 _LONGEST = 300  # the most characters of a sentence
 
 
 class GymError(Exception):
-    """A request cannot be carried out. `str` is a sentence for the client."""
+    """A request cannot be carried out. Its arguments are a sentence for the client and, if known, the reason."""
 
     code = 1007
     """The close code for the connection of a client of Gymie's."""
 
     def __str__(self) -> str:
-        return short(super().__str__(), _LONGEST)
+        return short(": ".join([self.brief, *map(str, self.args[1:])]), _LONGEST)
 
     @property
     def brief(self) -> str:
-        """Return Gymie's sentence for the error, without further reasons."""
-        return str(self)
+        """Return Gymie's sentence for the error, without the reason."""
+        return short(str(self.args[0]) if self.args else type(self).__name__, _LONGEST)
+
+    @property
+    def close_reason(self) -> str:
+        """Return what a client of Gymie's is told."""
+        return self.brief
 
 
 class InvalidMessage(GymError):
@@ -37,32 +40,16 @@ class MethodNotFound(GymError):
 
 
 class WrongParameters(GymError):
-    """The parameters do not fit the method. The exception's arguments are a sentence and, if known, the reason."""
-
-    def __str__(self) -> str:
-        return short(": ".join(map(str, self.args)), _LONGEST)
-
-    @property
-    def brief(self) -> str:
-        return short(str(self.args[0]), _LONGEST)
+    """The parameters do not fit the method."""
 
 
 class _Named(GymError):
-    """An error about an id or an action, which is the exception's first argument. Further arguments are reasons.
-
-    A program's own `get_env` may raise it as in Gymie, also without arguments.
-    """
+    """An error about an id or an action, which is the first argument. A program's `get_env` may raise it without."""
 
     sentence = "{}"
 
-    def __str__(self) -> str:
-        return short(": ".join([self._named(), *map(str, self.args[1:])]), _LONGEST)
-
     @property
     def brief(self) -> str:
-        return self._named()
-
-    def _named(self) -> str:
         return self.sentence.format(short(str(self.args[0]), 80) if self.args else "?")
 
 
@@ -78,7 +65,7 @@ class EnvironmentMalformed(_Named):
     sentence = "Environment `{}` is malformed"
 
     @property
-    def brief(self) -> str:
+    def close_reason(self) -> str:
         """Return Gymie's sentence and the reason: Gymie calls an environment malformed also if a package is missing."""
         return str(self)
 
@@ -99,10 +86,6 @@ class EnvironmentFailed(GymError):
     """The environment raised an exception, or returned something that cannot be used."""
 
 
-class TooSlow(GymError):
-    """The environment did not return in time."""
-
-
 class LimitReached(GymError):
     """The request would exceed a limit of the server."""
 
@@ -111,30 +94,6 @@ def short(text: str, most: int) -> str:
     """Put the text on one line, cut to `most` characters."""
     line = " ".join(text.split())
     return line if len(line) <= most else line[: most - 1] + "…"
-
-
-def reason(text: str) -> str:
-    """Shorten the text to what a close frame can hold: 123 bytes of UTF-8 (RFC 6455, 5.5).
-
-    Whole words are left out in the middle: the end of an error often says what to do.
-    """
-    if len(text.encode("utf-8", "replace")) <= 123:
-        return text
-    start = _first_words(text, 80)
-    rest = 123 - len(f"{start} … ".encode())
-    return f"{start} … {_first_words(text[::-1], rest)[::-1]}"
-
-
-def _first_words(text: str, most: int) -> str:
-    """Return the words that fit into so many bytes; if not even one does, its beginning."""
-    fitting = text.encode("utf-8", "replace")[:most].decode("utf-8", "ignore")
-    return fitting if text[len(fitting) :].startswith(" ") else fitting.rpartition(" ")[0] or fitting
-
-
-def unusable(error: OSError | UnicodeError) -> str:
-    """Return why a server cannot listen at an address."""
-    number = error.errno or 0 if isinstance(error, OSError) else 0
-    return os.strerror(number) if number > 0 else "there is no such host"  # getaddrinfo's numbers are negative
 
 
 def described(error: BaseException) -> str:

@@ -19,23 +19,24 @@ def become_subreaper() -> None:
     _prctl(_SET_CHILD_SUBREAPER, 1)
 
 
-def die_with_parent() -> None:
+def die_with(parent: int) -> None:
     """Let the system kill this process when its parent ends (PR_SET_PDEATHSIG, prctl(2))."""
     _prctl(_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(0)  # it has ended already
 
 
 def limit_memory(megabytes: int) -> None:
     """Limit the private memory of this process, and of each of its children, to its present size plus `megabytes`.
 
-    RLIMIT_DATA does so: since Linux 4.7 it counts private writable mappings (setrlimit(2)).
+    RLIMIT_DATA does so: since Linux 4.7 it counts private writable mappings (setrlimit(2)). It does not count memory
+    that processes share.
     """
-    if not _LINUX:
-        return
-    most = _private_bytes() + megabytes * 2**20
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    if hard != resource.RLIM_INFINITY:
-        most = min(most, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    if _LINUX:
+        most = _kilobytes("/proc/self/status", "VmData:") * 2**10 + megabytes * 2**20
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
 def children(pid: int) -> list[int]:
@@ -49,11 +50,11 @@ def children(pid: int) -> list[int]:
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the children of a process, their children, and so on."""
+    """Return the children of a process, their children, and so on, without those that have ended."""
     pids: list[int] = []
     waiting = [pid]
     while waiting:
-        below = children(waiting.pop())
+        below = [child for child in children(waiting.pop()) if runs(child)]
         pids += below
         waiting += below
     return pids
@@ -67,23 +68,19 @@ def runs(pid: int) -> bool:
 
 
 def used_megabytes(pid: int) -> float:
-    """Return the resident memory of a process without pages of files; 0 if it has ended.
+    """Return the memory of a process without pages of files; 0 if it has ended.
 
-    RssAnon is its own memory, RssShmem memory that it shares with others (/proc/PID/status, proc(5)).
+    Of memory that several processes share, each has its part (Pss in /proc/PID/smaps_rollup, proc(5)).
     """
     try:
-        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8", errors="replace").splitlines()
+        return _kilobytes(f"/proc/{pid}/smaps_rollup", "Pss_Anon:", "Pss_Shmem:") / 2**10
     except OSError:
         return 0.0
-    return sum(int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "RssShmem:"))) / 2**10
 
 
-def _private_bytes() -> int:
-    """Return the size of this process's private writable mappings (VmData in /proc/self/status, proc(5))."""
-    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith("VmData:"):
-            return int(line.split()[1]) * 1024
-    return 0
+def _kilobytes(file: str, *fields: str) -> int:
+    lines = Path(file).read_text(encoding="utf-8", errors="replace").splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith(fields))
 
 
 def _prctl(option: int, value: int) -> None:

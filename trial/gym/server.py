@@ -1,328 +1,293 @@
-"""The process that listens. It does the handshakes, and holds connections until their first request.
+"""The process that listens. It forks a process for each connection (`connection.py`), and ends those beyond a limit.
 
-Then the spawner (`spawner.py`) gets the connection's socket, and starts a process for it (`worker.py`). This process
-keeps a descriptor of the socket. If the worker had to be ended, it closes the connection with a sentence.
+It has one thread, runs no environment and reads nothing from clients, so neither of them can hold it up. It keeps a
+descriptor of each connection: if a connection's process did not end by itself, another one tells the client why.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
-import http
-import selectors
+import gc
+import os
+import select
+import signal
 import socket
+import sys
+import threading
 import time
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol
-from urllib.parse import urlsplit
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
 
-from websockets.datastructures import Headers
-from websockets.exceptions import ProtocolError
-from websockets.frames import CTRL_OPCODES, Close, CloseCode, Frame, Opcode
-from websockets.http11 import Request, Response
-from websockets.server import ServerProtocol
-from websockets.typing import Subprotocol
+from trial.gym import linux
+from trial.gym.errors import described
+from trial.gym.settings import PATH, Limits, Settings
 
-from trial.gym import handover
-from trial.gym.errors import reason
-from trial.gym.forms import ARRAYS, GYMIE, SUBPROTOCOL, UNKNOWN_FORM, MessageForm, form_of
-from trial.gym.limits import Limits
-from trial.gym.wakeup import Wakeup
-
-PATH = "/gym"
-_HANDSHAKE_SECONDS = 10.0
-_HANDSHAKE_BYTES = 16 * 1024  # the most bytes of a handshake
-_CLOSE_SECONDS = 2.0  # the time that a client has to close its end
-_NO_FILES_SECONDS = 0.05  # the pause if no file can be opened
-WITHOUT_HANDSHAKE = 100
-"""The connections beyond the limit that are accepted, so that their handshakes are answered with a refusal."""
-_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+REFUSING = 16
+"""The connections beyond the limit that get a process, which refuses them with a sentence."""
+_TICK_SECONDS = 0.25  # between two looks at which processes have ended
+_USAGE_SECONDS = 1.0  # between two looks at memory and processes
+_END_SECONDS = 3.0  # for clients to be told that the server ends
+_AWAY, _FAILED = 1001, 1011  # close codes (RFC 6455, 7.4.1)
 
 
-class ListeningSocket(Protocol):
-    """A listening socket, or an object that accepts connections in another way."""
+def start(host: str = "127.0.0.1", port: int = 5000, **options: Any) -> None:
+    """Serve environments at ws://host:port/gym until Ctrl-C or SIGTERM, with the functions of `override`.
 
-    def accept(self) -> tuple[socket.socket, Any]:
-        """Accept the next connection. Raises OSError if none waits, KeyboardInterrupt if there will be no more."""
-
-    def fileno(self) -> int:
-        """Return the descriptor that becomes readable when there is a connection."""
-
-    def setblocking(self, flag: bool, /) -> None:
-        """Set whether `accept` waits for a connection."""
-
-    def close(self) -> None:
-        """Accept no more connections."""
-
-
-@dataclass(slots=True, eq=False)
-class _Connection:
-    socket: socket.socket
-    deadline: float | None
-    """The time when it is dropped, unless its handshake, first request or close has come before; None: no limit."""
-    received: bytes = b""
-    form: str = ""
-    """The name of the form of its messages; empty until the handshake is done."""
-    number: int = 0
-    """Its number for the spawner; 0 if it has no worker."""
-    closing: bool = False
+    It prints the address once it listens. Without a `host` it listens at this machine alone, unlike Gymie. If the
+    address cannot be used, it prints a sentence and returns, as Gymie does. `options` are those of `serve`, such as
+    `limits`. Raises RuntimeError outside of the main thread, where signals cannot be received.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        raise RuntimeError("The server must be started in the main thread of the program: signals end it.")
+    try:
+        serve(host, port, **options)
+    except (OSError, UnicodeError) as error:
+        print(f"Address ws://{host}:{port} cannot be used: {unusable(error)}", file=sys.stderr)
 
 
-class GymServer:
-    """Serves connections until `run` is interrupted."""
+def serve(
+    host: str,
+    port: int,
+    limits: Limits | None = None,
+    *,
+    modules: Sequence[str] = (),
+    origins: Sequence[str] = (),
+    output: bool = False,
+    record: Path | None = None,
+) -> int:
+    """Serve environments until SIGINT or SIGTERM. Return the exit status. The options are those of `Settings`.
 
-    def __init__(
-        self, listener: ListeningSocket, control: socket.socket, limits: Limits, origins: Sequence[str]
-    ) -> None:
+    Raises OSError or UnicodeError if the address cannot be used.
+    """
+    settings = Settings(limits or Limits(), modules, origins, output, record)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, port), family=family, backlog=512) as listener:
+        server = _Server(listener, settings)
+        if not server.can_import_modules():
+            return 1
+        before = signal.signal(signal.SIGTERM, _interrupt)
+        try:
+            address = f"{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
+            print(f"Environments are served at ws://{address}{PATH}. Ctrl-C ends it.", flush=True)
+            server.run()
+        except KeyboardInterrupt:
+            return 0
+        finally:
+            signal.signal(signal.SIGTERM, before)
+
+
+@dataclass(slots=True)
+class _Child:
+    """The process of a connection."""
+
+    connection: socket.socket
+    close: tuple[int, str] | None = None
+    """The close code and the sentence for its client, if the server has killed the process."""
+    refuses: bool = False
+    """Whether the process only refuses a client, or tells it why its connection ends."""
+
+
+class _Server:
+    def __init__(self, listener: socket.socket, settings: Settings) -> None:
         self._listener = listener
-        self._control = control
-        self._limits = limits
-        self._origins = frozenset(origins)
-        self._selector = selectors.DefaultSelector()
-        self._connections: set[_Connection] = set()
-        self._with_worker: dict[int, _Connection] = {}
-        self._last_number = 0
-        self._from_spawner = bytearray()  # the beginning of a message that is not complete yet
+        self._settings = settings
+        self._limits = settings.limits
+        self._work = _imported_without_threads()
+        self._children: dict[int, _Child] = {}
+        self._others = set(linux.children(os.getpid()))  # processes that the program has started before
+        self._usage_checked = 0.0
+
+    def can_import_modules(self) -> bool:
+        """Import the modules in another process, which prints why it cannot, so that this one gets no threads."""
+        pid = os.fork()
+        if pid:
+            return os.waitpid(pid, 0)[1] == 0
+        status = 1
+        try:
+            self._work.import_modules(self._settings.modules)
+            status = 0
+        except Exception as error:  # noqa: BLE001 - a researcher's module may raise anything
+            print(f"{', '.join(self._settings.modules)} cannot be imported: {described(error)}", file=sys.stderr)
+        finally:
+            _exit(status)
 
     def run(self) -> NoReturn:
-        """Serve until a signal raises KeyboardInterrupt, which passes on. Raises EOFError if the spawner has ended."""
+        """Serve until a signal raises KeyboardInterrupt, which passes on when all processes have ended."""
+        linux.become_subreaper()
+        gc.collect()
+        gc.freeze()  # so that the collector does not write to pages that the processes share
         self._listener.setblocking(False)
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-        self._selector.register(self._control, selectors.EVENT_READ, self._listen_to_spawner)
-        with contextlib.closing(Wakeup()) as wakeup:
-            self._selector.register(wakeup, selectors.EVENT_READ, wakeup.clear)
-            try:
-                self._serve()
-            finally:
-                self._selector.unregister(wakeup)
-
-    def _serve(self) -> NoReturn:
-        checked = time.monotonic()
-        while True:
-            for key, _ in self._selector.select(1.0 if self._timed() else None):
-                if isinstance(key.data, _Connection):
-                    self._readable(key.data)
-                else:
-                    key.data()
-            now = time.monotonic()
-            if now - checked >= 0.5:
-                checked = now
-                for connection in [one for one in self._timed() if (one.deadline or now) < now]:
-                    if connection.form and not connection.closing:
-                        self._send_close(
-                            connection, 1001, f"There was no request for {self._limits.silent_seconds:g} s."
-                        )
-                    else:
-                        self._drop(connection)
-
-    def close(self) -> None:
-        """Tell all clients that the server ends, and close their connections."""
-        for connection in list(self._connections):
-            if connection.form and not connection.closing:
-                self._send_close(connection, 1001, "The server ends.")
-            self._drop(connection)
-        self._selector.close()
-
-    def _timed(self) -> list[_Connection]:
-        """Return the connections with a deadline."""
-        return [connection for connection in self._connections if connection.deadline is not None]
-
-    # ---- connections without a worker
+        try:
+            while True:
+                if select.select([self._listener], [], [], _TICK_SECONDS)[0]:
+                    self._accept()
+                self._reap()
+                self._check_usage()
+        finally:
+            self._close()
 
     def _accept(self) -> None:
         try:
-            accepted, _ = self._listener.accept()
-        except OSError as error:
-            if error.errno in (errno.EMFILE, errno.ENFILE):
-                time.sleep(_NO_FILES_SECONDS)  # without a pause, the loop would try this all the time
-            return
-        if len(self._connections) >= self._limits.connections + WITHOUT_HANDSHAKE:
-            accepted.close()
-            return
-        accepted.setblocking(False)
-        connection = _Connection(accepted, time.monotonic() + _HANDSHAKE_SECONDS)
-        self._connections.add(connection)
-        self._selector.register(accepted, selectors.EVENT_READ, connection)
-
-    def _readable(self, connection: _Connection) -> None:
-        try:
-            data = connection.socket.recv(4096)
+            connection, _ = self._listener.accept()
         except BlockingIOError:
             return
-        except OSError:
-            data = b""
-        if not data:
-            self._drop(connection)
-        elif not connection.closing:
-            connection.received += data
-            if not connection.form:
-                self._shake_hands(connection)
-            if connection.form:
-                self._between_requests(connection)
-
-    def _shake_hands(self, connection: _Connection) -> None:
-        head, end, rest = connection.received.partition(b"\r\n\r\n")
-        if not end:
-            if len(head) > _HANDSHAKE_BYTES:
-                self._drop(connection)
+        except OSError:  # no file can be opened; without a pause, the loop would try this all the time
+            time.sleep(_TICK_SECONDS)
             return
-        protocol = ServerProtocol(subprotocols=[SUBPROTOCOL], select_subprotocol=_subprotocol)
-        protocol.receive_data(head + end)
-        events = protocol.events_received()
-        form: MessageForm | None = None
-        if not events or not isinstance(events[0], Request):
-            response = _response(http.HTTPStatus.BAD_REQUEST, "This is no request of HTTP.\n")
-        else:
-            request = events[0]
-            try:
-                form = form_of(request.path)
-                response = self._refused(request) or protocol.accept(request)
-            except (ValueError, LookupError):  # a malformed address or origin, or a header that is there twice
-                response = _response(http.HTTPStatus.BAD_REQUEST, "This is no handshake of a WebSocket.\n")
-        connection.received = rest
-        if not self._send(connection, response.serialize()):
+        connection.setblocking(True)
+        most = self._limits.connections
+        if len(self._children) >= most + REFUSING:
+            connection.close()
             return
-        if response.status_code != http.HTTPStatus.SWITCHING_PROTOCOLS:
-            self._close_soon(connection)
-            return
-        connection.deadline = time.monotonic() + self._limits.silent_seconds
-        connection.form = (ARRAYS if protocol.subprotocol == SUBPROTOCOL else form or GYMIE).name
-        if connection.socket.family != socket.AF_UNIX:
-            connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            _keep_alive(connection.socket)
+        full = sum(not child.refuses for child in self._children.values()) >= most
+        work = partial(self._work.serve_client, connection, self._settings, full=full)
+        self._fork(_Child(connection, refuses=full), work)
 
-    def _refused(self, request: Request) -> Response | None:
-        """Return the HTTP answer that refuses the request; None if it is a handshake, and the client may connect."""
-        path, origin = urlsplit(request.path).path, request.headers.get("Origin")
-        if "websocket" not in request.headers.get("Upgrade", "").lower():
-            return _response(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
-        if path.rstrip("/") != PATH:
-            return _response(http.HTTPStatus.NOT_FOUND, f"There is nothing here. Environments are served at {PATH}.\n")
-        if origin is not None and origin not in self._origins and urlsplit(origin).hostname not in _LOOPBACK:
-            return _response(
-                http.HTTPStatus.FORBIDDEN, "Pages of this origin may not connect; start the server with --origin.\n"
-            )
-        if form_of(request.path) is None:
-            return _response(http.HTTPStatus.BAD_REQUEST, UNKNOWN_FORM)
-        if len(self._connections) > self._limits.connections:
-            return _response(
-                http.HTTPStatus.SERVICE_UNAVAILABLE, f"There are {self._limits.connections} connections already.\n"
-            )
-        return None
-
-    def _between_requests(self, connection: _Connection) -> None:
-        """Answer pings and closes. At the first data frame, let the spawner start a worker for the connection."""
-        while len(connection.received) >= 2:
-            first, second = connection.received[:2]
-            opcode, length = first & 0x0F, second & 0x7F
-            if opcode not in CTRL_OPCODES or not first & 0x80 or first & 0x70 or not second & 0x80 or length > 125:
-                self._hand_over(connection)  # also for a malformed frame: the worker answers as the protocol demands
-                return
-            if len(connection.received) < 6 + length:
-                return
-            mask, payload = connection.received[2:6], connection.received[6 : 6 + length]
-            connection.received = connection.received[6 + length :]
-            payload = bytes(byte ^ mask[at % 4] for at, byte in enumerate(payload))
-            if opcode == Opcode.PING:
-                self._send(connection, Frame(Opcode.PONG, payload).serialize(mask=False))
-            elif opcode == Opcode.CLOSE:
-                self._send(connection, Frame(Opcode.CLOSE, _close_answer(payload)).serialize(mask=False))
-                self._drop(connection)
-                return
-
-    def _hand_over(self, connection: _Connection) -> None:
-        self._selector.unregister(connection.socket)
-        connection.deadline = None
-        self._last_number += 1
-        connection.number = self._last_number
-        self._with_worker[connection.number] = connection
-        received, connection.received = connection.received, b""
-        handover.send(
-            self._control, handover.NewConnection(connection.number, connection.form, received, connection.socket)
-        )
-
-    # ---- the end of workers, and of connections
-
-    def _listen_to_spawner(self) -> None:
-        data = self._control.recv(65536)
-        if not data:
-            raise EOFError("the process that starts workers has ended")
-        self._from_spawner += data
-        while (ended := handover.read_ended(self._from_spawner)) is not None:
-            connection = self._with_worker.pop(ended.number, None)
-            if connection is None:
-                continue
-            connection.number = 0
-            if not ended.code:
-                self._drop(connection)
-                continue
-            connection.socket.setblocking(False)
-            self._selector.register(connection.socket, selectors.EVENT_READ, connection)
-            self._send_close(connection, ended.code, ended.sentence)
-
-    def _send_close(self, connection: _Connection, code: int, sentence: str) -> None:
-        close = Close(code, reason(sentence)).serialize()
-        if self._send(connection, Frame(Opcode.CLOSE, close).serialize(mask=False)):
-            self._close_soon(connection)
-
-    def _close_soon(self, connection: _Connection) -> None:
-        """Send nothing more, and give the client time to read what it was sent."""
-        connection.closing = True
-        connection.deadline = time.monotonic() + _CLOSE_SECONDS
-        with contextlib.suppress(OSError):
-            connection.socket.shutdown(socket.SHUT_WR)
-
-    def _send(self, connection: _Connection, data: bytes) -> bool:
-        """Send a few bytes. Drop the client and return False if they cannot be sent at once."""
+    def _fork(self, child: _Child, work: Callable[[], None]) -> None:
+        """Let a new process do this work with a connection, or close the connection if no process can be started."""
+        parent = os.getpid()
+        sys.stdout.flush()
+        sys.stderr.flush()
         try:
-            if connection.socket.send(data, socket.MSG_DONTWAIT) == len(data):
-                return True
+            pid = os.fork()
         except OSError:
-            pass
-        self._drop(connection)
-        return False
-
-    def _drop(self, connection: _Connection) -> None:
-        if connection not in self._connections:
+            child.connection.close()
             return
-        self._connections.discard(connection)
-        if connection.number:
-            self._with_worker.pop(connection.number, None)
-        else:
-            with contextlib.suppress(KeyError, ValueError):
-                self._selector.unregister(connection.socket)
-        connection.form = ""
-        connection.socket.close()
+        if pid:
+            self._children[pid] = child
+            return
+        status = 1
+        try:
+            os.setsid()
+            linux.become_subreaper()
+            linux.die_with(parent)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_DFL)
+            self._listener.close()
+            for other in self._children.values():
+                other.connection.close()
+            work()
+            status = 0
+        except BaseException:  # noqa: BLE001 - it must not return into the loop of its parent
+            traceback.print_exc()
+        finally:
+            _exit(status)
+
+    def _check_usage(self) -> None:
+        """End connections whose environments have too many processes, or use too much memory."""
+        if time.monotonic() - self._usage_checked < _USAGE_SECONDS:
+            return
+        self._usage_checked = time.monotonic()
+        limits = self._limits
+        for pid in self._children:
+            started = linux.descendants(pid)
+            if len(started) > limits.processes:
+                self._end(pid, f"The environments started more than {limits.processes} processes; all were ended.")
+            elif sum(map(linux.used_megabytes, (pid, *started))) > limits.megabytes:
+                self._end(pid, f"The environments used more than {limits.megabytes} MB; their process was ended.")
+
+    def _end(self, pid: int, sentence: str, code: int = _FAILED) -> None:
+        self._children[pid].close = self._children[pid].close or (code, sentence)
+        _kill(pid)
+
+    def _reap(self) -> None:
+        """Collect processes that have ended, and kill the processes that these have left."""
+        for pid in list(self._children):
+            status = _ended(pid)
+            if status is None:
+                continue
+            child = self._children.pop(pid)
+            _kill(pid)  # its group; on Linux its other descendants become children of this process
+            close = child.close
+            if close is None and status != 0:
+                close = (_FAILED, self._how(status))
+            if close is None or child.refuses:
+                child.connection.close()
+            else:
+                goodbye = partial(self._work.say_goodbye, child.connection, *close)
+                self._fork(_Child(child.connection, refuses=True), goodbye)
+        for stray in linux.children(os.getpid()):
+            if stray not in self._children and stray not in self._others:
+                _kill(stray)
+                _ended(stray)
+
+    def _how(self, status: int) -> str:
+        """Say how a process has ended, by its wait status."""
+        if not os.WIFSIGNALED(status):
+            return f"The environment ended its process (exit status {os.WEXITSTATUS(status)})."
+        if os.WTERMSIG(status) == signal.SIGALRM:
+            return f"The environment took longer than {self._limits.seconds:g} s; its process was ended."
+        return f"The environment ended its process (signal {signal.Signals(os.WTERMSIG(status)).name})."
+
+    def _close(self) -> None:
+        """End all processes, and tell their clients that the server ends."""
+        self._listener.close()
+        until = time.monotonic() + _END_SECONDS
+        try:
+            for pid in self._children:
+                self._end(pid, "The server ends.", _AWAY)
+            while self._children and time.monotonic() < until:
+                self._reap()
+                time.sleep(0.01)
+        finally:
+            for pid in self._children:
+                _kill(pid)
+            self._reap()
 
 
-def _close_answer(payload: bytes) -> bytes:
-    """Return the payload that answers a client's close: the same, or a code for a malformed one (RFC 6455, 7.4.1)."""
+def _imported_without_threads() -> ModuleType:
+    """Import what a connection's process needs, so that it has it at once: importing takes half a second.
+
+    A fork has only one of its parent's threads. So OpenBLAS, which numpy brings, must start none: if a program has
+    imported numpy before, OpenBLAS itself takes care of that.
+    """
+    name = "OPENBLAS_NUM_THREADS"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
     try:
-        Close.parse(payload)
-    except ProtocolError:
-        return Close(CloseCode.PROTOCOL_ERROR, "").serialize()
-    except UnicodeDecodeError:
-        return Close(CloseCode.INVALID_DATA, "").serialize()
-    return payload
+        from trial.gym import connection  # noqa: PLC0415
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+    return connection
 
 
-def _subprotocol(_: ServerProtocol, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return SUBPROTOCOL if the client offers it; None for Gymie's clients and others that speak JSON."""
-    return SUBPROTOCOL if SUBPROTOCOL in offered else None
+def _ended(pid: int) -> int | None:
+    """Return the status of a process that has ended; None if it runs."""
+    try:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+    except ChildProcessError:
+        return 0
+    return status if ended else None
 
 
-def _response(status: http.HTTPStatus, text: str) -> Response:
-    body = text.encode()
-    headers = Headers(
-        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
-    )
-    return Response(status.value, status.phrase, headers, body)
+def _kill(pid: int) -> None:
+    """Kill a process, and its group if it has one of its own."""
+    for kill in (os.killpg, os.kill):
+        with contextlib.suppress(OSError):
+            kill(pid, signal.SIGKILL)
 
 
-def _keep_alive(connection: socket.socket) -> None:
-    """Let the system find out within about two minutes that a client has gone without a close."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
-        if hasattr(socket, name):
-            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+def _exit(status: int) -> NoReturn:
+    """End a forked process, which must not run what its parent does at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status)
+
+
+def unusable(error: OSError | UnicodeError) -> str:
+    """Return why a server cannot listen at an address."""
+    number = error.errno or 0 if isinstance(error, OSError) else 0
+    return os.strerror(number) if number > 0 else "there is no such host"  # getaddrinfo's numbers are negative
+
+
+def _interrupt(*_: object) -> NoReturn:
+    raise KeyboardInterrupt

@@ -2,7 +2,7 @@
 
 The package `websockets` handles all other frames. For a message of a hundred bytes it takes as long as a step of a
 small environment. So this module handles the most frequent messages: pictures and their acknowledgements
-(`player_socket.py`), and requests at `/gym` with their answers (`trial/gym/worker.py`).
+(`player_socket.py`).
 """
 
 from __future__ import annotations
@@ -14,31 +14,12 @@ try:
 except ImportError:  # a platform for which `websockets` has no wheel
     from websockets.utils import apply_mask as unmasked
 
-__all__ = ["BINARY", "TEXT", "UNMASKED", "WHOLE", "extent", "framed", "short_text", "unmasked"]
-
 TEXT, BINARY = 0x81, 0x82
 """The first byte of a message in one frame."""
-WHOLE = (TEXT, BINARY)
-
-UNMASKED = [2] * 126 + [4, 10]
-"""The offset of the payload in a frame without a mask, by the seven bits of the frame's length field."""
 
 _MASKED_HEADER = 6  # bytes before a short text of a client: two, and the mask
 _MIDDLE = struct.Struct("!BBH")
 _LONG = struct.Struct("!BBQ")
-
-
-def extent(data: bytes) -> tuple[int, int]:
-    """Return the offset and length of the first frame's payload; (0, 0) if its header is not complete."""
-    if len(data) < 2:
-        return 0, 0
-    length = data[1] & 0x7F
-    start = UNMASKED[length]
-    if len(data) < start:
-        return 0, 0
-    if length > 125:
-        length = int.from_bytes(data[2:start], "big")
-    return start + (4 if data[1] & 0x80 else 0), length
 
 
 def short_text(data: bytes) -> bytes | bytearray | None:

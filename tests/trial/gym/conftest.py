@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 @pytest.fixture(scope="session")
 def server() -> Iterator[GymServerProcess]:
     """A server with the environments of `odd_environments.py`, and limits that a test can reach."""
-    limits = ("--seconds", "1", "--environments", "8", "--processes", "4", "--megabytes", "300")
+    limits = ("--seconds", "2", "--processes", "4", "--megabytes", "300")
     with gym_server("--import", "odd_environments", *limits, cwd=HERE) as found:
         yield found
 

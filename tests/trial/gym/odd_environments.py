@@ -8,6 +8,7 @@ import mmap
 import os
 import subprocess
 import sys
+import threading
 import time
 from typing import Any, ClassVar
 
@@ -119,23 +120,19 @@ class Greedy(Calm):
 
 
 class GreedyShared(Calm):
-    """Each step takes 20 MB more of shared memory, which the limit of a process does not count."""
+    """Each step takes 40 MB more of shared memory, which the limit of a process does not count."""
 
-    kept: ClassVar[list[mmap.mmap]] = []
-
-    def misbehave(self) -> None:
-        self.kept.append(mmap.mmap(-1, 20 * 2**20))
-        self.kept[-1].write(bytes(20 * 2**20))
-
-
-class GreedyBesideSmall(GreedyShared):
-    """The same, beside programs that use hardly any memory."""
+    shared: ClassVar[list[mmap.mmap]] = []
 
     def misbehave(self) -> None:
-        if not self.kept:
-            for _ in range(4):
-                subprocess.Popen(["sleep", "300"])
-        super().misbehave()
+        self.shared.append(mmap.mmap(-1, 40 * 2**20))
+        self.shared[-1].write(bytes(40 * 2**20))
+
+
+class Threading(Calm):
+    def misbehave(self) -> None:
+        for _ in range(20):
+            threading.Thread(target=time.sleep, args=(300,), daemon=True).start()
 
 
 class GreedyTogether(Calm):
@@ -147,7 +144,6 @@ class GreedyTogether(Calm):
                 kept = np.ones(200 * 2**20 // 8)
                 time.sleep(300)
                 os._exit(int(kept[0]))
-        time.sleep(0.5)
 
 
 class Lacking(Calm):
@@ -184,5 +180,5 @@ class OldSeeded(Calm):
 
 
 OLD = (Old, OldSeeded)
-for made in (*Calm.__subclasses__(), GreedyBesideSmall, Calm):
+for made in (*Calm.__subclasses__(), Calm):
     gymnasium.register(f"Odd/{made.__name__}-v0", made, disable_env_checker=True, order_enforce=made not in OLD)

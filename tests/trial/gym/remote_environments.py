@@ -54,7 +54,7 @@ class Everything(gymnasium.Env[Any, Any]):
 
 
 class Numbers(gymnasium.Env[Any, Any]):
-    """An environment that vector environments can batch: episodes of different lengths, and infos of all kinds that they merge."""
+    """An environment with nested spaces, episodes of different lengths, and infos of all kinds."""
 
     observation_space = spaces.Dict(
         {

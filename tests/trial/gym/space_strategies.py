@@ -67,7 +67,6 @@ FIXED = st.one_of(
     float_boxes(),
     whole_boxes(),
     st.builds(lambda: spaces.Box(0, 1, (3,), bool)),
-    st.builds(lambda: spaces.Box(-np.inf, np.inf, (2,), np.int16)),
     discretes(),
     st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 4), st.lists(st.integers(1, 3), min_size=1, max_size=2))),
     multi_discretes(),

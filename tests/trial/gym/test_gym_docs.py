@@ -7,20 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from tests.trial.gym.served import serving
+from testing.gym_server import gym_server
 
 ROOT = Path(__file__).parents[3]
+COUNT = 3
 PROGRAMS = [
     found for found in re.findall(r"```python\n(.*?)```", (ROOT / "docs/gym.md").read_text(), re.S) if "Remote" in found
 ]
 
 
-@pytest.mark.parametrize("at", range(3))
+@pytest.mark.parametrize("at", range(COUNT))
 def test_the_programs_run(at: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(PROGRAMS) == 3
-    with serving() as (address, _):
+    assert len(PROGRAMS) == COUNT
+    with gym_server() as server:
         names: dict[str, object] = {}
-        exec(PROGRAMS[at].replace("ws://127.0.0.1:5000/", address), names)
+        exec(PROGRAMS[at].replace("127.0.0.1:5000", f"127.0.0.1:{server.port}"), names)
     if at == 0:
         assert names["most"] == 500
         assert capsys.readouterr().out == "500 steps\n"

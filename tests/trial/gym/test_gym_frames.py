@@ -56,14 +56,6 @@ def frame(said: bytes, opcode: Opcode = Opcode.TEXT, fin: bool = True) -> bytes:
 UNKNOWN = b'{"method": "none", "params": {}}'
 
 
-def test_two_requests_in_one_packet_are_answered_in_order(raw: RawConnection) -> None:
-    raw.say(frame(b'{"method": "one", "params": {}}') + frame(b'{"method": "two", "params": {}}'))
-    answer = b""
-    while answer.count(b"error") < 2:
-        answer += raw.socket.recv(65536)
-    assert answer.index(b"`one`") < answer.index(b"`two`")
-
-
 def test_a_request_sent_byte_by_byte_is_answered(raw: RawConnection) -> None:
     raw.say(*(bytes([byte]) for byte in frame(UNKNOWN)))
     assert b"MethodNotFound" in raw.hear().data
@@ -75,15 +67,6 @@ def test_a_request_in_fragments_with_a_ping_between_them_is_answered(raw: RawCon
     assert (pong.opcode, pong.data) == (Opcode.PONG, b"are you there")
     raw.say(frame(UNKNOWN[9:20], Opcode.CONT, fin=False), frame(UNKNOWN[20:], Opcode.CONT))
     assert b"MethodNotFound" in raw.hear().data
-
-
-def test_a_ping_between_requests_is_answered(raw: RawConnection) -> None:
-    raw.say(frame(b"first", Opcode.PING))
-    assert raw.hear().data == b"first"
-    raw.say(frame(UNKNOWN))
-    raw.hear()
-    raw.say(frame(b"second", Opcode.PING))
-    assert raw.hear().data == b"second"
 
 
 @pytest.mark.parametrize("length", [0, 1, 125, 126, 65535, 65536, 200_000])

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from testing.gym_server import TextClient
+from testing.gym_server import TextClient, gym_server
 from tests.trial.gym.odd_results import PICTURES, RESULTS
-from tests.trial.gym.served import serving
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError
 
 REFUSED = {
@@ -20,10 +19,10 @@ REFUSED = {
     "three values": "step() must return five values",
     "nothing": "step() must return five values",
     "generator": "step() must return five values",
-    "reward of text": "a reward that is no number: str",
-    "no reward": "a reward that is no number: NoneType",
-    "complex reward": "a reward that is no number: complex",
-    "huge reward": "OverflowError",
+    "reward of text": "a reward that cannot be a float: str",
+    "no reward": "a reward that cannot be a float: NoneType",
+    "complex reward": "a reward that cannot be a float: complex",
+    "huge reward": "a reward that cannot be a float: int",
     "info without end": "MemoryError",
 }
 ARRIVES: dict[str, tuple[Any, Any]] = {
@@ -32,15 +31,14 @@ ARRIVES: dict[str, tuple[Any, Any]] = {
     "info of text": (1.0, {"info": "word"}),
     "no info": (1.0, {}),
     "info with odd keys": (1.0, {"Key": 4}),
-    "array that is no list": (1.0, {}),
     "list": (1.0, {}),
 }
 
 
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
-    with serving("--import", "tests.trial.gym.odd_results", "--megabytes", "300") as (address, _):
-        yield address
+    with gym_server("--import", "tests.trial.gym.odd_results", "--megabytes", "300") as server:
+        yield server.url
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +49,7 @@ def env(url: str) -> Iterator[RemoteEnv]:
 
 @pytest.fixture(scope="module")
 def asking(url: str) -> Iterator[TextClient]:
-    with TextClient(f"{url}gym?form=gymnasium") as found:
+    with TextClient(f"{url}?form=gymnasium") as found:
         yield found
 
 
@@ -96,7 +94,7 @@ def test_a_result_that_can_be_sent_arrives(env: RemoteEnv, name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", [name for name in ARRIVES if name != "array that is no list"])
+@pytest.mark.parametrize("name", ARRIVES)
 def test_a_result_that_can_be_sent_arrives_in_json(asking: TextClient, instance_id: str, name: str) -> None:
     observation, reward, terminated, truncated, info = asking.ask(
         "step", instance_id=instance_id, action=action_named(name)
@@ -110,27 +108,15 @@ def test_a_result_that_can_be_sent_arrives_in_json(asking: TextClient, instance_
     )
 
 
-def test_an_array_that_cannot_become_a_list_gets_a_sentence_in_json(asking: TextClient, instance_id: str) -> None:
-    answer = asking.ask("step", instance_id=instance_id, action=action_named("array that is no list"))
-    assert "RuntimeError: no list" in answer["error"]["message"]
-
-
 def test_an_info_arrives_to_some_depth(env: RemoteEnv) -> None:
     env.reset()
     info = env.step(action_named("info too deep"))[4]
     assert isinstance(info["deep"][0][0][0][0], list)
 
 
-def test_an_environment_that_closes_the_connection_ends_it_with_a_sentence(url: str) -> None:
-    with RemoteEnv(url, "Odd/Results-v0") as env:
-        env.reset()
-        with pytest.raises(ConnectionLost, match="The environment ended its process"):
-            env.step(action_named("closed descriptors"))
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("raised", "WithoutText"), ("thing", "cannot be sent"), ("deep", "cannot be sent"), ("huge", "MemoryError")],
+    [("raised", "WithoutText"), ("huge", "MemoryError")],
 )
 def test_a_picture_that_cannot_be_drawn_gets_a_sentence(env: RemoteEnv, name: str, words: str) -> None:
     env.reset()

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.trial.gym.served import serving
+from testing.gym_server import gym_server
 from tests.trial.test_trial_tls import put
 from trial.gym import ConnectionLost, RemoteEnv
 
@@ -53,7 +53,7 @@ def relay(client: ssl.SSLSocket, port: int | None) -> None:
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     folder = tmp_path_factory.mktemp("certificate")
     put(folder, 1)
-    with serving() as (address, _), encrypted(address, folder) as relayed:
+    with gym_server() as server, encrypted(server.url, folder) as relayed:
         yield relayed, folder / "fullchain.pem"
 
 

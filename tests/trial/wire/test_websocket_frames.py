@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from trial.wire import websocket_frames as frames
-
-
-@given(st.binary(max_size=200), st.booleans())
-def test_frames_are_read_as_websockets_writes_them(said: bytes, mask: bool) -> None:
-    data = Frame(Opcode.BINARY, said).serialize(mask=mask)
-    start, length = frames.extent(data)
-    assert (start + length, length) == (len(data), len(said))
-    assert all(frames.extent(data[:few]) in ((0, 0), (start, length)) for few in range(len(data)))
 
 
 @pytest.mark.parametrize("length", [0, 125, 126, 65535, 65536])
