@@ -166,7 +166,7 @@ class _Server:
             os.setsid()
             linux.become_subreaper()
             linux.die_with(parent)
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
                 signal.signal(number, signal.SIG_DFL)
             self._listener.close()
             for other in self._children.values():
