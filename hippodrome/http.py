@@ -1,7 +1,6 @@
-"""Reads requests from events of API Gateway, and makes its responses: HTTP APIs (payloads 2.0 and 1.0) and REST APIs.
+"""Reads requests from events of API Gateway's HTTP APIs, and makes its responses, both of payload format 2.0.
 
-Formats: https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html and, of
-REST APIs, https://docs.aws.amazon.com/apigateway/latest/developerguide/set-up-lambda-proxy-integrations.html
+https://docs.aws.amazon.com/apigateway/latest/developerguide/http-api-develop-integrations-lambda.html
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import binascii
 import gzip
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
@@ -37,37 +36,24 @@ _COMMON_HEADERS = {
 
 @dataclass(frozen=True)
 class Request:
-    """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded.
-
-    `path` is the path within the API. If the API has a named stage, clients may see another path: the gateway puts the
-    stage in front, or a custom domain maps another path to it. The event does not say which
-    (CodeGenieApp/serverless-express, issue 465), so `own_path` is False then.
-    """
+    """One HTTP request. `query` has every field in order; `body` is None if it could not be decoded."""
 
     method: str
     path: str
     query: tuple[tuple[str, str], ...] | None  # None: the query is malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
-    own_path: bool = True  # whether `path` is also the path that clients see
-    binary: bool = True  # the gateway decodes responses in base64; a REST API does so only if it is told to
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> Request:
         """Read an event of API Gateway. No request of a client makes this raise."""
-        context = event.get("requestContext") or {}
-        second = event.get("version") == "2.0" or "http" in context or "rawQueryString" in event
-        method = (context.get("http") or {}).get("method") if second else event.get("httpMethod")
-        rest = "httpMethod" in event and "version" not in event
-        own_path = context.get("stage") in (None, "", "$default")
+        http = (event.get("requestContext") or {}).get("http") or {}
         return cls(
-            method=str(method or context.get("httpMethod") or "GET").upper(),
-            path=_path(event, "rawPath" if second else "path", own_path),
-            query=_raw_query(event) if second else _parsed_query(event),
+            method=str(http.get("method") or "GET").upper(),
+            path=str(event.get("rawPath") or "/"),
+            query=_query(event),
             headers=_headers(event),
             body=_body(event),
-            own_path=own_path,
-            binary=not rest,
         )
 
     def query_value(self, name: str) -> str | None:
@@ -105,78 +91,38 @@ class Request:
 
     @property
     def accepts_gzip(self) -> bool:
-        """Whether the client accepts gzip, and the gateway can return a binary body."""
-        return self.binary and _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
-
-    def steps_folder(self, project_id: str) -> str:
-        """Return the address of the project's files, relative to this request's address; it ends with a slash."""
-        return f"{'/' if self.own_path else ''}steps/{project_id}/"
+        """Whether the client accepts gzip."""
+        return _GZIP.search(self.headers.get("accept-encoding", "").lower()) is not None
 
     def url(self, **changes: str) -> str:
         """Return this request's address, relative to the host, with these query fields set.
 
         The result goes into headers, so the path, which arrives decoded, is encoded again. It never begins with `//`,
-        which would name another host. If `self.own_path` is False, the result is the query alone, which browsers add to
-        the path that they see.
+        which would name another host.
         """
         kept = [(key, value) for key, value in self.query or () if key not in changes]
-        if not self.own_path:
-            return f"?{urlencode([*kept, *changes.items()])}"
         path = quote("/" + self.path.lstrip("/\\"), safe="/:@!$&'()*+,;=~", errors="replace")
         return f"{path}?{urlencode([*kept, *changes.items()])}"
 
 
-def _path(event: Mapping[str, Any], key: str, own_path: bool) -> str:
-    """The path within the API. The route, if the event has it, says which part in front is a stage's or a domain's."""
-    path = str(event.get(key) or "/")
-    route = str(event.get("resource") or event.get("routeKey") or "").rpartition(" ")[2]
-    if own_path or not route.startswith("/"):
-        return path
-    greedy = re.fullmatch(r"(.*/)\{(\w+)\+\}", route)
-    if greedy:
-        rest = (event.get("pathParameters") or {}).get(greedy[2])
-        return path if rest is None else f"{greedy[1]}{rest}"
-    count = route.rstrip("/").count("/")
-    return "/" + "/".join(path.rstrip("/").split("/")[-count:] if count else ())
-
-
-def _raw_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
+def _query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
+    """The fields of the query. A link may have been copied from HTML, where `&` is written `&amp;`."""
     raw = event.get("rawQueryString") or ""
     try:
         raw.encode()  # half a surrogate pair could be neither stored nor sent back
         query = parse_qsl(raw, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS, errors="strict")
     except ValueError:
         return None
-    return _from_html(query)
-
-
-def _parsed_query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:
-    """The query of payload format 1.0, which arrives decoded. `queryStringParameters` has only one value per field."""
-    several = event.get("multiValueQueryStringParameters") or {
-        key: [value] for key, value in (event.get("queryStringParameters") or {}).items()
-    }
-    query = tuple((str(key), str(value)) for key, values in several.items() for value in values or ())
-    try:
-        for key, value in query:
-            f"{key}{value}".encode()
-    except ValueError:
-        return None
-    return _from_html(query) if len(query) <= MAX_QUERY_FIELDS else None
-
-
-def _from_html(query: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
-    """The fields of a link that may have been copied from HTML, where `&` is written `&amp;`."""
     return tuple((re.sub(r"\A(?:amp;)+", "", name), value) for name, value in query)
 
 
 def _headers(event: Mapping[str, Any]) -> dict[str, str]:
-    """The headers, with names in lower case. Several values of one header are joined by commas, as in format 2.0.
+    """The headers, with names in lower case.
 
     Bytes that are not UTF-8 arrive from a web server as halves of surrogate pairs; here each becomes a question mark.
     """
-    several = {key: ",".join(map(str, values or ())) for key, values in (event.get("multiValueHeaders") or {}).items()}
-    values = {**(event.get("headers") or {}), **several}
-    return {str(key).lower(): str(value).encode("utf-8", "replace").decode() for key, value in values.items()}
+    headers = event.get("headers") or {}
+    return {str(key).lower(): str(value).encode("utf-8", "replace").decode() for key, value in headers.items()}
 
 
 def _body(event: Mapping[str, Any]) -> bytes | None:

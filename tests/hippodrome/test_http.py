@@ -42,7 +42,6 @@ def test_an_empty_event_is_a_get_of_the_root(event: dict[str, Any]) -> None:
     [
         ({"version": "2.0", "rawPath": "/a"}, "GET"),
         ({"requestContext": {"http": {"method": "PUT"}}, "rawPath": "/a"}, "PUT"),
-        ({"requestContext": {"httpMethod": "post"}, "path": "/a"}, "POST"),
     ],
 )
 def test_an_event_that_lacks_some_parts_is_read_by_those_it_has(event: dict[str, Any], method: str) -> None:
@@ -76,65 +75,6 @@ def test_a_header_that_is_not_utf_8_can_be_stored() -> None:
 
 def test_half_of_a_surrogate_pair_in_a_body_becomes_bytes_that_are_no_text() -> None:
     assert Request.from_event({"body": "\ud800"}).body == b"\xed\xa0\x80"
-
-
-@pytest.mark.parametrize(
-    ("given", "query"),
-    [
-        ({"multiValueQueryStringParameters": {"a": ["1", "2"]}, "queryStringParameters": {"a": "2"}}, "a=1&a=2"),
-        ({"queryStringParameters": {"a": "1", "b": ""}}, "a=1&b="),
-        ({"queryStringParameters": None, "multiValueQueryStringParameters": None}, ""),
-        ({"multiValueQueryStringParameters": {"a": ["1 + 1", "ü&"]}}, "a=1+%2B+1&a=%C3%BC%26"),
-        ({"multiValueQueryStringParameters": {"a": None}}, ""),
-        ({"multiValueQueryStringParameters": {"a": ["1"] * 64}}, "&".join(["a=1"] * 64)),
-    ],
-)
-def test_the_query_of_payload_format_1_is_decoded_already(given: dict[str, Any], query: str) -> None:
-    assert Request.from_event({"httpMethod": "GET", "path": "/next", **given}).query == request(query).query
-
-
-@pytest.mark.parametrize("values", [["\ud800"], ["1"] * 65])
-def test_a_malformed_query_of_payload_format_1_is_none(values: list[str]) -> None:
-    assert Request.from_event({"httpMethod": "GET", "multiValueQueryStringParameters": {"a": values}}).query is None
-
-
-def test_several_values_of_a_header_are_joined_as_in_payload_format_2() -> None:
-    event = {"httpMethod": "POST", "headers": {"Accept": "b"}, "multiValueHeaders": {"Accept": ["a", "b"], "X": None}}
-    read = Request.from_event(event)
-    assert (read.method, read.headers) == ("POST", {"accept": "a,b", "x": ""})
-
-
-@pytest.mark.parametrize(
-    ("event", "path"),
-    [
-        ({"resource": "/next", "path": "/next"}, "/next"),
-        ({"resource": "/next", "path": "/hippo/next"}, "/next"),  # of a custom domain with a base path
-        ({"resource": "/next", "path": "/hippo/next/"}, "/next"),
-        ({"resource": "/a/X", "path": "/hippo/a/X"}, "/a/X"),  # only a slash at the end does not count
-        ({"resource": "/", "path": "/live"}, "/"),  # as HIPPO's API is set up
-        ({"resource": "/", "path": "/"}, "/"),
-        ({"resource": "/steps/{projectId}/{file}", "path": "/a/b/steps/maze/x.png"}, "/steps/maze/x.png"),
-        ({"resource": "/{all+}", "path": "/a/next", "pathParameters": {"all": "next"}}, "/next"),
-        ({"resource": "/{all+}", "path": "/next", "pathParameters": None}, "/next"),
-        ({"resource": "/steps/{all+}", "path": "/a/steps/b/c", "pathParameters": {"all": "b/c"}}, "/steps/b/c"),
-        ({"version": "2.0", "routeKey": "GET /next", "rawPath": "/live/next"}, "/next"),
-        ({"path": "/next"}, "/next"),
-        ({}, "/"),
-    ],
-)
-def test_a_stage_or_a_base_path_is_no_part_of_the_path(event: dict[str, Any], path: str) -> None:
-    read = Request.from_event({"httpMethod": "GET", "requestContext": {"stage": "live"}, **event})
-    assert (read.path, read.own_path) == (path, False)
-    assert read.url(a="1") == "?a=1"
-
-
-@pytest.mark.parametrize("stage", [{"stage": "$default"}, {"stage": ""}, {}])
-@pytest.mark.parametrize("route", ["GET /next", "$default", "ANY /{proxy+}"])
-def test_without_a_stage_the_path_is_the_one_that_browsers_see(route: str, stage: dict[str, str]) -> None:
-    context = {**stage, "http": {"method": "GET"}}
-    event = {"version": "2.0", "routeKey": route, "rawPath": "//evil/next", "requestContext": context}
-    read = Request.from_event(event)
-    assert (read.path, read.own_path, read.url()) == ("//evil/next", True, "/evil/next?")
 
 
 @pytest.mark.parametrize("query", ["a=%ff", "a=\ud800", "&".join(["a=1"] * 65)])
@@ -189,22 +129,6 @@ def test_gzip_is_accepted_if_the_header_says_so(header: str, accepted: bool) -> 
     assert request().accepts_gzip is False
 
 
-@pytest.mark.parametrize(
-    ("event", "decoded"),
-    [
-        (
-            {"httpMethod": "GET", "path": "/next"},
-            False,
-        ),  # of a REST API, which decodes no response unless it is told to
-        ({"version": "1.0", "httpMethod": "GET", "path": "/next"}, True),
-        ({"version": "2.0", "rawPath": "/next"}, True),
-    ],
-)
-def test_gzip_needs_a_gateway_that_decodes_responses(event: dict[str, Any], decoded: bool) -> None:
-    assert Request.from_event({**event, "headers": {"Accept-Encoding": "gzip"}}).accepts_gzip is decoded
-    assert not Request.from_event({**event, "headers": {"Accept-Encoding": "br"}}).accepts_gzip
-
-
 def test_a_page_of_another_site_that_asks_for_json_is_a_front_end() -> None:
     assert request(accept="application/json", origin="https://play.example.org").is_front_end is True
     assert request(accept="application/json").is_front_end is False
@@ -215,11 +139,6 @@ def test_a_page_of_another_site_that_asks_for_json_is_a_front_end() -> None:
 def test_the_gateway_says_whether_a_browser_spoke_tls(header: str, https: bool) -> None:
     assert request(x_forwarded_proto=header).is_https is https
     assert request().is_https is False
-
-
-def test_the_folder_of_a_projects_files_is_beside_the_page_if_the_path_that_clients_see_is_not_known() -> None:
-    assert Request("GET", "/next", (), {}).steps_folder("demo") == "/steps/demo/"
-    assert Request("GET", "/next", (), {}, own_path=False).steps_folder("demo") == "steps/demo/"
 
 
 def test_a_requests_own_url_keeps_the_query_and_never_names_another_host() -> None:

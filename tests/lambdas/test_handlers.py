@@ -6,7 +6,6 @@ import base64
 import gzip
 import io
 import json
-import re
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -18,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome.model import ids, messages, server
-from hippodrome.model.project import Events, step_key
+from hippodrome.model.project import Events
 from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.ports import DnsRecord, Topic
 from hippodrome.servers.causes import Cause
@@ -38,7 +37,6 @@ from lambdas import (
 from testing import aws_events, studies
 from testing.exploration import examples
 from testing.fake_platform import FakePlatform
-from testing.visitors import body_of
 
 PROJECT = "ms-pacman"
 SECRET = "xyzzy-do-not-log"
@@ -151,59 +149,6 @@ def test_a_posted_json_form_is_answered_with_json(platform: FakePlatform) -> Non
     assert answer["headers"]["Content-Type"] == "application/json"
     assert answer["headers"]["Content-Encoding"] == "gzip"
     assert set(json.loads(gzip.decompress(base64.b64decode(answer["body"])))) >= {"page", "css"}
-
-
-@pytest.mark.parametrize("payload", ["rest_get", "http_get_format_1", "http_get_stage"])
-def test_events_of_other_formats_get_the_same_page(platform: FakePlatform, payload: str) -> None:
-    """A REST API, and an HTTP API with payload format 1.0 or a named stage: the same page."""
-    plain = {**aws_events.load("http_get"), "requestContext": {"http": {"method": "GET"}}}
-    answer, usual = (next_step.handler(event, None) for event in (aws_events.load(payload), plain))
-    assert answer["statusCode"] == 200
-    shown, expected = (_form_fields(text) for text in (answer, usual))
-    assert shown == expected
-
-
-def _form_fields(answer: dict[str, Any]) -> list[str]:
-    text = body_of(answer).decode()
-    return re.findall(r'<input type="hidden" name="[^"]+" value="[^"]+"', text)
-
-
-@pytest.mark.parametrize(("payload", "address"), [
-    ("http_get", "/next?"), ("http_get_format_1", "/next?"), ("rest_get", "?"), ("http_get_stage", "?"),
-])  # fmt: skip
-def test_a_form_goes_to_the_address_that_the_browser_sees(platform: FakePlatform, payload: str, address: str) -> None:
-    """With a named stage, the address is not known, so the form's address is only its query."""
-    page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
-    assert f'action="{address}projectId={PROJECT}&amp;userId=R_3fGxW2vPqT9aBcD"' in page
-
-
-@pytest.mark.parametrize(("payload", "folder"), [("http_get", "/steps/"), ("rest_get", "steps/")])
-def test_the_address_of_a_picture_includes_the_stage(platform: FakePlatform, payload: str, folder: str) -> None:
-    for n in (0, 1):
-        platform.documents.put(step_key(PROJECT, f"consent-{n}"), b'<img src="maze.png">')
-    page = body_of(next_step.handler(aws_events.load(payload), None)).decode()
-    assert f'src="{folder}{PROJECT}/maze.png"' in page
-
-
-def test_a_rest_api_gets_no_body_in_base64(platform: FakePlatform) -> None:
-    """Unless its binaryMediaTypes say so, a REST API does not decode a body in base64."""
-    assert next_step.handler(aws_events.load("http_get_format_1"), None)["isBase64Encoded"]
-    assert not next_step.handler(aws_events.load("rest_get"), None)["isBase64Encoded"]
-
-
-def test_a_request_without_a_query_gets_an_error_page(platform: FakePlatform) -> None:
-    """In such an event `queryStringParameters` is null."""
-    answer = next_step.handler(aws_events.load("rest_get_without_query"), None)
-    assert (answer["statusCode"], json.loads(answer["body"])["page"]) == (400, "Project ID Not Found")
-
-
-def test_a_post_through_a_rest_api_is_stored(platform: FakePlatform) -> None:
-    next_step.handler(aws_events.load("rest_get"), None)
-    answer = next_step.handler(aws_events.load("rest_post_json"), None)
-    assert (answer["statusCode"], answer["headers"]["Access-Control-Allow-Origin"]) == (200, "*")
-    assert json.loads(answer["body"])["step"] == "2"
-    stored = json.loads(platform.documents.kept[f"{PROJECT}/users/R_3fGxW2vPqT9aBcD/answers/1.json"][0])
-    assert stored["answers"] == {"age": "34", "comment": "Très bien ✓"}
 
 
 def test_a_start_message_directly_from_the_topic_starts_one_server(platform: FakePlatform) -> None:

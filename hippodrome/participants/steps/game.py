@@ -68,7 +68,7 @@ class GameStep:
         view = replace(
             view,
             texts={key: (source.text, source.values) for key, source in sources.items()},
-            files=request.steps_folder(project.id),
+            files=f"/steps/{project.id}/",
         )
         with rendering(visit, *sources.values()):
             page = pages.game_page(view)

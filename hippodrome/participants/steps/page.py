@@ -31,7 +31,7 @@ class PageStep:
             values=source.values,
             ticket=ids.ticket(project.secret, visit.user_id, step.key),
             action=visit.request.url(),
-            files=visit.request.steps_folder(project.id),
+            files=f"/steps/{project.id}/",
             final=step.key == project.final.key,
             answered=step.key in visit.progress.answered,
         )
