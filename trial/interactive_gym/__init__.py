@@ -1,7 +1,7 @@
-"""Runs experiments that were written for Interactive Gym, with its modules and names.
+"""Runs experiments that were written for Interactive Gym: `python -m trial.interactive_gym experiment.py`.
 
-`from trial import RemoteConfig`, and the other names in `trial.__getattr__`, import modules of this package.
-docs/interactive-gym.md says what each option becomes here. On the researcher's machine `server_app.run(config)` makes
-a project from the experiment (`project.py`). On a participant's server the project's agent.py loads the experiment's
-file (`on_server.py`).
+`script.py` runs the experiment's own script, in which Interactive Gym's module names lead to modules of this package,
+until it calls `run`. On the researcher's machine `project.py` then makes a project of the experiment; `options.py` has
+the key of config.yml for each option. On a participant's server, the project's agent.py runs the script once more, and
+`playing.py` calls its functions. docs/interactive-gym.md is for researchers.
 """

@@ -1,91 +1,40 @@
-"""The agent and the policies of the project that `server_app.run` makes from an experiment.
-
-The project's agent.py gets them from `on_server.py`.
-"""
+"""Plays an experiment: the agent and the policies of the project's agent.py, which call the experiment's functions."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from protocol import environment as variables
-from trial.interactive_gym.configuration_constants import PolicyTypes
-from trial.interactive_gym.object_contexts import fields_of
-from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.remote_game import RemoteGame
-
-
-class Unplayable(ValueError):
-    """The experiment cannot be played here. The message is for the researcher."""
+from trial.interactive_gym import inference, script
+from trial.interactive_gym.game import RemoteGame
+from trial.interactive_gym.objects import fields_of
+from trial.interactive_gym.options import RemoteConfig, Unplayable
 
 
 class Several:
-    """Wraps an environment with several players: adds the attributes by which a PettingZoo `ParallelEnv` names them."""
+    """An environment with several players, which names them as a PettingZoo `ParallelEnv` does."""
 
     def __init__(self, env: Any, players: Iterable[Any]) -> None:
         self.env = env
         self.possible_agents = list(players)
 
-    @property
-    def unwrapped(self) -> Any:
-        """The environment itself."""
-        return getattr(self.env, "unwrapped", self.env)
-
-    def action_space(self, player: Any) -> Any:
-        """Return the space of a player's actions; None if it is not known."""
-        return space_of(self.env, "action_space", player)
-
-    def observation_space(self, player: Any) -> Any:
-        """Return the space of a player's observations; None if it is not known."""
-        return space_of(self.env, "observation_space", player)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
 
 
-def space_of(env: Any, name: str, player: Any) -> Any:
-    """Return a player's space, by a method, a map by player, or the space of all players; None if it is not known."""
-    for attribute in (getattr(env, name, None), getattr(env, f"{name}s", None)):
-        if callable(attribute) and not hasattr(attribute, "sample"):
-            try:
-                return attribute(player)
-            except (KeyError, TypeError, NotImplementedError):
-                continue
-        # `key in space` would ask a Dict space whether the key is a sample of it: so take its dict.
-        by_player = getattr(attribute, "spaces", attribute)
-        if isinstance(by_player, Mapping):
-            if player in by_player:
-                return by_player[player]
-        elif attribute is not None:
-            return attribute
-    return None
-
-
-def mapping_of(config: RemoteConfig) -> dict[Any, Any]:
-    """Return `policy_mapping`. If it is empty, the only player is human: `human_id`, or else player_0."""
-    if config.policy_mapping:
-        return dict(config.policy_mapping)
-    return {"player_0" if config.human_id is None else config.human_id: PolicyTypes.Human}
-
-
-def humans_of(config: RemoteConfig) -> list[Any]:
-    """Return the players that participants play."""
-    return [player for player, plays in mapping_of(config).items() if plays == PolicyTypes.Human]
-
-
-def make_environment(config: RemoteConfig) -> Any:
-    """Make an environment as Interactive Gym does.
-
-    Raises Unplayable if the config does not say how, and what the experiment's code raises.
-    """
+def _make_environment(config: RemoteConfig) -> Any:
+    """Make an environment as Interactive Gym does. Raises Unplayable if the config does not say how."""
     if config.env_creator is not None:
         return config.env_creator(**config.env_config, render_mode="rgb_array")
-    if config.environment_initialization_code:
-        names: dict[str, Any] = {"__name__": "environment_initialization"}
-        exec(compile(config.environment_initialization_code, "environment_initialization_code", "exec"), names)  # noqa: S102 - the researcher's own code
-        if "env" not in names:
-            raise Unplayable("environment_initialization_code makes no variable env")
-        return names["env"]
-    raise Unplayable("there is no environment: give environment(env_creator=…) a function that makes it")
+    names: dict[str, Any] = {"__name__": "environment_initialization"}
+    code = config.environment_initialization_code
+    exec(compile(code, "environment_initialization_code", "exec"), names)  # noqa: S102 - the researcher's own code
+    if "env" not in names:
+        raise Unplayable("there is no environment: give environment(env_creator=…) a function that makes it")
+    return names["env"]
 
 
 class ExperimentAgent:
@@ -93,9 +42,12 @@ class ExperimentAgent:
 
     def __init__(self, config: RemoteConfig) -> None:
         self._config = config
+        self._players = config.policy_mapping
         self._raw: Any = None  # the experiment's environment
-        self._first = True  # whether the next picture is the episode's first
-        self.game: RemoteGame | None = None
+        self._takes_map = True  # whether the environment's `step` gets a map of actions by player
+        self._first_step = True
+        self._first_picture = True  # of the episode
+        self.game: Any = None
         self.env: Any = None
         self.several = False
 
@@ -103,53 +55,46 @@ class ExperimentAgent:
 
     def start(self, _game: str | None = None) -> Any:
         """Make the environment, and return it."""
-        config = self._config
-        self._raw = make_environment(config)
-        players = mapping_of(config)
-        self.several = len(players) > 1 or _has_players(self._raw)
-        self.game = RemoteGame(config, self._raw, players, os.environ.get(variables.USER_ID, ""))
-        self.env = Several(self._raw, players) if self.several else self._raw
+        self._raw = _make_environment(self._config)
+        has_players = isinstance(getattr(self._raw, "action_spaces", None), Mapping)
+        self.several = len(self._players) > 1 or has_players or bool(getattr(self._raw, "possible_agents", None))
+        self.game = RemoteGame(self._config, self._raw, self._players, os.environ.get(variables.USER_ID, ""))
+        self.env = Several(self._raw, self._players) if self.several else self._raw
         return self.env
 
     def reset(self, seed: int | None = None) -> Any:
         """Begin an episode. Return its observation and infos."""
-        game = self._game
+        game = self.game
         alone = len(game.human_players) == 1
         for key in game.human_players:  # with several participants, the researcher's code gets no participant's id
             game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
         observation, infos = map(self._own, result if isinstance(result, tuple) and len(result) == 2 else (result, {}))
         game.began(observation, infos)
-        self._first = True
+        self._first_picture = True
         return observation, infos
 
     def step(self, action: Any) -> Any:
         """Take one step with an action, or with a map of the players' actions. Return the environment's five values."""
-        game = self._game
-        actions = action if isinstance(action, Mapping) else dict.fromkeys(mapping_of(self._config), action)
-        # Interactive Gym's games in the browser give a map to every environment, also to one with a single player.
-        by_player = self.several or self._config.run_through_pyodide
-        result = tuple(map(self._own, self._raw.step(actions if by_player else action)))
-        game.stepped(actions, result)
+        actions = action if isinstance(action, Mapping) else dict.fromkeys(self._players, action)
+        result = tuple(map(self._own, self._step(actions)))
+        self.game.stepped(actions, result)
         return result
 
     def render(self) -> Any:
         """Return the present picture: objects with the HUD's text, or pixels."""
-        config, game = self._config, self._game
-        hud = "" if config.hud_text_fn is None else str(config.hud_text_fn(game))
+        config = self._config
+        hud = "" if config.hud_text_fn is None else str(config.hud_text_fn(self.game))
         if config.env_to_state_fn is None:
             drawn = self._raw.render()
             if not isinstance(drawn, list):
                 return drawn
         else:
             drawn = config.env_to_state_fn(self._raw, config)
-        objects = [fields_of(each) for each in drawn]
-        pixels = next((each for each in objects if _kind(each) == "rendered_env_rgb"), None)
-        if pixels is not None:
-            return _pixels(pixels)
-        if self._first:
-            self._first = False
-            objects = [*({**fields_of(each), "permanent": True} for each in config.state_init), *objects]
+        objects = [fields_of(thing) for thing in drawn]
+        if self._first_picture:
+            self._first_picture = False
+            objects = [*({**fields_of(thing), "permanent": True} for thing in config.state_init), *objects]
         return {"objects": objects, "hud": hud}
 
     def close(self) -> None:
@@ -158,15 +103,23 @@ class ExperimentAgent:
         if callable(close):
             close()
 
+    def _step(self, actions: Mapping[Any, Any]) -> Any:
+        """Take one step. As in Interactive Gym, an environment that refuses a map of one player gets the action."""
+        first, self._first_step = self._first_step, False
+        if self._takes_map:
+            try:
+                return self._raw.step(actions)
+            except (AssertionError, TypeError, KeyError, IndexError, ValueError):
+                if self.several or not first:
+                    raise
+                self._takes_map = False
+        return self._raw.step(next(iter(actions.values())))
+
     def _own(self, value: Any) -> Any:
         """Return the value of the only player, if the environment returned a map by player for a single one."""
-        players = mapping_of(self._config)
-        return value[next(iter(players))] if not self.several and _is_by_player(value, players) else value
-
-    @property
-    def _game(self) -> RemoteGame:
-        assert self.game is not None, "start() comes first"
-        return self.game
+        if self.several or not isinstance(value, Mapping) or value.keys() != self._players.keys():
+            return value
+        return value[next(iter(self._players))]
 
 
 class ListeningAgent(ExperimentAgent):
@@ -178,105 +131,75 @@ class ListeningAgent(ExperimentAgent):
 
     def on_episode_start(self, session: Any) -> Any:
         """Call the experiment's `on_episode_start`, and `on_game_tick_start` for the first step."""
-        self._tell(session, "on_episode_start", "on_game_tick_start")
+        self._call(session, "on_episode_start", "on_game_tick_start")
 
     def on_tick(self, session: Any) -> Any:
         """Call the experiment's callbacks of a step, and `on_game_tick_start` for the next step."""
-        more = () if self._game.over else ("on_game_tick_start",)
-        self._tell(session, "on_game_tick_end", "on_graphics_start", "on_graphics_end", *more)
+        next_step = () if self.game.over else ("on_game_tick_start",)
+        self._call(session, "on_game_tick_end", "on_graphics_start", "on_graphics_end", *next_step)
 
     def on_episode_end(self, session: Any) -> Any:
         """Call the experiment's `on_episode_end`."""
-        self._tell(session, "on_episode_end")
+        self._call(session, "on_episode_end")
 
     def on_session_end(self, session: Any) -> Any:
         """Call the experiment's `on_game_end` if the game ends in the middle of an episode, as Interactive Gym does."""
-        if not self._game.over:
-            self._tell(session, "on_game_end")
+        if not self.game.over:
+            self._call(session, "on_game_end")
 
-    def _tell(self, session: Any, *events: str) -> None:
-        """Call these methods of the callback, and record what each returns.
-
-        If a method raises, the others are still called. Then the first exception is raised.
-        """
-        game, raised = self._game, []
-        game.record = session.record
+    def _call(self, session: Any, *events: str) -> None:
+        """Call these methods of the callback, and record what each returns."""
+        self.game.record = session.record
         for event in events:
             method = getattr(self._config.callback, event, None)
-            if callable(method):
-                try:
-                    value = method(game)
-                except Exception as error:  # noqa: BLE001 - the callback's other methods are still called
-                    raised.append(error)
-                else:
-                    if value is not None:
-                        session.record(event, value)
-        if raised:
-            raise raised[0]
+            value = method(self.game) if callable(method) else None
+            if value is not None:
+                session.record(event, value)
 
 
-def agent_class(config: RemoteConfig) -> type:
-    """Make the class `Agent` for the project's agent.py."""
-    base = ExperimentAgent if config.callback is None else ListeningAgent
-
-    class Agent(base):  # type: ignore[misc, valid-type]
-        """The experiment's agent."""
-
-        def __init__(self) -> None:
-            super().__init__(config)
-
-    return Agent
+def functions_of(config: RemoteConfig, plays: Any) -> tuple[Any, Any]:
+    """Return the functions that load and ask a policy. For an ONNX file without functions they are `inference.py`'s."""
+    if isinstance(plays, str) and plays.endswith(".onnx") and config.policy_inference_fn is None:
+        return inference.load_onnx_policy_fn, inference.onnx_model_inference_fn
+    return config.load_policy_fn, config.policy_inference_fn
 
 
-def policy_class(config: RemoteConfig, player: Any, locate: Callable[[Any], Any]) -> type:
-    """Make a class for agent.py that plays this player by the experiment's functions.
+class Experiment:
+    """The experiment of a project, for its agent.py."""
 
-    `locate` gets the value in `policy_mapping`. If this names a file, it returns the file's path, else the value.
-    """
+    def __init__(self, agent_file: str, script_path: str, arguments: Sequence[str]) -> None:
+        """Run the experiment's script, a copy in the folder of agent.py. Raises Unplayable, and what it raises."""
+        self._folder = Path(agent_file).resolve().parent
+        self._config, _ = script.load(script_path, arguments, self._folder)
 
-    class Policy:
-        """A policy of the experiment."""
+    def agent(self) -> type:
+        """Make the class `Agent` for agent.py."""
+        config = self._config
+        base = ExperimentAgent if config.callback is None else ListeningAgent
 
-        def __init__(self) -> None:
-            plays = locate(config.policy_mapping[player])
-            self._policy = plays if config.load_policy_fn is None else config.load_policy_fn(plays)
+        class Agent(base):  # type: ignore[misc, valid-type]
+            """The experiment's agent."""
 
-        def act(self, observation: Any, _info: Any) -> int:
-            """Choose an action by the experiment's function."""
-            if config.policy_inference_fn is not None:
-                return int(config.policy_inference_fn(observation, self._policy))
-            return int(self._policy(observation))
+            def __init__(self) -> None:
+                super().__init__(config)
 
-    return Policy
+        return Agent
 
+    def policy(self, player: Any) -> type:
+        """Make a class for agent.py that plays this player by the experiment's functions."""
+        plays = self._config.policy_mapping[player]
+        load, choose = functions_of(self._config, plays)
+        if isinstance(plays, str) and (self._folder / plays).is_file():
+            plays = str(self._folder / plays)
 
-def located(folder: Path) -> Callable[[Any], Any]:
-    """Make the argument `locate` of `policy_class`: it finds policies' files in the project's folder."""
+        class Policy:
+            """A policy of the experiment."""
 
-    def locate(name: Any) -> Any:
-        if isinstance(name, str | os.PathLike):
-            for path in (folder / name, folder / "policies" / Path(name).name):
-                if path.is_file():
-                    return str(path)
-        return name
+            def __init__(self) -> None:
+                self._policy = plays if load is None else load(plays)
 
-    return locate
+            def act(self, observation: Any, _info: Any) -> int:
+                """Choose an action by the experiment's function."""
+                return int(choose(observation, self._policy))
 
-
-def _has_players(env: Any) -> bool:
-    spaces = getattr(env, "action_spaces", None)
-    return isinstance(spaces, Mapping) or bool(getattr(env, "possible_agents", None))
-
-
-def _is_by_player(value: Any, players: Mapping[Any, Any]) -> bool:
-    return isinstance(value, Mapping) and value.keys() == players.keys()
-
-
-def _kind(value: Any) -> Any:
-    return value.get("object_type") if isinstance(value, Mapping) else None
-
-
-def _pixels(value: Mapping[str, Any]) -> Any:
-    import numpy as np  # noqa: PLC0415 - only where pixels are drawn
-
-    return np.asarray(value["game_image"], np.uint8)
+        return Policy

@@ -2,273 +2,185 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from trial.interactive_gym import assets, looking, options, pages, playing, sources, trying
-from trial.interactive_gym.configuration_constants import ActionSettings, InputModes, PolicyTypes
-from trial.interactive_gym.looking import Look
-from trial.interactive_gym.playing import Unplayable
-from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.sources import HASHES, ConfigModule, Locate
+from trial.agent import environments
+from trial.interactive_gym import files as project_files
+from trial.interactive_gym import pages, playing, script
+from trial.interactive_gym.options import (
+    ActionSettings,
+    Look,
+    PolicyTypes,
+    RemoteConfig,
+    Unplayable,
+    settings,
+    without_effect,
+)
 
-MIN_PATIENCE, MAX_PATIENCE = 10, 3600
-"""The limits of `project.patience`, in seconds."""
-MAX_BUFFER = 10_000
-"""The highest value of `actionBufferLifespan`, in steps."""
-_NO_ID = re.compile(r"[^A-Za-z0-9_-]+")
-_MADE_BY = "made by `python {file}`; change that file and run it again"
-
-
-@dataclass(frozen=True, slots=True)
-class MadeProject:
-    """The project that was made from an experiment."""
-
-    folder: Path
-    remarks: list[str] = field(default_factory=list)
-    """Sentences for the researcher: on what was left out, and on options that have no effect or another one."""
+_MADE_BY = "made by `python -m trial.interactive_gym {}`; change that file and run it again"
 
 
-def make(config: RemoteConfig, folder: Path | None = None, candidates: tuple[Any, ...] = ()) -> MadeProject:
-    """Make the project in `folder`, or in a folder beside the experiment's file.
+def make(path: Path, arguments: Sequence[str], target: Path) -> tuple[RemoteConfig, list[str]]:
+    """Make the project `target` of the experiment whose script is at `path`, below the present folder.
 
-    One of `candidates`, by default the config, must be a variable of the experiment's file (`sources.find`).
-    A file that was changed by hand since it was made stays as it is. Raises Unplayable if the experiment cannot be
-    played here, or if the folder has other files in it; OSError; and what the experiment's code raises.
+    Return its game's config, and sentences for the researcher. A file that was changed by hand since it was made stays
+    as it is. Raises Unplayable if the experiment cannot be played here, OSError, and what the experiment's code raises.
     """
-    source = sources.find(*(candidates or (config,)))
-    target = (folder or source.file.parent / f"{_id(source.file.stem)}-study").resolve()
-    remarks: list[str] = []
-    files = files_of(config, source, target, remarks.append)
-    remarks += ignored(config)
-    remarks += write(target, files)
-    return MadeProject(target, remarks)
-
-
-def files_of(
-    config: RemoteConfig, source: ConfigModule, target: Path, remark: Callable[[str], None]
-) -> dict[str, bytes]:
-    """Make the project's files, by their paths in it. Raises Unplayable, and what the experiment's code raises."""
-    look = looking.look(config)
-    looking.check_actions(config, look.actions)
-    find = sources.locate(source)
-    own, sentences = sources.belonging(source, target)
-    for sentence in sentences:
-        remark(sentence)
-    files = {name: path.read_bytes() for name, path in own.items()}
+    modules_before = list(sys.modules)
+    config, variables = script.load(path.as_posix(), arguments, Path.cwd())
+    look = _look(config, variables)
+    remarks = without_effect(config)
+    files = project_files.own_files(path.absolute(), modules_before, target)
     for name in files.keys() & {"agent.py", "config.yml"}:
-        raise Unplayable(
-            f"there is a {name} beside {source.file.name}, and the project needs one of its own: rename it"
-        )
-    players = _players(config, look, find, files, remark)
-    for sentence in trying.try_policies(config, look, find, source.root):
-        remark(sentence)
-    files |= {f"assets/{name}": data for name, data in assets.asset_files(config, find, remark).items()}
+        raise Unplayable(f"there is a {name} beside {path.name}, and the project needs its own: rename yours")
+    for name in (*_policy_files(config), *(name for scene in config.scenes for name in scene.files)):
+        files[Path(name).as_posix()] = Path(name).read_bytes()
+    files |= project_files.assets(config.assets_to_preload, remarks.append)
     before, after = pages.around(config)
-    steps = {
-        **before,
-        **after,
-        "instructions": pages.instructions(config, look.game, look.human, find, remark),
-        "between": pages.between(config, remark),
-    }
-    for name, page in steps.items():
+    instructions, between = pages.instructions(config, look, remarks.append), pages.between(config)
+    for name, page in {**before, **after, "instructions": instructions, "between": between}.items():
         if page:
-            files[f"steps/{name}.html"] = pages.with_files(page, find, files).encode()
-    trial = trial_section(config, look, looking.names_of(config, look.actions, source.names))
-    labels = looking.labels_of(dict.fromkeys(trial.get("keys", {}).values()), source.names)
-    if labels:
-        trial["labels"] = labels
-    if steps["instructions"]:
-        trial["instructions"] = "instructions"
-    if steps["between"]:
-        trial["betweenEpisodes"] = "between"
-    if look.several:
-        trial["players"] = {str(player): plays for player, (plays, _) in players.items()}
-    max_steps = getattr(config, "max_steps", None)
-    if max_steps:
-        trial["maxSteps"] = int(max_steps)
-    document = {"project": _project(config, source, [*before, "game", *after]), "trial": trial}
-    files["config.yml"] = _yaml(document, source).encode()
-    files["agent.py"] = agent_file(source, [(name, key) for key, (_, name) in players.items() if name]).encode()
-    if "requirements.txt" not in files:
-        models = any(name.endswith(".onnx") for name in files)
-        lines = sources.requirements(own.values(), config.packages_to_install, ("onnxruntime",) if models else ())
-        files["requirements.txt"] = "".join(f"{line}\n" for line in lines).encode()
+            files[f"steps/{name}.html"] = pages.with_files(page, files).encode()
+    document = _document(config, look, path.stem, [*before, "game", *after])
+    document["trial"] |= _labels(document["trial"].get("keys", {}), variables)
+    if instructions:
+        document["trial"]["instructions"] = "instructions"
+    if between:
+        document["trial"]["betweenEpisodes"] = "between"
+    files["config.yml"] = _yaml(document, path).encode()
+    files["agent.py"] = _agent_file(path, arguments, _policies(config)).encode()
+    files.setdefault("requirements.txt", project_files.requirements(files, config.packages_to_install))
     if config.default_action is None:
-        remark("there is no default_action: while no key is pressed, noop or else action 0 is taken")
+        remarks.append("there is no default_action: while no key is pressed, noop or else action 0 is taken")
+    return config, remarks + project_files.write(target, files)
+
+
+def _look(config: RemoteConfig, variables: Mapping[str, Any]) -> Look:
+    """Make the environment, begin an episode and draw it. Raises Unplayable, and what the experiment's code raises."""
+    if not config.humans:
+        raise Unplayable("policy_mapping has no PolicyTypes.Human: say which player the participant plays")
+    agent = playing.ExperimentAgent(config)
+    env = agent.start()
+    try:
+        agent.reset(1)
+        owner = env if agent.several else playing.Several(env, config.policy_mapping)
+        counts = environments.players_of(owner, list(config.policy_mapping), ("unnamed",), stepped=False).counts
+        for player, count in counts.items():
+            if count is None:
+                raise Unplayable(
+                    f"the environment does not say how many actions {player} has: its action_space must be a Discrete "
+                    "space, or a map of such spaces by player, or a method that returns the space of a player"
+                )
+        names = _action_names(max(filter(None, counts.values())), variables)
+        return Look(agent.several, names, isinstance(agent.render(), Mapping), agent.game)
+    finally:
+        agent.close()
+
+
+def _action_names(count: int, variables: Mapping[str, Any]) -> tuple[str, ...]:
+    """Name the actions by the constants of the script (`LEFT = 1`), if each action has exactly one, else by numbers."""
+    constants = [(value, name.lower()) for name, value in variables.items() if _is_action(name, value, count)]
+    names = dict(constants)
+    if len(constants) == len(names) == len(set(names.values())) == count:
+        return tuple(names[number] for number in range(count))
+    return tuple(map(str, range(count)))
+
+
+def _is_action(name: str, value: Any, count: int) -> bool:
+    return type(value) is int and 0 <= value < count and name[:1].isupper()
+
+
+def _labels(keys: Mapping[str, str], variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `labels`, the texts for actions whose constants have several words: `Pick up` for `PickUp`."""
+    constants = {name.lower(): name for name, value in variables.items() if type(value) is int}
+    labels = {}
+    for name in keys.values():
+        label = re.sub(r"_+|(?<=[a-z0-9])(?=[A-Z])", " ", constants.get(name, name)).lower().capitalize()
+        if " " in label:
+            labels[name] = label
+    return {"labels": labels} if labels else {}
+
+
+def _policies(config: RemoteConfig) -> dict[str, Any]:
+    """Return the names of the classes in agent.py that play a player, with this player."""
+    others = (PolicyTypes.Human, PolicyTypes.Random)
+    return {
+        f"Policy{number}": player
+        for number, (player, plays) in enumerate(config.policy_mapping.items())
+        if not (isinstance(plays, str) and plays in others)
+    }
+
+
+def _policy_files(config: RemoteConfig) -> list[str]:
+    """Return the policies' files, by their paths below the present folder. Raises Unplayable."""
+    files = []
+    for player in _policies(config).values():
+        plays = config.policy_mapping[player]
+        if playing.functions_of(config, plays)[1] is None:
+            raise Unplayable(f"there is no policies(policy_inference_fn=…) that could play {player} by {plays!r}")
+        if isinstance(plays, str) and os.path.isfile(plays):
+            files.append(os.path.relpath(plays))
+        elif isinstance(plays, str) and plays.endswith(".onnx"):
+            raise Unplayable(f"the policy of {player} is not found: {plays}")
+    for file in files:
+        if file.startswith(".."):
+            raise Unplayable(f"{file} is not below {Path.cwd()}: copy it there, or start in a folder above both")
     return files
 
 
-def ignored(config: RemoteConfig) -> list[str]:
-    """Return a sentence about each option of the experiment that has no effect here."""
-    several = len(playing.humans_of(config)) > 1
-    return [f"{name} has no effect: the game runs on a server" for name in getattr(config, "ignored", ())] + [
-        f"{option.name} has no effect: {option.ignored}"
-        for option in options.OPTIONS
-        if option.ignored and not (several and option.of_several)
-        if option.name in config.given and getattr(config, option.name) != option.new_default()
-    ]
-
-
-def trial_section(config: RemoteConfig, look: Look, names: list[str]) -> dict[str, Any]:
-    """Make the section `trial` of config.yml, without pages and players. `names` are the actions' names."""
+def _document(config: RemoteConfig, look: Look, stem: str, steps: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Make config.yml, with the keys that no option has alone."""
+    name = stem.replace("_", " ") if config.page_title == RemoteConfig().page_title else config.page_title
+    project: dict[str, Any] = {
+        "id": study_id(config.env_name or stem),
+        "name": name,
+        "steps": {**dict(enumerate(steps[:-1], 1)), "finalStep": steps[-1]},
+    }
+    if len(config.humans) > 1:
+        project["players"] = len(config.humans)
     trial: dict[str, Any] = {
-        "game": config.env_name or "experiment",
-        "maxEpisodes": config.num_episodes,
-        "startingFrameRate": round(config.fps),
         "minFrameRate": 1,
         "maxFrameRate": max(90, round(config.fps)),
-        "actionSpace": names,
-        "betweenEpisodes": _number(config.reset_timeout / 1000),
+        "actionSpace": list(look.actions),
     }
-    if config.default_action is not None:
-        trial["idleAction"] = names[int(config.default_action)]
-    if config.action_mapping:
-        trial["keys"] = {_keys(key): names[int(action)] for key, action in config.action_mapping.items()}
-    previous = config.action_population_method == ActionSettings.PreviousSubmittedAction
-    if config.input_mode == InputModes.SingleKeystroke:
-        trial["input"] = "single"
-        if previous and not config.run_through_pyodide:
-            trial["actionBufferLifespan"] = MAX_BUFFER
     if look.several:
         # Interactive Gym's server ignores action_population_method for policies; its games in the browser do for humans
-        holds = previous and config.run_through_pyodide
-        trial |= {"frameSkip": config.frame_skip, "policyActions": "held" if holds else "single"}
-    if config.reset_freeze_s:
-        trial["resetFreeze"] = config.reset_freeze_s
-    if "seed" in config.given:
-        trial["seed"] = config.seed
-    if config.max_ping is not None and len(playing.humans_of(config)) > 1:
-        trial |= {"maxPing": round(config.max_ping), "pingSamples": int(config.min_ping_measurements)}
-    if look.objects:
-        trial["scene"] = {
-            "width": round(config.game_width),
-            "height": round(config.game_height),
-            "background": config.background,
-            "coordinates": config.location_representation,
-        }
-    return trial
+        repeats = config.action_population_method == ActionSettings.PreviousSubmittedAction
+        trial["policyActions"] = "held" if repeats and config.run_through_pyodide else "single"
+        classes = {player: f"agent:{name}" for name, player in _policies(config).items()}
+        trial["players"] = {str(player): classes.get(player, plays) for player, plays in config.policy_mapping.items()}
+    sections = settings(config, look)
+    return {"project": project | sections["project"], "trial": sections["trial"] | trial}
 
 
-def agent_file(source: ConfigModule, policies: list[tuple[str, Any]]) -> str:
-    """Write the project's agent.py. `policies` has the name of each policy's class, and the player whom it plays."""
+def _agent_file(path: Path, arguments: Sequence[str], policies: Mapping[str, Any]) -> str:
+    """Write the project's agent.py, with these classes of policies."""
     lines = [
-        f'"""The agent of {source.file.name}, {_MADE_BY.format(file=source.file.name)}."""',
+        f'"""The agent of {path.name}, {_MADE_BY.format(path.name)}."""',
         "",
-        "from trial.interactive_gym import on_server",
+        "from trial.interactive_gym.playing import Experiment",
         "",
-        f"_experiment = on_server.load(__file__, {pages.quoted(source.module)}, {pages.quoted(source.variable)})",
+        f"_experiment = Experiment(__file__, {json.dumps(path.as_posix())}, {json.dumps(list(arguments))})",
         "",
         "Agent = _experiment.agent()",
-        *(f"{name} = _experiment.policy({player!r})" for name, player in policies),
+        *(f"{name} = _experiment.policy({player!r})" for name, player in policies.items()),
     ]
     return "\n".join(lines) + "\n"
 
 
-def write(folder: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a project, and remove the files that only its earlier version had.
-
-    A file that was changed by hand stays as it is. Return a sentence about each file that was not written for
-    this reason. Raises Unplayable if the folder has files in it and none of them was made here, and OSError.
-    """
-    hashes = folder / HASHES
-    if folder.exists() and any(folder.iterdir()) and not hashes.is_file():
-        raise Unplayable(f"{folder} holds something else; give server_app.run(config, project=…) another folder")
-    before: dict[str, str] = json.loads(hashes.read_text()) if hashes.is_file() else {}
-    sentences = []
-    now = {}
-    for name, data in files.items():
-        path = folder / name
-        now[name] = _hash(data)
-        if path.is_file() and name in before and _hash(path.read_bytes()) not in (before[name], now[name]):
-            sentences.append(f"{path} was changed by hand and stays; delete it to have it made anew")
-            now[name] = before[name]
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    for name in before.keys() - files.keys():
-        path = folder / name
-        if path.is_file() and _hash(path.read_bytes()) == before[name]:
-            path.unlink()
-    hashes.write_text(json.dumps(now, indent=0, sort_keys=True))
-    return sentences
+def study_id(name: str) -> str:
+    """Return the name in the form of a project's id."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")[:60] or "experiment"
 
 
-def _players(
-    config: RemoteConfig,
-    look: Look,
-    find: Locate,
-    files: dict[str, bytes],
-    remark: Callable[[str], None],
-) -> dict[Any, tuple[str, str]]:
-    """Return, by player, the value in `trial.players`, and the policy's class in agent.py or an empty name.
-
-    Adds the files of policies to `files`. Raises Unplayable if a class would find another policy's file under the name
-    of its own (`playing.located`).
-    """
-    players: dict[Any, tuple[str, str]] = {}
-    for number, (player, plays) in enumerate(playing.mapping_of(config).items()):
-        if isinstance(plays, str) and plays in (PolicyTypes.Human, PolicyTypes.Random):
-            players[player] = (plays, "")
-            continue
-        file = find(plays) if isinstance(plays, str) and ("/" in plays or "." in plays) else None
-        name = Path(str(plays)).name
-        if file is not None and file.is_file():
-            name = sources.put(file, "policies", files)
-        elif isinstance(plays, str) and plays.endswith(".onnx"):
-            remark(f"the policy of {player} is not found: {plays}")
-        if looking.is_file(config, plays) and look.joined_as_sorted:
-            players[player] = (f"sample:policies/{name}", "")
-        elif file is not None and name != file.name and os.path.normpath(plays) not in files:
-            raise Unplayable(f"policy_mapping has two files that are called {file.name}: give them different names")
-        else:
-            players[player] = (f"agent:Policy{number}", f"Policy{number}")
-    return players
-
-
-def _project(config: RemoteConfig, source: ConfigModule, steps: list[str]) -> dict[str, Any]:
-    named = "page_title" in config.given
-    project: dict[str, Any] = {
-        "id": _id(config.env_name or source.file.stem),
-        "name": config.page_title if named else source.file.stem.replace("_", " "),
-        "steps": {**dict(enumerate(steps[:-1], 1)), "finalStep": steps[-1]},
-    }
-    if "max_concurrent_games" in config.given:
-        project["maxServers"] = config.max_concurrent_games
-    humans = len(playing.humans_of(config))
-    if humans > 1:
-        project["players"] = humans
-        if config.waitroom_timeout is not None:
-            seconds = round(config.waitroom_timeout / 1000, 3)
-            project["patience"] = _number(max(MIN_PATIENCE, min(MAX_PATIENCE, seconds)))
-    return project
-
-
-def _number(value: float) -> float:
-    """Return a whole number as an int, so that config.yml has 5 and not 5.0."""
-    return int(value) if value == int(value) else value
-
-
-def _id(name: str) -> str:
-    return _NO_ID.sub("-", name.replace("_", "-")).strip("-_")[:60] or "experiment"
-
-
-def _keys(key: Any) -> str:
-    return "+".join(map(str, key)) if isinstance(key, tuple) else str(key)
-
-
-def _yaml(document: Mapping[str, Any], source: ConfigModule) -> str:
+def _yaml(document: Mapping[str, Any], path: Path) -> str:
     import yaml  # noqa: PLC0415 - servers do not need it
 
-    head = f"# {source.file.name}, {_MADE_BY.format(file=source.file.name)}.\n\n"
+    head = f"# {path.name}, {_MADE_BY.format(path.name)}.\n\n"
     return head + yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120)
-
-
-def _hash(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()

@@ -1,4 +1,4 @@
-"""Experiments for the tests, as researchers write them, and how they are run."""
+"""Experiments for the tests, as researchers write them for Interactive Gym, and how they are run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from testing import processes
 ALONE = """
 import gymnasium
 import helper
-from trial import RemoteConfig, callback, configuration_constants, object_contexts, server_app
+import eventlet
+
+eventlet.monkey_patch()
+
+from interactive_gym.configurations import configuration_constants, object_contexts
+from interactive_gym.configurations.remote_config import RemoteConfig
+from interactive_gym.server import callback, server_app
 
 LEFT, NOOP, RIGHT = 0, 1, 2
 
@@ -61,13 +67,15 @@ def place(env):
 """
 RUN = """
 if __name__ == "__main__":
-    server_app.run(config, serve=SERVE)
+    server_app.run(config)
 """
 
 TOGETHER = '''
 import numpy as np
 from gymnasium import spaces
-from trial import RemoteConfig, callback, configuration_constants, object_contexts, server_app
+from configurations import configuration_constants, object_contexts
+from configurations.remote_config import RemoteConfig
+from server import callback, server_app
 
 class Fields:
     """Two players; each reward is the player's own action."""
@@ -137,10 +145,10 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(processes.ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def run_experiment(folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run `python experiment.py` in this folder, to its end."""
+def run_experiment(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run `python -m trial.interactive_gym --no-run ARGUMENTS` in this folder, by default for `experiment.py`."""
     return subprocess.run(
-        [sys.executable, "experiment.py"],
+        [sys.executable, "-m", "trial.interactive_gym", "--no-run", *(arguments or ["experiment.py"])],
         cwd=folder,
         env=environment(),
         stdin=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""An experiment on a participant's server: its environment, objects, policies and callback; and `python experiment.py`."""
+"""An experiment on a participant's server: its environment, objects, policies and callback; and its run to the end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 
@@ -21,8 +20,8 @@ from tests.trial.client_messages import play_to_the_end
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, run_experiment
 from tests.trial.sessions import SID, answer, form, member, recordings
 from trial.interactive_gym import playing
-from trial.interactive_gym.remote_config import RemoteConfig
-from trial.interactive_gym.remote_game import RemoteGame
+from trial.interactive_gym.game import RemoteGame
+from trial.interactive_gym.options import RemoteConfig, Unplayable
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -30,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[3]
 def make_project(folder: Path, source: str) -> Path:
     """Run the experiment; return the folder of the project that it makes."""
     folder.mkdir()
-    (folder / "experiment.py").write_text(source + RUN.replace("SERVE", "False"))
+    (folder / "experiment.py").write_text(source + RUN)
     (folder / "helper.py").write_text(HELPER)
     (folder / "how.html").write_text("<h1>How</h1>")
     (folder / "brains").mkdir()
@@ -150,10 +149,10 @@ def test_in_a_game_of_several_people_a_humans_id_is_the_name_of_their_player(mon
 def test_running_the_experiments_file_runs_its_study_until_ctrl_c(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     make_project(folder, ALONE)
-    (folder / "experiment.py").write_text(ALONE + RUN.replace("SERVE", "True"))
+    (folder / "experiment.py").write_text(ALONE + RUN)
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     running = subprocess.Popen(
-        [sys.executable, "experiment.py"],
+        [sys.executable, "-m", "trial.interactive_gym", "experiment.py"],
         cwd=folder,
         env=env,
         stdout=subprocess.PIPE,
@@ -241,7 +240,7 @@ def test_a_single_players_reward_is_a_number() -> None:
 
 
 def agent(**options: Any) -> playing.ExperimentAgent:
-    config = RemoteConfig()
+    config = RemoteConfig().policies(policy_mapping={"human": "human"})
     for name, value in options.items():
         setattr(config, name, value)
     made = playing.ExperimentAgent(config)
@@ -253,6 +252,7 @@ def agent(**options: Any) -> playing.ExperimentAgent:
 def test_objects_of_the_beginning_are_drawn_once_and_stay() -> None:
     fence = {"uuid": "fence", "object_type": "circle"}
     made = agent(
+        policy_mapping={"a": "human"},
         env_creator=Env,
         env_to_state_fn=lambda env, config: [{"uuid": "ball"}],
         state_init=[fence],
@@ -264,46 +264,45 @@ def test_objects_of_the_beginning_are_drawn_once_and_stay() -> None:
     assert len(made.render()["objects"]) == 2
 
 
-def test_a_picture_of_pixels_among_the_objects_is_a_frame() -> None:
-    pixels = {"object_type": "rendered_env_rgb", "name": "x", "game_image": [[[1, 2, 3]]]}
-    made = agent(env_creator=Env, env_to_state_fn=lambda env, config: [pixels])
-    assert np.array_equal(made.render(), np.array([[[1, 2, 3]]], np.uint8))
-
-
 def test_environments_are_made_as_interactive_gym_makes_them() -> None:
     assert agent(env_creator=Env, env_config={"size": 3})._raw.given == {"size": 3, "render_mode": "rgb_array"}
     code = "class Env:\n    def reset(self, seed=None): return 7, {}\nenv = Env()"
     made = agent(environment_initialization_code=code)
     assert made.reset(1) == (7, {})
-    with pytest.raises(playing.Unplayable, match="makes no variable env"):
+    with pytest.raises(Unplayable, match="there is no environment"):
         agent(environment_initialization_code="x = 1")
 
 
-def test_an_environment_of_a_game_in_the_browser_gets_a_map_of_actions_also_for_one_player() -> None:
-    """Interactive Gym's Mountain Car is of this form."""
-    code = """
+@pytest.mark.parametrize(
+    "value", ["actions['human']", "actions if actions in (0, 1) else 1 / int(actions)", "[4, 1][actions]"]
+)
+def test_an_environment_of_one_player_gets_a_map_of_actions_or_if_it_refuses_that_the_action(value: str) -> None:
+    """Interactive Gym's Mountain Car takes a map; Gymnasium's environments take the action."""
+    code = f"""
 class Env:
-    def reset(self, seed=None): return {"human": 7}, {}
-    def step(self, actions): return {"human": actions["human"]}, 2.5, False, {"human": True}, {}
+    def reset(self, seed=None): return {{"human": 7}}, {{}}
+    def step(self, actions): return {{"human": {value}}}, 2.5, False, {{"human": True}}, {{}}
 env = Env()
 """
-    options = {"environment_initialization_code": code, "policy_mapping": {"human": "human"}}
-    made = agent(**options, run_through_pyodide=True)
-    assert (made.reset(1), made.step(1)) == ((7, {}), (1, 2.5, False, True, {}))
+    made = agent(environment_initialization_code=code, policy_mapping={"human": "human"})
+    assert made.reset(1) == (7, {})
+    assert [made.step(1), made.step(1)] == [(1, 2.5, False, True, {})] * 2
     assert made.game is not None
     assert (made.game.prev_actions, made.game.over) == ({"human": 1}, True)
 
 
-def test_policies_are_loaded_from_the_projects_copy(tmp_path: Path) -> None:
-    (tmp_path / "policies").mkdir()
-    (tmp_path / "policies/model.onnx").write_bytes(b"")
-    config = RemoteConfig().policies(
-        policy_mapping={"a": "human", "b": "far/away/model.onnx", "c": "by name"},
-        load_policy_fn=lambda name: ["loaded", name],
-        policy_inference_fn=lambda observation, policy: np.int64(len(policy) + observation),
-    )
-    locate = playing.located(tmp_path)
-    policy = playing.policy_class(config, "b", locate)()
-    assert policy._policy == ["loaded", str(tmp_path / "policies/model.onnx")]
-    assert policy.act(5, {}) == 7
-    assert playing.policy_class(config, "c", locate)()._policy == ["loaded", "by name"]
+def test_an_error_of_an_environment_that_has_taken_a_step_is_its_own() -> None:
+    class Env:
+        def reset(self, seed: int | None = None) -> Any:
+            self.steps = 0
+            return 0, {}
+
+        def step(self, actions: Any) -> Any:
+            self.steps += 1
+            return 0, {"": 0.0}["reward"] if self.steps > 1 else actions["human"], False, False, {}
+
+    made = agent(env_creator=lambda **_: Env(), policy_mapping={"human": "human"})
+    made.step(1)
+    with pytest.raises(KeyError, match="reward"):
+        made.step(1)
+    assert made.game.env.steps == 2

@@ -1,4 +1,4 @@
-"""`python experiment.py`: the project that it makes, its remarks, and the experiments that it refuses."""
+"""`python -m trial.interactive_gym`: the project that it makes, its remarks, and the experiments that it refuses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from jinja2 import Environment
@@ -20,7 +19,6 @@ from testing import onnx_files
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, environment, run_experiment
 
 ROOT = Path(__file__).resolve().parents[3]
-MAKE = RUN.replace("SERVE", "False")
 
 
 def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -31,7 +29,7 @@ def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
 
 def write(folder: Path, source: str = ALONE, name: str = "experiment.py") -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text(source + MAKE)
+    (folder / name).write_text(source + RUN)
     (folder / "helper.py").write_text(HELPER)
     (folder / "how.html").write_text('<h1>How</h1><p><img src="key.png" alt="A key"></p>')
     (folder / "key.png").write_bytes(b"a picture")
@@ -121,33 +119,24 @@ def test_a_package_that_the_experiment_names_is_not_required_twice(tmp_path: Pat
     assert lines == ["Gymnasium[classic_control]~=1.2", "typing.extensions !=4.0"]
 
 
-def test_files_that_are_left_out_do_not_count_as_too_much(tmp_path: Path) -> None:
+def test_a_folder_with_more_than_a_server_should_carry_is_refused(tmp_path: Path) -> None:
     with (tmp_path / "film.bin").open("wb") as film:
         film.truncate(600 * 2**20)
-    project, said = project_of(tmp_path)
-    assert "Remark: film.bin is left out: it has 600 MB, and 50 are the most" in said
-    assert not (project / "film.bin").exists()
+    assert "holds more than 500 MB: put the experiment into a folder of its own" in refusal_of(tmp_path, ALONE)
 
 
 def test_options_without_effect_get_a_remark(tmp_path: Path) -> None:
     _, said = project_of(tmp_path)
     assert "Remark: host has no effect: on one machine only its own browsers reach a study" in said
-    assert "Remark: max_ping has no effect: no participant is turned away" in said
     assert "waitroom" not in said, "only what the experiment sets"
 
 
-def test_a_heading_and_a_time_that_a_page_ignores_get_a_remark(tmp_path: Path) -> None:
-    more = "config.user_experience(game_header_text='Drive', game_page_text='<h2>On</h2>')\n"
-    _, said = project_of(tmp_path / "heading", ALONE + more)
-    assert "Remark: game_header_text is left out: the instructions have a heading (<h1>) of their own" in said
-    project, said = project_of(
-        tmp_path / "time", ALONE + "config.reset_timeout = 9000\nconfig.between_episode_text = 'Rest'\n"
-    )
-    assert "Remark: reset_timeout has no effect: participants go on themselves from the page between" in said
-    assert config_of(project)["trial"]["betweenEpisodes"] == "between"
-    project, said = project_of(tmp_path / "alone", ALONE + "config.reset_timeout = 9000\n")
-    assert "reset_timeout" not in said
+def test_a_page_between_two_episodes_takes_the_place_of_the_pause(tmp_path: Path) -> None:
+    project, _ = project_of(tmp_path / "time", ALONE + "config.reset_timeout = 9000\n")
     assert config_of(project)["trial"]["betweenEpisodes"] == 9
+    project, _ = project_of(tmp_path / "page", ALONE + "config.between_episode_text = 'Rest'\n")
+    assert config_of(project)["trial"]["betweenEpisodes"] == "between"
+    assert (project / "steps/between.html").read_text() == "<p>Rest</p>\n"
 
 
 def test_players_and_their_policies_become_keys_of_the_study(tmp_path: Path) -> None:
@@ -158,7 +147,7 @@ def test_players_and_their_policies_become_keys_of_the_study(tmp_path: Path) -> 
     trial = config_of(project)["trial"]
     assert trial["players"] == {"0": "human", "1": "agent:Policy1"}
     assert (trial["frameSkip"], trial["input"], trial["actionSpace"]) == (1, "single", ["0", "1", "2"])
-    assert (project / "policies/two.txt").read_text() == "2"
+    assert (project / "brains/two.txt").read_text() == "2"
     assert "Policy1 = _experiment.policy(1)" in (project / "agent.py").read_text()
     read_project(project)
 
@@ -190,28 +179,28 @@ THREE = (
 )
 
 
-def test_files_of_functions_with_the_same_name_are_refused_if_one_would_hide_the_other(tmp_path: Path) -> None:
-    """Files below the experiment's folder keep their folders. Others are copied to `policies/`."""
+def test_policies_whose_files_have_the_same_name_are_two_files(tmp_path: Path) -> None:
     for folder, inside in (("left", "1"), ("right", "2")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "two.txt").write_text(inside)
-    said = refusal_of(tmp_path / "mine", THREE)
-    assert said == "policy_mapping has two files that are called two.txt: give them different names"
     project, _ = project_of(tmp_path, THREE.replace("left/", "./left/").replace("right/", "left/../right/"))
     assert (project / "left/two.txt").read_text() + (project / "right/two.txt").read_text() == "12"
+    said = refusal_of(tmp_path / "mine", THREE.replace("left/", "../left/").replace("right/", "../right/"))
+    assert said == f"../left/two.txt is not below {tmp_path / 'mine'}: copy it there, or start in a folder above both"
 
 
 def test_a_package_run_as_a_module_keeps_its_folders(tmp_path: Path) -> None:
     package = tmp_path / "examples" / "car"
-    write(package, ALONE.replace("import helper", "from examples.car import helper"), "car_server.py")
+    source = ALONE.replace("import helper", "from examples.car import helper")
+    write(package, source.replace('"how.html"', '"examples/car/how.html"'), "car_server.py")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "large.bin").write_bytes(b"not ours")
-    done = run_python(tmp_path, "-m", "examples.car.car_server")
+    done = run_experiment(tmp_path, "examples.car.car_server")
     assert done.returncode == 0, done.stderr
     project = package / "car-server-study"
     assert (project / "examples/car/helper.py").is_file()
     assert not list(project.rglob("large.bin"))
-    assert '"examples.car.car_server", "config"' in (project / "agent.py").read_text()
+    assert '"examples/car/car_server.py", []' in (project / "agent.py").read_text()
     assert run_python(project, "-c", "import agent; agent.Agent().start('x')").returncode == 0
 
 
@@ -221,7 +210,12 @@ def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> Non
     (tmp_path / "sitecustomize.py").write_text("")  # Python imports it as it starts
     env = {**environment(), "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     done = subprocess.run(
-        [sys.executable, str(package / "experiment.py")], env=env, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "trial.interactive_gym", "--no-run", "experiment.py"],
+        cwd=package,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     project = package / "experiment-study"
@@ -247,10 +241,10 @@ def test_a_project_is_made_anew_and_changes_by_hand_stay(tmp_path: Path) -> None
     (project / "data").mkdir()
     (project / "data/answer").write_text("kept")
     (tmp_path / "key.png").unlink()
-    (tmp_path / "experiment.py").write_text((ALONE + MAKE).replace("Mountain car", "Another name"))
+    (tmp_path / "experiment.py").write_text((ALONE + RUN).replace("Mountain car", "Another name"))
     done = run_experiment(tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "steps/welcome.html was changed by hand and stays; delete it to have it made anew" in done.stdout
+    assert "steps/welcome.html was changed by hand and stays; delete it to have it made again" in done.stdout
     assert (project / "steps/welcome.html").read_text() == "<h1>Mine</h1>"
     assert config_of(project)["project"]["name"] == "Another name"
     assert not (project / "key.png").exists(), "what is no more in the experiment is removed"
@@ -277,7 +271,7 @@ def test_a_file_that_the_experiment_reads_as_it_is_imported_is_found_on_a_server
 
 def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     write(tmp_path)
-    (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config, serve=False)\n")
+    (tmp_path / "experiment.py").write_text(ALONE + "server_app.run(config)\n")
     assert run_experiment(tmp_path).returncode == 0
     done = run_python(tmp_path / "experiment-study", "-c", "import agent; print(agent.Agent.__name__)")
     assert (done.returncode, done.stdout) == (0, "Agent\n"), done.stderr
@@ -287,15 +281,14 @@ def test_a_run_without_a_guard_does_nothing_on_a_server(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [
         ("PolicyTypes.Human}", "PolicyTypes.Random}", "policy_mapping has no PolicyTypes.Human"),
-        ("PolicyTypes.Human}", 'PolicyTypes.Human, **{n: "human" for n in range(16)}}', "policy_mapping has 17 humans; at most 16 participants play together"),
         ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "x.pkl"}', "there is no policies(policy_inference_fn=…) that could play other by 'x.pkl'"),
-        ('"ArrowRight": RIGHT', '"ArrowRight": 7', "'ArrowRight' leads to the action 7; there are 0 to 2"),
-        ("default_action=NOOP", "default_action=3", "'default_action' leads to the action 3; there are 0 to 2"),
-        ("fps=60", "fps=600", "fps must be from 1 to 240, not 600"),
-        ('"MountainCar-v0"', '"MountainCarContinuous-v0"', "the actions of human must be numbered (a Discrete space); they are Box("),
+        ("PolicyTypes.Human}", 'PolicyTypes.Human, "other": "x.onnx"}', "the policy of other is not found: x.onnx"),
+        ('"ArrowRight": RIGHT', '"ArrowRight": 7', "'ArrowRight' is the action 7; there are 0 to 2"),
+        ("default_action=NOOP", "default_action=3", "default_action is the action 3; there are 0 to 2"),
+        ('"MountainCar-v0"', '"MountainCarContinuous-v0"', "the environment does not say how many actions human has"),
         (".environment(env_creator=env_creator, ", ".environment(", "there is no environment: give environment(env_creator=…)"),
-        ("import helper", "import helper, sys, types; sys.modules['eventlet'] = types.ModuleType('eventlet')", "take `import eventlet` and `eventlet.monkey_patch()` out"),
-        ("config = (", "configs = [None]; configs[0] = (", "run() takes a RemoteConfig"),
+        ("config = (", "configs = [None]; configs[0] = (", "the experiment has 0 games"),
+        ('"how.html"', '"why.html"', "instructions_html_file: there is no why.html"),
     ],
 )  # fmt: skip
 def test_a_wrong_experiment_gets_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
@@ -311,15 +304,24 @@ def test_an_environment_without_a_players_actions_gets_a_sentence(tmp_path: Path
     source = ALONE.replace(
         "config = (", "class Env(gymnasium.Env):\n    action_space = {'0': 1}\n\n\nconfig = ("
     ).replace(made_by, "env_creator=lambda **_: Env()")
-    assert "the environment does not say which actions 'human' has" in refusal_of(tmp_path, source)
+    assert "the environment does not say how many actions human has" in refusal_of(tmp_path, source)
 
 
-def test_a_config_that_is_no_variable_of_the_file_is_refused(tmp_path: Path) -> None:
-    source = ALONE.replace("config = (", "def build(): return (")
-    write(tmp_path, source)
-    (tmp_path / "experiment.py").write_text(source + "\nserver_app.run(build(), serve=False)\n")
-    done = run_experiment(tmp_path)
-    assert "the config must be a variable of the experiment's file" in done.stderr
+def test_the_config_that_counts_is_the_one_that_the_script_runs_with_its_arguments(tmp_path: Path) -> None:
+    source = (
+        ALONE.replace("config = (", "def build(name):\n  return (")
+        .replace("Mountain car", "{name}")
+        .replace('page_title="', 'page_title=f"')
+    )
+    write(tmp_path)
+    guarded = "import sys\nif __name__ == '__main__':\n    server_app.run(build(sys.argv[1]))\n"
+    (tmp_path / "experiment.py").write_text(source + guarded)
+    done = run_experiment(tmp_path, "experiment.py", "Hill")
+    assert done.returncode == 0, done.stderr
+    project = tmp_path / "experiment-study"
+    assert config_of(project)["project"]["name"] == "Hill"
+    done = run_python(project, "-c", "import agent; agent.Agent().start('x')")
+    assert done.returncode == 0, done.stderr
 
 
 def test_images_and_atlases_are_copied_under_their_names(tmp_path: Path) -> None:
@@ -331,19 +333,20 @@ def test_images_and_atlases_are_copied_under_their_names(tmp_path: Path) -> None
         "config.rendering(assets_to_preload=["
         "object_contexts.AtlasSpec('chef', 'static/cook.png', 'static/cook.json').as_dict(),"
         "object_contexts.ImgSpec('plain.png', 'static/cook.png').as_dict(),"
-        "object_contexts.ImgSpec('gone', 'static/gone.png').as_dict()],"
-        "animation_configs=[render_configs.Animation('walk', 'chef', ['EAST.png'], 8)])\n"
+        "object_contexts.ImgSpec('gone', 'static/gone.png').as_dict()])\n"
     )
-    source = ALONE.replace("server_app\n", "server_app, render_configs\n") + specs
-    project, said = project_of(tmp_path, source)
+    project, said = project_of(tmp_path, ALONE + specs)
     assert sorted(path.name for path in (project / "assets").iterdir()) == ["chef.json", "chef.png", "plain.png"]
-    assert '"walk": {"frames": ["EAST.png"], "frameRate": 8}' in (project / "assets/chef.json").read_text()
     assert "Remark: the image 'gone' is not found at static/gone.png; sprites that show it are grey boxes" in said
 
 
 SCENES = (
-    ALONE.partition("config = (")[0].replace("from trial import ", "from trial import experiment_config, gym_scene, stager, static_scene, ")
+    ALONE.partition("config = (")[0]
     + """
+from interactive_gym.configurations import experiment_config
+from interactive_gym.scenes import gym_scene, scene, stager, static_scene
+from interactive_gym.server import app
+
 start_scene = static_scene.StartScene().scene(scene_id="hello").display(scene_header="Hi", scene_body="Welcome")
 more = static_scene.StaticScene().display(scene_body="<p>Read this</p>")
 game = (
@@ -354,15 +357,15 @@ game = (
     .rendering(fps=60, env_to_state_fn=draw)
     .gameplay(default_action=NOOP, action_mapping={"ArrowLeft": LEFT}, num_episodes=2, max_steps=15)
     .user_experience(scene_header="Car", scene_body="How to drive", in_game_scene_body="Drive!")
-    .pyodide(restart_pyodide=False)
+    .pyodide(restart_pyodide=True)
 )
 end = static_scene.EndScene().display(scene_header="Bye").redirect("https://example.org/?id=", append_subject_id=True)
 stager = stager.Stager(scenes=[start_scene, more, GAMES, end])
 if __name__ == "__main__":
     config = experiment_config.ExperimentConfig().experiment(stager=stager, experiment_id="car_study").hosting(port=0)
-    server_app.run(config, serve=False)
+    app.run(config)
 """
-)  # fmt: skip
+)
 
 
 def test_scenes_before_and_after_the_game_become_pages(tmp_path: Path) -> None:
@@ -387,7 +390,6 @@ def test_texts_may_be_tuples_by_a_stray_comma_lists_paths_or_none(tmp_path: Path
     write(tmp_path)
     texts = """
 import pathlib
-from trial import scene
 more.display(scene_header=("Much",), scene_subheader=["more"], scene_body=("<p>Read</p>", "<p>this</p>"))
 game.welcome_text, game.game_page_text, game.instructions_html_file = None, ("Go",), pathlib.Path("how.html")
 stager = """
@@ -400,31 +402,31 @@ stager = """
     assert "Go" in (steps / "instructions.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("imports", "said"),
-    [
-        ("from trial.scenes import static_scene", "write `from trial import static_scene` and the like"),
-        ("import trial.configurations.remote_config", "write `from trial import remote_config` and the like"),
-        ("from trial.server import server_app", "write `from trial import server_app`"),
-        ("from trial import utils", "take the import of server/utils.py out"),
-        ("from trial.utils import onnx_inference_utils", "write `from trial import onnx_inference_utils`"),
-        ("from trial import unity_scene", "games made with Unity are not played here"),
-        ("from trial.static_scene import OptionBoxes", "its questions are written as a page of steps/"),
-        ("from trial.scene import RandomizeOrder", "scenes are shown once, in the order of the stager"),
-    ],
-)
-def test_an_import_of_interactive_gyms_that_is_not_here_says_what_to_do(imports: str, said: str) -> None:
-    with pytest.raises(ImportError, match=re.escape(said)):
-        exec(imports, {})
+def test_files_that_scenes_name_belong_to_the_project(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "interactive_gym/pages").mkdir(parents=True)
+    (tmp_path / "interactive_gym/pages/more.html").write_text("<p>Read this file</p>")
+    package = tmp_path / "interactive_gym/mine"
+    source = SCENES.replace("GAMES", "game").replace("import helper", "from interactive_gym.mine import helper")
+    named = 'scene_body_filepath="interactive_gym/pages/more.html"'
+    write(package, source.replace('scene_body="<p>Read this</p>"', named))
+    (package / "experiment.py").write_text((package / "experiment.py").read_text().replace(RUN, ""))
+    done = run_experiment(tmp_path, "interactive_gym.mine.experiment")
+    assert done.returncode == 0, done.stderr
+    project = package / "experiment-study"
+    assert (project / "steps/before_2.html").read_text() == "<p>Read this file</p>\n"
+    done = run_python(project, "-c", "import agent; agent.Agent().start('x')")
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
     ("scenes", "said"),
     [
-        ("game, game", "the stager has 2 games (GymScene), and a study has one game here: make an experiment of each"),
-        ("static_scene.SceneWrapper([game, game])", "the stager has 2 games (GymScene), and"),
-        ("more", "the stager has no game (GymScene)"),
-        ("game, type('OptionBoxes', (static_scene.StaticScene,), {})()", "a OptionBoxes is no page that can be shown"),
+        ("game, game", "the experiment has 2 games (GymScene), and a study has one here: make an experiment of each"),
+        ("scene.SceneWrapper([game, game])", "the experiment has 2 games (GymScene), and"),
+        ("more", "the experiment has 0 games (GymScene), and"),
+        ("game, static_scene.OptionBoxes('id', {}, ['a'])", "the scene OptionBoxes of Interactive Gym is not here"),
+        ("game, scene.RandomizeOrder([more])", "the scene RandomizeOrder of Interactive Gym is not here"),
     ],
 )
 def test_wrong_scenes_are_refused(tmp_path: Path, scenes: str, said: str) -> None:
@@ -469,93 +471,28 @@ def test_a_waiting_time_is_limited_to_those_of_a_lobby(tmp_path: Path, wait: int
     read_project(project)
 
 
-# ---- policies are tried
-
-
-WITH_A_FILE = (
-    TOGETHER.replace('"brains/two.txt"', '"brains/partner.onnx"')
-    .replace("load_policy_fn=load", "load_policy_fn=onnx_inference_utils.load_onnx_policy_fn")
-    .replace("policy_inference_fn=infer", "policy_inference_fn=onnx_inference_utils.onnx_model_inference_fn")
-    .replace("from trial import ", "from trial import onnx_inference_utils, ")
-)
-
-
-def test_a_file_that_fits_is_a_policy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("functions", [True, False])
+def test_an_onnx_file_is_a_policy_with_interactive_gyms_functions_and_without(tmp_path: Path, functions: bool) -> None:
     onnx_files.linear(tmp_path / "brains/partner.onnx", [[1, 0, 0], [0, 1, 0]])
-    project, said = project_of(tmp_path, WITH_A_FILE)
-    assert config_of(project)["trial"]["players"]["1"] == "sample:policies/partner.onnx"
+    source = TOGETHER.replace('"brains/two.txt"', '"brains/partner.onnx"')
+    if functions:
+        source = "from utils import onnx_inference_utils\n" + source.replace(
+            "load_policy_fn=load", "load_policy_fn=onnx_inference_utils.load_onnx_policy_fn"
+        ).replace("policy_inference_fn=infer", "policy_inference_fn=onnx_inference_utils.onnx_model_inference_fn")
+    else:
+        source = source.replace("load_policy_fn=load,", "").replace("policy_inference_fn=infer,", "")
+    project, said = project_of(tmp_path, source)
     assert "Remark" not in said
-
-
-def test_policies_whose_files_have_the_same_name_are_two_files(tmp_path: Path) -> None:
-    for folder, weights in (("left", [[1, 0, 0], [0, 1, 0]]), ("right", [[0, 0, 1], [0, 1, 0]])):
-        onnx_files.linear(tmp_path / folder / "partner.onnx", weights)
-    source = WITH_A_FILE.replace('1: "brains/partner.onnx"', '1: "left/partner.onnx", 2: "right/partner.onnx"')
-    source = source.replace("(0, 1)", "(0, 1, 2)").replace("1: spaces.", "2: spaces.Discrete(3), 1: spaces.", 1)
-    source = source.replace("1: spaces.Box", "2: spaces.Box(0, 99, (2,)), 1: spaces.Box", 1)
-    source = (
-        source.replace("1: {}", "1: {}, 2: {}").replace("{0, 1}", "{0, 1, 2}").replace("1: False", "1: False, 2: False")
-    )
-    project, _ = project_of(tmp_path, source)
-    files = [config_of(project)["trial"]["players"][player].removeprefix("sample:") for player in ("1", "2")]
-    assert files == ["policies/partner.onnx", "policies/partner-2.onnx"]
-    for folder, file in zip(("left", "right"), files, strict=True):
-        assert (project / file).read_bytes() == (tmp_path / folder / "partner.onnx").read_bytes()
-
-
-def test_a_file_that_is_no_onnx_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "brains").mkdir()
-    (tmp_path / "brains/partner.onnx").write_bytes(b"a spreadsheet")
-    assert refusal_of(tmp_path, WITH_A_FILE).startswith(
-        "the policy of 1 does not fit: partner.onnx is no ONNX file that onnxruntime can read: "
-    )
-
-
-def test_a_file_for_other_observations_is_refused(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
-    assert refusal_of(tmp_path, WITH_A_FILE) == (
-        "the policy of 1 does not fit: partner.onnx takes observations of 7 numbers (its input 'obs'); "
-        "the environment gives 2 numbers; "
-        "export it for one such observation, or write a class with act() in agent.py that runs the file"
-    )
-
-
-def test_a_file_for_other_observations_is_refused_where_no_space_is_known(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((7, 3)))
-    said = refusal_of(tmp_path, WITH_A_FILE.replace("    observation_space = ", "    seen_by_all = "))
-    assert "partner.onnx takes observations of 7 numbers" in said
-
-
-def test_a_file_for_other_actions_is_refused(tmp_path: Path) -> None:
-    onnx_files.linear(tmp_path / "brains/partner.onnx", np.ones((2, 5)))
-    assert refusal_of(tmp_path, WITH_A_FILE) == (
-        "the policy of 1 does not fit: partner.onnx returns 5 numbers as 'output'; expected 3, one for each action"
-    )
-
-
-def test_without_onnxruntime_files_are_not_tried_and_the_project_names_it(tmp_path: Path) -> None:
-    (tmp_path / "brains").mkdir()
-    (tmp_path / "brains/partner.onnx").write_bytes(b"a spreadsheet")
-    hidden = "import importlib.util, sys; sys.modules['onnxruntime'] = None\nfrom importlib import metadata\n"
-    hidden += "names = metadata.packages_distributions\n"
-    hidden += "metadata.packages_distributions = lambda: {k: v for k, v in names().items() if k != 'onnxruntime'}\n"
-    project, said = project_of(tmp_path, hidden + WITH_A_FILE)
-    assert (
-        f"Remark: ONNX files are not tried, since onnxruntime is not installed here: pip install {ONNXRUNTIME}" in said
-    )
     assert ONNXRUNTIME in (project / "requirements.txt").read_text().splitlines()
+    acts = "import agent, numpy; print(agent.Policy1().act(numpy.array([100, 0]), {}))"
+    done = run_python(project, "-c", acts)
+    assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("return int(policy)", "return [1, 2][int(policy)]", "the policy of 1 fails: IndexError: list index out of range (experiment.py:"),
-        ("return int(policy)", "return 3", "the policy of 1 chose action 3; there are 0 to 2"),
-        ("return open(name)", "return open(name + '.gz')", "the policy of 1 fails: FileNotFoundError: "),
-    ],
-)  # fmt: skip
-def test_functions_that_choose_no_action_are_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
-    (tmp_path / "brains").mkdir()
-    (tmp_path / "brains/two.txt").write_text("2")
-    assert old in TOGETHER
-    assert refusal_of(tmp_path, TOGETHER.replace(old, new)).startswith(said)
+def test_only_a_process_that_loads_an_experiment_knows_interactive_gyms_names(tmp_path: Path) -> None:
+    project, _ = project_of(tmp_path)
+    asks = (
+        "import importlib.util, sys, trial.server\n{}\nprint(importlib.util.find_spec('interactive_gym') is not None)"
+    )
+    for first, known in (("", "False"), ("import agent", "True")):
+        assert run_python(project, "-c", asks.format(first)).stdout == f"{known}\n"

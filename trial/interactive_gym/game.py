@@ -1,10 +1,10 @@
-"""`RemoteGame`, the argument of Interactive Gym's callbacks and functions: the present state of the game."""
+"""Interactive Gym's callbacks, and their argument, the `RemoteGame`: the present state of the game."""
 
 from __future__ import annotations
 
 import collections
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from trial.core.players import ALL
@@ -94,8 +94,48 @@ class RemoteGame:
     def over(self) -> bool:
         """Whether the episode has ended for all players."""
         ends = (self.terminateds, self.truncateds)
-        if not all(isinstance(each, Mapping) for each in ends):
+        if not all(isinstance(end, Mapping) for end in ends):
             return any(map(bool, ends))
-        players = {player for each in ends for player in each} - {ALL}
-        each_ended = all(any(each.get(player) for each in ends) for player in players)
-        return any(each.get(ALL) for each in ends) or (bool(players) and each_ended)
+        players = {player for end in ends for player in end} - {ALL}
+        all_ended = all(any(end.get(player) for end in ends) for player in players)
+        return any(end.get(ALL) for end in ends) or (bool(players) and all_ended)
+
+
+class GameCallback:
+    """A callback that does nothing: the base class of an experiment's callbacks, with a method for each event.
+
+    Those of the waiting room are never called: participants wait in the lobby, before their server runs.
+    """
+
+    def __init__(self, **_options: Any) -> None:
+        """Take any options, as Interactive Gym does."""
+
+
+class MultiCallback(GameCallback):
+    """Calls several callbacks in turn; `callbacks` are their classes.
+
+    Each method returns a map of the values that the callbacks return, by the names of their classes, without None.
+    """
+
+    def __init__(self, callbacks: Iterable[type[GameCallback]], **_options: Any) -> None:
+        super().__init__()
+        self.callbacks = [callback() for callback in callbacks]
+
+
+def _call_all(event: str) -> Any:
+    """Return the method of `MultiCallback` for an event."""
+
+    def call(self: MultiCallback, remote_game: RemoteGame) -> dict[str, Any] | None:
+        values = {type(callback).__name__: getattr(callback, event)(remote_game) for callback in self.callbacks}
+        return {name: value for name, value in values.items() if value is not None} or None
+
+    return call
+
+
+for _event in (
+    *("on_episode_start", "on_episode_end", "on_game_tick_start", "on_game_tick_end", "on_game_end"),
+    *("on_graphics_start", "on_graphics_end"),
+    *("on_waitroom_start", "on_waitroom_join", "on_waitroom_end", "on_waitroom_timeout"),
+):
+    setattr(GameCallback, _event, lambda _self, _remote_game: None)
+    setattr(MultiCallback, _event, _call_all(_event))

@@ -7,11 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from trial.interactive_gym.inference_utils import sample_action_via_softmax
-
 ORT_SESSIONS: dict[str, Any] = {}
 """The loaded models by their paths."""
-_TYPES = {"tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(double)": np.float64}
 
 
 def load_onnx_policy_fn(onnx_model_path: str) -> str:
@@ -30,17 +27,9 @@ def load_onnx_policy_fn(onnx_model_path: str) -> str:
 def inference_onnx_model(input_dict: Mapping[str, Any], model_path: str) -> Any:
     """Run the model, and return its outputs. Inputs that `input_dict` lacks, such as recurrent states, are zeros."""
     session = ORT_SESSIONS[model_path]
-    feeds = {
-        each.name: input_dict[each.name] if each.name in input_dict else _zeros(each) for each in session.get_inputs()
-    }
-    return session.run(["output"], feeds)
-
-
-def _zeros(port: Any) -> Any:
-    """Return the value of an input that was given none: zeros, but 1 for a `seq_lens` with at most one axis."""
-    shape = [size if isinstance(size, int) else 1 for size in port.shape]
-    fill = 1 if port.name == "seq_lens" and len(shape) <= 1 else 0
-    return np.full(shape, fill, _TYPES.get(port.type, np.float32))
+    shapes = {port.name: [size if isinstance(size, int) else 1 for size in port.shape] for port in session.get_inputs()}
+    zeros = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    return session.run(["output"], {**zeros, **input_dict})
 
 
 def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
@@ -49,3 +38,9 @@ def onnx_model_inference_fn(observation: Any, onnx_model_path: str) -> int:
         observation = np.hstack([np.asarray(part).reshape(-1) for part in observation.values()])
     inputs = {"obs": np.asarray(observation, np.float32).reshape(1, -1)}
     return sample_action_via_softmax(inference_onnx_model(inputs, onnx_model_path)[0])
+
+
+def sample_action_via_softmax(logits: Any) -> int:
+    """Draw the number of an action, with the probabilities of the softmax of `logits`."""
+    weights = np.exp(np.asarray(logits, float).reshape(-1) - np.max(logits))
+    return int(np.random.choice(len(weights), p=weights / weights.sum()))
