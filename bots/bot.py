@@ -28,7 +28,8 @@ from bots.report import BotReport, PlayedStep
 from hippodrome.config.project_keys import MAX_STEPS
 from trial.pictures.frames import FrameError
 
-SUBPROTOCOLS = [Subprotocol(f"hippodrome.{version}") for version in (3, 2, 1)]
+SUBPROTOCOL = Subprotocol("hippodrome")
+DECODES = ("deflate", "jpeg", "objects")
 MAX_FRAME_BYTES = 64 * 1024 * 1024
 
 LOBBY, UNMATCHED = "lobby", "unmatched"  # states of the game page (docs/pages.md)
@@ -255,7 +256,7 @@ class Bot:
         host, port = self.allowed.dial(parts.hostname or "", parts.port or PORTS[parts.scheme])
         if address not in play.addresses:
             play.addresses.append(address)
-        hello = {"userId": self.report.user_id, "token": state["token"], "step": play.step}
+        hello = {"userId": self.report.user_id, "token": state["token"], "step": play.step, "decodes": DECODES}
         try:
             async with (
                 asyncio.timeout(self.patience + self.play),
@@ -264,15 +265,15 @@ class Bot:
                     host=host,
                     port=port,
                     ssl=self.allowed.tls if parts.scheme == "wss" else None,
-                    subprotocols=SUBPROTOCOLS,
+                    subprotocols=[SUBPROTOCOL],
                     compression=None,
                     max_size=MAX_FRAME_BYTES,
                     proxy=None,
                     close_timeout=2,
                 ) as websocket,
             ):
-                if websocket.subprotocol not in SUBPROTOCOLS:
-                    raise Failed("the server speaks none of hippodrome.3, hippodrome.2 and hippodrome.1")
+                if websocket.subprotocol != SUBPROTOCOL:
+                    raise Failed(f"the server does not speak the subprotocol {SUBPROTOCOL}")
                 await GameConnection(websocket, play, self.report, self.random, self.play).run(hello)
         except ConnectionClosed as closed:
             code = closed.rcvd.code if closed.rcvd else 1006

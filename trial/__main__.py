@@ -10,7 +10,7 @@ import sys
 
 from protocol import environment, exits
 from trial.server import assignment
-from trial.server.preauth_limit import PortNotPermitted
+from trial.server.listener import PortNotPermitted
 from trial.server.server import TrialServer
 from trial.settings import SettingsError, TrialSettings
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import queue
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -31,39 +29,6 @@ class _Job:
     limit: float
 
 
-class _Notifier:
-    """Makes an event loop call `callback` once for each `notify`, which any thread may call.
-
-    `call_soon_threadsafe` does the same, but makes a handle, a write to a socket of its own and two reads of it: with
-    it a tick of two participants takes 3 % longer.
-    """
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], None]) -> None:
-        self.loop = loop
-        self._callback = callback
-        self._eventfd = -1  # Linux alone has it
-        if sys.platform == "linux":
-            self._eventfd = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_CLOEXEC)
-            loop.add_reader(self._eventfd, self._readable)
-
-    def notify(self) -> None:
-        if sys.platform == "linux":
-            os.eventfd_write(self._eventfd, 1)
-        else:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                self.loop.call_soon_threadsafe(self._callback)
-
-    def _readable(self) -> None:
-        if sys.platform == "linux":
-            os.eventfd_read(self._eventfd)  # takes one of the calls; the loop comes again for each of the others
-        self._callback()
-
-    def __del__(self) -> None:
-        if self._eventfd >= 0:
-            # Nothing uses it any more: a loop that reads it or a thread that may notify would keep this object alive.
-            os.close(self._eventfd)
-
-
 class Worker:
     """Calls functions one after another on one thread of its own, since many simulators must stay on one thread.
 
@@ -77,8 +42,6 @@ class Worker:
         self._unfinished = 0  # functions that have not returned
         self._waiting: dict[_Job, None] = {}  # unfinished functions that are not late; a dict keeps the order
         self._timer: asyncio.TimerHandle | None = None  # one for all functions, since most return before their limit
-        self._results: deque[tuple[_Job, Any, Exception | None]] = deque()  # the loop is notified of each result
-        self._notifier: _Notifier | None = None
 
     @property
     def busy(self) -> bool:
@@ -93,13 +56,12 @@ class Worker:
         event loop.
         """
         loop = asyncio.get_running_loop()
-        if self._notifier is None or self._notifier.loop is not loop:
-            self._notifier, self._results = _Notifier(loop, self._returned), deque()
-        job, notifier, results = _Job(done, loop.time() + limit, limit), self._notifier, self._results
+        job = _Job(done, loop.time() + limit, limit)
 
         def run() -> None:
-            results.append((job, *_call(function)))
-            notifier.notify()
+            result, error = _call(function)
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self._returned, job, result, error)
 
         self._unfinished += 1
         self._waiting[job] = None
@@ -107,8 +69,7 @@ class Worker:
             self._wake_at(loop, job.until)
         self._jobs.put(run)
 
-    def _returned(self) -> None:
-        job, result, error = self._results.popleft()
+    def _returned(self, job: _Job, result: Any, error: Exception | None) -> None:
         self._unfinished -= 1
         if job in self._waiting:
             del self._waiting[job]

@@ -17,6 +17,10 @@ FRAME_RATE_CONTROLS = {"faster": "fpsUp", "slower": "fpsDown"}
 _BUTTONS_OF_ACTIONS = frozenset({"fire", "leftup", "rightup", "leftdown", "rightdown"})
 """Further controls that are actions in HIPPO's front end, also if the action space has none of that name."""
 
+DECODABLE = frozenset({"deflate", "jpeg", "objects"})
+"""What a client may name in `decodes` of its first message (docs/wire.md)."""
+_DECODED_BY_DEFAULT = frozenset({"deflate"})
+
 _FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden"})
 
 
@@ -52,6 +56,8 @@ class Hello:
     """The message has a field `projectId`, as HIPPO's front end sends it."""
     project_id: str | None = None
     """The value of that field, if it is a text."""
+    decodes: frozenset[str] = _DECODED_BY_DEFAULT
+    """What the client decodes, of DECODABLE. Clients without our subprotocol do not say it, and get JPEGs in JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +134,19 @@ def parse_hello(data: str | bytes) -> Hello:
         step,
         names_project="projectId" in value,
         project_id=project if isinstance(project, str) else None,
+        decodes=_decodes(value.get("decodes")),
     )
+
+
+def _decodes(names: Any) -> frozenset[str]:
+    """Return the names of DECODABLE among these; `deflate` if the client has left them out."""
+    if names is None:
+        return _DECODED_BY_DEFAULT
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadMessage("decodes must be a list of texts")
+    if not {"deflate", "jpeg"} & set(names):
+        raise BadMessage("decodes must name deflate or jpeg")
+    return DECODABLE & set(names)
 
 
 def words_of(trial: TrialSection) -> tuple[str, ...]:

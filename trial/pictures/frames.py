@@ -97,6 +97,11 @@ def packed(rows: Frame, base: Frame | None = None, limit: float = math.inf) -> b
     return b"".join(parts) if size + len(parts[-1]) <= limit else None
 
 
+def jpeg_frame(frame: Frame, frame_id: int) -> bytes:
+    """Build a binary frame of the kind JPEG."""
+    return header(JPEG, frame, frame_id) + jpeg(frame)
+
+
 def jpeg(frame: Frame, quality: int = 80) -> bytes:
     """Encode the picture as a JPEG.
 

@@ -1,4 +1,4 @@
-"""Draws scenes as frames, for clients that cannot draw scenes: without a subprotocol, or with an earlier one.
+"""Draws scenes as frames, for clients that do not draw objects, such as HIPPO's front end.
 
 The frames look as `web/game/painter.js` draws the scenes, apart from smooth edges, fonts and tweens.
 """

@@ -27,10 +27,12 @@ _JSON = json.JSONEncoder(separators=(",", ":"), ensure_ascii=False)
 class SceneEncoder:
     """Encodes the scenes of one connection: the first scene whole, then the changes from each scene to the next.
 
-    A WebSocket loses no message and keeps their order, so the client has the scene that was sent last.
+    A WebSocket loses no message and keeps their order, so the client has the scene that was sent last. With `deflate`
+    long messages are packed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, deflate: bool = True) -> None:
+        self._deflate = deflate
         self._sent: Scene | None = None
 
     def forget(self) -> None:
@@ -39,7 +41,7 @@ class SceneEncoder:
 
     def encode(self, scene: Scene, scene_id: int) -> bytes:
         """Encode one scene, and return its bytes. `scene` is kept, to compare it with the next one."""
-        kind, body = _CACHE.packed(self._sent, scene)
+        kind, body = _CACHE.packed(self._sent, scene, deflate=self._deflate)
         self._sent = scene
         return HEADER.pack(kind, scene_id & 0xFFFFFFFF) + body
 
@@ -48,24 +50,25 @@ class _Cache:
     """Keeps the changes that were packed last, since players of one game mostly see the same two scenes in a row."""
 
     def __init__(self) -> None:
-        self._last: tuple[Scene | None, Scene, tuple[int, bytes]] | None = None  # never changed: threads may read it
+        # Never changed: threads may read it.
+        self._last: tuple[Scene | None, Scene, bool, tuple[int, bytes]] | None = None
 
-    def packed(self, before: Scene | None, scene: Scene) -> tuple[int, bytes]:
+    def packed(self, before: Scene | None, scene: Scene, *, deflate: bool) -> tuple[int, bytes]:
         """Return the kind of the message, and its bytes after the header."""
         last = self._last
-        if last is not None and last[0] is before and last[1] is scene:
-            return last[2]
-        packed = _pack(changes(before, scene))
-        self._last = before, scene, packed
+        if last is not None and last[0] is before and last[1] is scene and last[2] is deflate:
+            return last[3]
+        packed = _pack(changes(before, scene), deflate=deflate)
+        self._last = before, scene, deflate, packed
         return packed
 
 
 _CACHE = _Cache()
 
 
-def _pack(message: Mapping[str, Any]) -> tuple[int, bytes]:
+def _pack(message: Mapping[str, Any], *, deflate: bool) -> tuple[int, bytes]:
     body = _JSON.encode(message).encode("utf-8", "replace")
-    if len(body) <= _PACK_FROM:
+    if not deflate or len(body) <= _PACK_FROM:
         return SCENE, body
     packer = zlib.compressobj(1, zlib.DEFLATED, -15)
     return PACKED_SCENE, packer.compress(body) + packer.flush()

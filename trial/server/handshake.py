@@ -20,7 +20,7 @@ from trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
 from trial.server import watch
 from trial.settings import TrialSettings
 from trial.wire import notice, plain
-from trial.wire.connection import SUBPROTOCOLS
+from trial.wire.connection import SUBPROTOCOL
 from trial.wire.inbound import RateLimit
 
 _REFUSED = "that token does not open this game"
@@ -58,8 +58,8 @@ def process_request(websocket: ServerConnection, request: Request, *, gym: str =
 
 
 def select_subprotocol(_: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return the subprotocol to use. None if the client offers none of ours, as HIPPO's clients do."""
-    return next((Subprotocol(name) for name in SUBPROTOCOLS if name in offered), None)
+    """Return the subprotocol to use; None if the client does not offer it, as HIPPO's clients do not."""
+    return Subprotocol(SUBPROTOCOL) if SUBPROTOCOL in offered else None
 
 
 async def receive_hello(websocket: ServerConnection, seconds: float) -> Hello:
@@ -91,14 +91,16 @@ def tokens_for(settings: TrialSettings, user_id: str | None) -> tuple[str, ...]:
 
 
 def check_member(websocket: ServerConnection, user_id: str | None, settings: TrialSettings) -> None:
-    """Check that the participant is a member of the session, and that their client has a subprotocol of SUBPROTOCOLS.
+    """Check that the participant is a member of the session, and that their client has our subprotocol.
 
     Unknown fields of a client without a subprotocol are recorded, and could hold a member's id. Raises CloseConnection.
     """
     if user_id not in settings.seats:
         raise CloseConnection(4401, _REFUSED)
     if websocket.subprotocol is None:
-        raise CloseConnection(4401, "this game is played with others, and needs a client that offers a subprotocol")
+        raise CloseConnection(
+            4401, f"this game is played with others, and needs a client with the subprotocol {SUBPROTOCOL}"
+        )
 
 
 def check_access(websocket: ServerConnection, hello: Hello, tokens: Iterable[str], origins: Collection[str]) -> None:

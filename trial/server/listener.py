@@ -14,19 +14,21 @@ from websockets.typing import Subprotocol
 from trial.recordings.store import Store
 from trial.server.certificate import RELOAD_SECONDS, Certificate
 from trial.server.handshake import process_request, select_subprotocol
-from trial.server.preauth_limit import PreauthLimitedSocket
 from trial.settings import TrialSettings
-from trial.wire.connection import SUBPROTOCOLS
-from trial.wire.player_socket import PlayerSocket
+from trial.wire.connection import SUBPROTOCOL
 
 log = logging.getLogger("trial")
 
 MAX_MESSAGE = 4096
 """The most bytes in a client's message."""
 MAX_UNAUTHENTICATED_WEBSOCKETS = 64
-"""The most WebSockets that have not authenticated. One more closes the oldest. preauth_limit.py limits sockets."""
+"""The most WebSockets that have not authenticated. One more closes the oldest."""
 CLOSE_SECONDS = 2.0
 """The time that a client has to answer a close."""
+
+
+class PortNotPermitted(Exception):
+    """The system does not let this process listen on the port."""
 
 
 class Listener:
@@ -38,7 +40,6 @@ class Listener:
         self._settings = settings
         self._handle = handle
         self._certificate = Certificate(settings, store) if settings.tls else None
-        self._socket: PreauthLimitedSocket
         self._server: WebSocketServer
         self._unauthenticated: dict[ServerConnection, None] = {}
 
@@ -50,14 +51,23 @@ class Listener:
         settings, certificate = self._settings, self._certificate
         if certificate is not None:
             await asyncio.to_thread(certificate.load)
-        self._socket = PreauthLimitedSocket(settings.host, settings.port)
-        self._server = await serve(
+        try:
+            self._server = await self._serve()
+        except PermissionError as error:
+            raise PortNotPermitted(f"port {settings.port} is for privileged processes") from error
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    async def _serve(self) -> WebSocketServer:
+        settings, certificate = self._settings, self._certificate
+        return await serve(
             self._connected,
-            sock=self._socket,
+            settings.host,
+            settings.port,
             open_timeout=settings.hello_seconds,
             ssl=certificate.context if certificate is not None else None,
             ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
-            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+            subprotocols=[Subprotocol(SUBPROTOCOL)],
             select_subprotocol=select_subprotocol,
             process_request=partial(process_request, gym=settings.trial.gym),
             server_header=None,
@@ -68,15 +78,11 @@ class Listener:
             ping_timeout=15,
             close_timeout=CLOSE_SECONDS,
             logger=_silent(),
-            create_connection=PlayerSocket,
         )
-        port: int = self._server.sockets[0].getsockname()[1]
-        return port
 
     def authenticated(self, websocket: ServerConnection) -> None:
-        """Take a connection that has authenticated out of the limits."""
+        """Take a connection that has authenticated out of the limit."""
         self._unauthenticated.pop(websocket, None)
-        self._socket.authenticated(websocket.remote_address)
 
     async def renew_certificate(self) -> None:
         """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled. Without TLS, return at once."""

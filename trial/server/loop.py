@@ -101,12 +101,11 @@ class TrialLoop:
         self._saving_members: set[asyncio.Task[None]] = set()
         self._done: asyncio.Future[None] = self._loop.create_future()
         self._logged: set[str] = set()
-        self._pictured: list[Connection] = []  # connections whose new picture is not sent yet
         self._carry_out: dict[type[Effect], Callable[[Any], None]] = {
             **dict.fromkeys((StepCall, FeedbackCall, ResetCall, ReplayCall), self._call),
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
-            SendPicture: self._send_picture,
+            SendPicture: lambda effect: effect.connection.show(effect.picture, effect.frame_id),
             SendDone: self._send_done,
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: self._write_line,
@@ -180,10 +179,6 @@ class TrialLoop:
     def receive(self, connection: Connection, message: Message) -> None:
         """Carry out a message of a client."""
         self._apply(self.core.receive(connection, message, self._loop.time()))
-
-    def acknowledges_again(self, connection: Connection, frame_id: int) -> None:
-        """Note that a client that had stopped acknowledging frames has acknowledged this one."""
-        self._do(self.core.receive, connection, Message(ack=frame_id))
 
     # ---- programs
 
@@ -290,8 +285,6 @@ class TrialLoop:
         """Carry out the effects, then set the timer for the core's `wake_at`."""
         for effect in effects:
             self._carry_out[type(effect)](effect)
-        while self._pictured:  # pictures follow the messages of the same event
-            self._pictured.pop().send_now()
         core = self.core
         if core.ready:
             self.ready.set()
@@ -355,11 +348,6 @@ class TrialLoop:
     def _send_done(self, effect: SendDone) -> None:
         connection: Any = effect.connection
         connection.close_done(effect.episodes, effect.score, effect.outcome, effect.words)
-
-    def _send_picture(self, effect: SendPicture) -> None:
-        connection: Any = effect.connection
-        connection.put_picture(effect.picture, effect.frame_id)
-        self._pictured.append(connection)
 
     def _write(self, line: Line) -> None:
         self._recorder.write(line)

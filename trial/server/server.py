@@ -232,6 +232,7 @@ class TrialServer:
         drawing = self._drawing
         connection = Connection(
             websocket,
+            decodes=hello.decodes,
             lossless=self.settings.trial.lossless,
             stalled_seconds=self.settings.stalled_seconds,
             assets=drawing.assets,
@@ -312,9 +313,6 @@ class TrialServer:
         """Receive a client's messages until its connection is closed. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
         inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
-        connection.hear_acknowledgements(inbound)
-        if self.settings.session:  # only in a session does an acknowledgement concern the trial: the member is back
-            connection.acknowledges_again = partial(trial.acknowledges_again, connection)
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())
@@ -322,7 +320,7 @@ class TrialServer:
                 connection.send(messages.error(str(error)))
                 continue
             if message.ack is not None and connection.binary:
-                connection.acknowledged(message.ack, loop.time())
+                connection.acknowledged(message.ack)
             if message.asset is not None and not connection.send_asset(message.asset):
                 connection.send(messages.error("this game has no such image"))
             trial.receive(connection, message)

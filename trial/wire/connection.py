@@ -8,7 +8,7 @@ import logging
 import math
 import socket
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 
 from websockets.asyncio.server import ServerConnection
@@ -23,14 +23,11 @@ from trial.pictures.picture import Picture
 from trial.pictures.scene import Scene
 from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
 from trial.settings import STALLED_SECONDS
-from trial.wire.inbound import Inbound
-from trial.wire.player_socket import PlayerSocket
 
 log = logging.getLogger("trial")
 
-SUBPROTOCOLS = ("hippodrome.3", "hippodrome.2", "hippodrome.1")
-"""The subprotocols, the preferred one first. Clients with the first draw scenes; clients with the last take only
-lossless frames."""
+SUBPROTOCOL = "hippodrome"
+"""The subprotocol of docs/wire.md. Clients without it, such as HIPPO's front end, get HIPPO's messages."""
 REST_SECONDS = 0.25
 """A lossy frame is made exact if no other picture follows within this time or 2.5 frames, whichever is longer."""
 
@@ -46,34 +43,34 @@ _ASSET_TIMES = 3  # how often a connection may ask for the same image
 class Connection:
     """Sends pictures and messages to a client. `run` sends what the other methods have collected.
 
-    Only `send_now` may send a picture itself, if nothing has to be sent before it. Of pictures and states only the
-    newest one waits, so nothing builds up for a slow client.
-    Pictures may be lossy (trial/pictures/encoder.py) if the client takes such frames and `lossless` is False. A client
-    that does not draw scenes gets them as frames, which `draw` makes on a thread.
+    Of pictures and states only the newest one waits, so nothing builds up for a slow client: `run` sends the next
+    message when the last one has left the write buffer (`write_limit` in trial/server/listener.py).
+    `decodes` names what the client decodes (`Hello.decodes`). Pictures may be lossy (trial/pictures/encoder.py) if the
+    client decodes JPEGs and `lossless` is False. A client that does not draw objects gets scenes as frames, which
+    `draw` makes on a thread.
     """
 
     def __init__(
         self,
         websocket: ServerConnection,
         *,
+        decodes: Collection[str] = messages.DECODABLE,
         lossless: bool = False,
         stalled_seconds: float = STALLED_SECONDS,
         assets: Assets | None = None,
         draw: Callable[[Scene], frames.Frame] | None = None,
     ) -> None:
         self.websocket = websocket
-        self._direct = websocket if isinstance(websocket, PlayerSocket) else None
         self._loop = asyncio.get_running_loop()
         self.window = Window(stalled_seconds)
-        self.binary = websocket.subprotocol in SUBPROTOCOLS
-        self.acknowledges_again: Callable[[int], None] | None = None
-        """A function that is called when a client that had stopped acknowledging frames acknowledges one, with its
-        id."""
+        self.binary = websocket.subprotocol == SUBPROTOCOL
+        """Whether the client has our subprotocol: it gets binary frames, and acknowledges them."""
         self.rate = 30
         """The game's present frame rate, per second."""
-        self._draws_scenes = websocket.subprotocol == SUBPROTOCOLS[0]
-        self._encoder = Encoder(lossy=websocket.subprotocol in SUBPROTOCOLS[:2] and not lossless)
-        self._scenes = SceneEncoder()
+        self._inflates = "deflate" in decodes
+        self._draws_objects = self.binary and "objects" in decodes
+        self._encoder = Encoder(lossy="jpeg" in decodes and not lossless)
+        self._scenes = SceneEncoder(deflate=self._inflates)
         self._draw = draw
         self._assets = () if assets is None else tuple(assets.by_name.values())
         self._asked: Counter[int] = Counter()  # how often the client has asked for each asset
@@ -85,7 +82,6 @@ class Connection:
         self._sent = 0, False  # the id of the last picture, and whether it is large
         self._closing: tuple[int, str] | None = None  # the code, and the last message
         self._wake = asyncio.Event()
-        self._resting = False  # whether `run` waits for `_wake` to be set
         _limit_unsent(websocket)
 
     def send(self, text: str) -> None:
@@ -99,41 +95,13 @@ class Connection:
         self._state = text
         self._wake.set()
 
-    def put_picture(self, picture: Picture, picture_id: int) -> None:
-        """Let a picture wait for `send_now` or the next message. It replaces a picture that still waits.
+    def show(self, picture: Picture, picture_id: int) -> None:
+        """Send a picture, after the messages that wait. It replaces a picture that still waits.
 
         `picture` must not change afterwards.
         """
         self._picture = (picture_id, picture)
-
-    def send_now(self) -> None:
-        """Send the picture that waits at once, or let `run` send it if something else is sent or written before it."""
-        if not self._send_at_once():
-            self._wake.set()
-
-    def _send_at_once(self) -> bool:
-        """Send the picture that waits. Return False if `run` has to send it, or rows that make it exact."""
-        direct, now = self._direct, self._loop.time()
-        if direct is None or self._picture is None or not self._resting or self._wake.is_set() or not direct.free:
-            return False
-        if self.window.wait(now, self.rate) > 0.0:
-            return False
-        frame_id, picture = self._picture
-        pack, large = self._packing(picture, frame_id)
-        if large or not self.binary:
-            return False
-        self._picture = None
-        try:
-            data = pack()
-            assert isinstance(data, bytes)
-            self._sent = (frame_id, False)
-            self._note_sent(frame_id, now, self._rest())
-            direct.send_now(data)
-        except Exception:
-            log.exception("a picture cannot be sent")
-            self.abort()
-            return True
-        return self._encoder.exact
+        self._wake.set()
 
     def send_asset(self, name: str) -> bool:
         """Send an image, at most `_ASSET_TIMES` times to one client. Return False if there is none of this name."""
@@ -146,27 +114,11 @@ class Connection:
             self._wake.set()
         return True
 
-    def acknowledged(self, frame_id: int, now: float) -> None:
+    def acknowledged(self, frame_id: int) -> None:
         """Note that the client has shown this frame."""
-        had_stopped = self.acknowledges_again is not None and self.window.stalled(now)
-        self.window.acknowledged(frame_id, now)
-        if had_stopped and self.acknowledges_again is not None:
-            self.acknowledges_again(frame_id)
+        self.window.acknowledged(frame_id, self._loop.time())
         if self._picture is not None or not self._encoder.exact:
             self._wake.set()
-
-    def hear_acknowledgements(self, inbound: Inbound) -> None:
-        """Let `inbound` read each acknowledgement as it arrives. `recv` returns all other messages."""
-
-        def hear(data: bytes | bytearray | memoryview) -> bool:
-            now = self._loop.time()
-            frame_id = inbound.acknowledged(data, now)
-            if frame_id is not None:
-                self.acknowledged(frame_id, now)
-            return frame_id is not None
-
-        if self._direct is not None:
-            self._direct.hear = hear
 
     def close(self, code: int, last_words: str) -> None:
         """Close with this code, after the messages that wait and the message `last_words`.
@@ -183,10 +135,9 @@ class Connection:
 
     async def run(self) -> None:
         """Send until the connection is closed."""
-        timer: asyncio.TimerHandle | None = None
         try:
             while True:
-                await self._something_to_do()
+                await self._until_due()
                 while self._texts:
                     await self.websocket.send(self._texts.popleft())
                 if self._state is not None:
@@ -195,41 +146,31 @@ class Connection:
                 if self._closing is not None:
                     await self._end(*self._closing)
                     return
-                if timer is not None:
-                    timer.cancel()
                 if self._wanted:
                     await self._send_part()
-                    self._wake.set()
-                wait = self._wait(self._loop.time())
-                if wait > 0.0:
-                    if wait < math.inf:
-                        timer = self._loop.call_later(wait, self._wake.set)
-                    continue
-                await self._send_picture()
-                self._wake.set()
+                if self._picture_in() <= 0.0:
+                    await self._send_picture()
         except ConnectionClosed:
             pass
         except Exception:
             log.exception("a picture cannot be sent")
             self.abort()  # so that the page connects again, and does not wait for a frame that never comes
-        finally:
-            self._resting = False
-            if timer is not None:
-                timer.cancel()
 
-    async def _something_to_do(self) -> None:
-        self._resting = True
-        await self._wake.wait()
-        self._resting = False
+    async def _until_due(self) -> None:
+        """Wait until there is something to send."""
+        seconds = 0.0 if self._wanted else self._picture_in()
+        if seconds > 0.0:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds if seconds < math.inf else None):
+                    await self._wake.wait()
         self._wake.clear()
-        if self._direct is not None:
-            await self._direct.drain()  # `PlayerSocket.send_now` does not wait until the data are written
 
-    def _wait(self, now: float) -> float:
+    def _picture_in(self) -> float:
         """Return the seconds until the next picture or rows may be sent; infinity if there are none."""
+        now = self._loop.time()
         if self._picture is not None:
             return self.window.wait(now, self.rate)
-        if not self.binary or self._encoder.exact:
+        if self._encoder.exact:
             return math.inf
         return max(self._sharpen_at - now, self.window.wait(now, self.rate))
 
@@ -265,26 +206,20 @@ class Connection:
         if self._picture is not None:
             (frame_id, picture), self._picture = self._picture, None
             pack, large = self._packing(picture, frame_id)
-            self._sent, rest = (frame_id, large), self._rest()
+            self._sent, rest = (frame_id, large), max(REST_SECONDS, 2.5 / self.rate)
         else:
             frame_id, large = self._sent
             pack, rest = partial(self._encoder.sharpen, frame_id), 1.0 / max(self.rate, _ROWS_RATE)
-        data: bytes | str = await asyncio.to_thread(pack) if large else pack()
-        self._note_sent(frame_id, self._loop.time(), rest)
-        await self.websocket.send(data)  # returns when the write buffer is empty
-
-    def _rest(self) -> float:
-        """Return the seconds after a picture until its rows follow, if no other picture does."""
-        return max(REST_SECONDS, 2.5 / self.rate)
-
-    def _note_sent(self, frame_id: int, now: float, rest: float) -> None:
+        data = await asyncio.to_thread(pack) if large else pack()
+        now = self._loop.time()
         self.window.sent(frame_id, now)
         self._sharpen_at = now + rest
+        await self.websocket.send(data)  # returns when the write buffer is empty
 
     def _packing(self, picture: Picture, frame_id: int) -> tuple[Callable[[], bytes | str], bool]:
         """Return a function that packs a picture for this client, and whether it must run on a thread."""
         if isinstance(picture, Scene):
-            if self._draws_scenes:
+            if self._draws_objects:
                 self._encoder.forget()
                 return partial(self._scenes.encode, picture, frame_id), False
             return partial(self._drawn, picture, frame_id), True
@@ -296,7 +231,11 @@ class Connection:
         return self._encode(self._draw(scene), frame_id)
 
     def _encode(self, frame: frames.Frame, frame_id: int) -> bytes | str:
-        return self._encoder.encode(frame, frame_id) if self.binary else frames.jpeg_message(frame, frame_id)
+        if not self.binary:
+            return frames.jpeg_message(frame, frame_id)
+        if not self._inflates:
+            return frames.jpeg_frame(frame, frame_id)
+        return self._encoder.encode(frame, frame_id)
 
     def abort(self) -> None:
         """Cut the connection without a close frame."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection
 
 from trial.core import messages
@@ -13,7 +12,6 @@ from trial.wire import plain
 MESSAGES_A_SECOND = 200
 """The most messages that a client may send in a second."""
 _NONSENSE_ALLOWED = 2  # messages that are not JSON objects; one more closes the connection
-_ACK = re.compile(rb'\{"ack": ?(0|[1-9][0-9]{0,9})\}')
 
 
 class RateLimit:
@@ -43,17 +41,6 @@ class Inbound:
         self._words = words
         self._rate = RateLimit(MESSAGES_A_SECOND)
         self._nonsense = 0
-
-    def acknowledged(self, data: bytes | bytearray | memoryview, now: float) -> int | None:
-        """Read a message that only acknowledges a frame, and return the frame's id; None if `read` must read it.
-
-        Such a message follows each frame, so most messages are of this kind.
-        """
-        found = _ACK.fullmatch(data)
-        if found is None or self._window is None:
-            return None
-        frame_id = int(found[1])
-        return None if frame_id > self._window.newest or self._rate.exceeded(now) else frame_id
 
     def read(self, data: str | bytes, now: float) -> Message:
         """Read a message. Raises BadMessage and NotAMessage, whose words are for the client, and CloseConnection."""

@@ -44,7 +44,7 @@ function drawRows(header, first, bytes) {
 }
 
 // Drops the pixels if not all rows of their picture have come, or if it has another size.
-function beginPicture({ width, height, channels = 0 }) {
+function beginPicture({ width, height, channels }) {
   if (rows > 0 && rows < height) pixels = null;
   rows = 0;
   const now = `${width} ${height} ${channels}`;

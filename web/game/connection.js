@@ -1,10 +1,10 @@
 // The WebSocket to the participant's server (docs/wire.md): handshake, acknowledgements, and how the page notices that it is dead.
 import { startDrawing } from "./drawing.js";
-import { canDecode, canInflate, decodeJpeg, readHeader, unpack } from "./frames.js";
+import { decodes, readHeader, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { data } from "./page.js";
 
-export const SUBPROTOCOLS = ["hippodrome.2", "hippodrome.1"]; // the last has no lossy frames
+const SUBPROTOCOL = "hippodrome";
 const SILENCE = 1_500; // ms without a message; then the page asks whether the server is there
 const PATIENCE = 5_000; // ms without an answer; then it gives up the connection
 const CONNECTING = 10_000; // ms for a connection to open; some firewalls neither let it through nor refuse it
@@ -18,7 +18,7 @@ let link = null; // the present connection; messages of earlier ones are ignored
 // "elsewhere", "moved", "failed" (the game cannot begin on this server) or "lost", `welcome` whether the server let us in, `result` its last message after "done".
 export function play(server, hear) {
   return new Promise((resolve) => {
-    const socket = new WebSocket(server.url, canInflate ? SUBPROTOCOLS.slice(canDecode ? 0 : 1) : []);
+    const socket = new WebSocket(server.url, SUBPROTOCOL);
     const own = { socket, heard: performance.now(), asked: 0, acked: 0, drawn: -Infinity, owed: 0, welcome: false };
     own.end = (why, result) => {
       if (link !== own) return;
@@ -31,7 +31,7 @@ export function play(server, hear) {
     const failed = () => own.end("lost"); // a new connection begins with a whole picture
     own.show = startDrawing(() => link === own || own.done, (id) => acknowledge(own, id), failed);
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step });
+    socket.onopen = () => send({ userId: server.userId, token: server.token, step: data.step, decodes });
     socket.onmessage = (event) => link === own && receive(own, event.data, hear);
     socket.onclose = (event) => own.end(own.welcome && event.code === 1011 ? "lost" : ENDS[event.code] ?? "lost");
   });
@@ -50,14 +50,12 @@ function receive(own, raw, hear) {
     const header = readHeader(raw);
     return own.show(header, unpack(header, raw));
   }
-  if (raw === "done") return own.end("done");
   let message;
   try {
     message = JSON.parse(raw) ?? {};
   } catch {
-    return own.end("lost"); // a trial server sends JSON or "done"
+    return own.end("lost"); // a trial server sends JSON
   }
-  if (message.frame) own.show({ id: message.frameId }, decodeJpeg(message.frame));
   if (message.done) own.end("done", message);
   if (Array.isArray(message.UI)) own.welcome = true;
   hear(message);
@@ -66,7 +64,6 @@ function receive(own, raw, hear) {
 // Acknowledges a picture at once if the last one came ACK_WAIT or more before it. If pictures come quicker, every second one
 // is acknowledged, which stands for both.
 function acknowledge(own, id) {
-  if (!SUBPROTOCOLS.includes(own.socket.protocol)) return;
   const now = performance.now();
   const quick = now - own.drawn < ACK_WAIT;
   Object.assign(own, { newest: id, drawn: now, owed: own.owed + 1 });

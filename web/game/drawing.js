@@ -22,7 +22,7 @@ export function startDrawing(isOpen, drawn, failed) {
       const late = header.kind === JPEG && newestWhole > number;
       if (unpacked.draw) unpacked.draw();
       else if (!unpacked.picture) drawPixels(header, unpacked);
-      else drawPicture(header.kind === JPEG ? header : unpacked, late ? null : unpacked.picture);
+      else drawPicture(header, late ? null : unpacked.picture);
       unpacked.picture?.close?.();
       if (!late) drawn(header.id);
     }).catch(failed);

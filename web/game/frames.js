@@ -5,8 +5,16 @@ export const KEY = 0, DIFFERENCE = 1, JPEG = 2, ROWS = 3; // kinds of frames
 const PART = 2 ** 14; // bytes that are unpacked at a time; they become at most 17 MB
 const LARGEST = 2 ** 24; // pixels of a picture: 4096 x 4096; trial/pictures/frames.py sends no more
 
-export const canInflate = typeof DecompressionStream === "function";
-export const canDecode = typeof createImageBitmap === "function";
+// What this browser decodes (docs/wire.md, "Opening"); scene.js adds objects.
+export const decodes = canInflate() ? ["deflate", "jpeg"] : ["jpeg"];
+
+function canInflate() {
+  try {
+    return Boolean(new DecompressionStream("deflate-raw"));
+  } catch {
+    return false; // Safari before 16.4, Firefox before 113, Chrome before 103
+  }
+}
 
 // An object without fields, which `unpack` refuses, if the message is too short for a header.
 export function readHeader(buffer) {
@@ -64,7 +72,7 @@ export async function inflate(packed, least, most = least) {
 async function decodeLossy({ width, height }, buffer) {
   const size = jpegSize(new DataView(buffer, HEADER));
   if (size?.width !== width || size.height !== height) throw new Error("no such frame");
-  const picture = await createImageBitmap(new Blob([buffer.slice(HEADER)], { type: "image/jpeg" }));
+  const picture = await decodeImage(new Blob([buffer.slice(HEADER)], { type: "image/jpeg" }));
   if (picture.width !== width || picture.height !== height) throw new Error("no such frame");
   return { picture };
 }
@@ -80,10 +88,14 @@ export function jpegSize(view) {
   return null;
 }
 
-// Decodes a frame in base64, as in HIPPO's messages.
-export async function decodeJpeg(base64) {
+// Resolves to a picture for `drawImage`. Safari before 15 has only the element for images.
+export async function decodeImage(blob) {
+  if (typeof createImageBitmap === "function") return createImageBitmap(blob);
   const picture = new Image();
-  picture.src = `data:image/jpeg;base64,${base64}`;
+  const reader = new FileReader();
+  reader.readAsDataURL(blob);
+  await new Promise((done) => (reader.onloadend = done));
+  picture.src = reader.result;
   await picture.decode();
-  return { picture, width: picture.naturalWidth, height: picture.naturalHeight };
+  return picture;
 }

@@ -1,11 +1,10 @@
 // The project's labels of arrows: each stands below its arrow.
 import { hooks } from "./hooks.js";
+import { addStyle } from "./page.js";
 
-const captions = new CSSStyleSheet();
-captions.replaceSync(`
+addStyle(`
 .pad .named { padding: 0; font-size: 1.1rem; line-height: 1.1; overflow: hidden; }
 .pad .named::after { content: attr(aria-label); display: block; font-size: .65rem; overflow-wrap: anywhere; }`);
-document.adoptedStyleSheets = [...document.adoptedStyleSheets, captions];
 
 hooks.message.push(({ labels }) => {
   if (!labels) return;

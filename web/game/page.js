@@ -22,6 +22,11 @@ export function make(tag, properties, ...children) {
   return element;
 }
 
+// Adds rules that only some games' pages need.
+export function addStyle(rules) {
+  document.head.append(make("style", { textContent: rules }));
+}
+
 // How numbers are shown
 
 export function duration(seconds) {

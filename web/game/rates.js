@@ -2,15 +2,13 @@
 import { commandButtons } from "./controls.js";
 import { send } from "./connection.js";
 import { hooks } from "./hooks.js";
-import { find, make } from "./page.js";
+import { addStyle, find, make } from "./page.js";
 import { game } from "./state.js";
 
-const rateSheet = new CSSStyleSheet();
-rateSheet.replaceSync(`.rates { display: flex; flex-wrap: wrap; align-items: center; justify-content: center; gap: .5rem .8rem; }
+addStyle(`.rates { display: flex; flex-wrap: wrap; align-items: center; justify-content: center; gap: .5rem .8rem; }
 .rates label { margin: 0; }
 .rates input[type=range] { width: 8rem; }
 .rates output { min-width: 8rem; font-variant-numeric: tabular-nums; }`);
-document.adoptedStyleSheets = [...document.adoptedStyleSheets, rateSheet];
 
 hooks.rates = (shown, message) => {
   if (!message.allowFrameRateChange) return null;

@@ -1,9 +1,8 @@
 // Games that are drawn by objects (docs/wire.md, "A scene"): puts the server's changes together, and shows the scene.
-import { SUBPROTOCOLS } from "./connection.js";
-import { canDecode, DIFFERENCE, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
+import { decodes, DIFFERENCE, inflate, JPEG, KEY, readHeader, ROWS, unpack } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { askForSprites, takeSpritePart } from "./sprites.js";
-import { find, make, setText } from "./page.js";
+import { addStyle, find, make, setText } from "./page.js";
 import { paint, place, prepare, putAway } from "./painter.js";
 
 const SCENE_HEADER = 5; // bytes: kind, id
@@ -18,14 +17,12 @@ let waitsForPaint = false;
 
 const hud = make("span", { id: "scene-hud", hidden: true });
 find("score").closest("p").append(hud);
-const sheet = new CSSStyleSheet(); // only these games' pages need it
-sheet.replaceSync(`.hud { flex-wrap: wrap; }
+addStyle(`.hud { flex-wrap: wrap; }
 .hud #scene-hud { flex: 1 0 100%; white-space: pre-line; overflow-wrap: anywhere; text-align: center; }
 @media (min-aspect-ratio: 5/4) {
   .hud { flex-wrap: nowrap; }
   .hud #scene-hud { flex: none; text-align: inherit; }
 }`);
-document.adoptedStyleSheets = [...document.adoptedStyleSheets, sheet];
 
 async function unpackScene(kind, buffer) {
   const body = buffer.slice(SCENE_HEADER);
@@ -105,7 +102,7 @@ function show(now) {
   }
 }
 
-if (canDecode) SUBPROTOCOLS.unshift("hippodrome.3");
+decodes.push("objects");
 for (const kind of [4, 5]) {
   hooks.kinds[kind] = (buffer, take) => take({ kind, id: new DataView(buffer).getUint32(1) }, unpackScene(kind, buffer));
 }

@@ -1,6 +1,6 @@
 // The images of a game that is drawn by objects: the page asks for them before the game, and a bar shows the progress.
 import { send } from "./connection.js";
-import { jpegSize } from "./frames.js";
+import { decodeImage, jpegSize } from "./frames.js";
 import { hooks } from "./hooks.js";
 import { showOverlay } from "./overlay.js";
 import { find, make, setText } from "./page.js";
@@ -69,7 +69,7 @@ async function opened(bytes) {
   const { width, height } = sizeOf(image);
   if (!(width <= SPRITE_SIDE && height <= SPRITE_SIDE && pixelsLeft >= width * height)) throw new Error("no such image");
   pixelsLeft -= width * height;
-  const bitmap = await createImageBitmap(new Blob([bytes.subarray(end)], { type }));
+  const bitmap = await decodeImage(new Blob([bytes.subarray(end)], { type }));
   return { bitmap, frames: new Map(Object.entries(frames)), animations: new Map(Object.entries(animations)) };
 }
 

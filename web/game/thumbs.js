@@ -1,4 +1,6 @@
 // Games with buttons for left, right and up only, on a phone: the left thumb moves, the right one jumps.
+import { addStyle } from "./page.js";
+
 const css = `
 @media (pointer: coarse) {
   .pad { --thumb: calc(1.25 * var(--key)); grid: var(--thumb) / var(--thumb) var(--thumb) 1fr var(--thumb); width: 100%; max-width: 30rem; }
@@ -16,6 +18,4 @@ const css = `
   .wide .overlay button { min-width: 0; }
   .wide .controls > :not(.pad) { align-self: end; width: 7.2rem; }
 }`;
-const thumbs = new CSSStyleSheet();
-thumbs.replaceSync(css.replaceAll(".pad", ".pad:has(.left, .right):has(.up):not(:has(.down))"));
-document.adoptedStyleSheets = [...document.adoptedStyleSheets, thumbs];
+addStyle(css.replaceAll(".pad", ".pad:has(.left, .right):has(.up):not(:has(.down))"));

@@ -2,7 +2,7 @@
 // what was chosen for them because the time was up.
 import { labelOf } from "./controls.js";
 import { hooks } from "./hooks.js";
-import { find, make, setText } from "./page.js";
+import { addStyle, find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const MINE = TEXT.yourTurn;
@@ -13,8 +13,7 @@ let turnEndsAt = null;
 let wasMine = false;
 
 document.querySelector(".hud").append(turn, choice);
-const turnSheet = new CSSStyleSheet(); // only these games' pages need it
-turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
+addStyle(`.hud { flex-wrap: wrap; }
 .hud :is(#turn, #choice) { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
 .hud #choice { font-size: .875rem; line-height: 1.2; color: var(--ink); }
 #choice:empty { display: none; }
@@ -22,7 +21,6 @@ turnSheet.replaceSync(`.hud { flex-wrap: wrap; }
 .others:first-child { min-width: 100%; }
 .hold[aria-pressed=true] { color: #fff; background: var(--accent); }
 @media (min-aspect-ratio: 5/4) { .hud :is(#turn, #choice) { flex: none; text-align: inherit; } }`);
-document.adoptedStyleSheets = [...document.adoptedStyleSheets, turnSheet];
 // A press that starts or resumes the game is no action.
 hooks.starts = () => true;
 
