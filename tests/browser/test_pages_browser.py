@@ -309,7 +309,7 @@ def test_the_page_goes_from_waiting_to_the_game_without_a_reload(world: World, t
     tab.wait_for_selector("#overlay-button:visible")
     assert tab.evaluate("window.same") is True
     assert tab.title().startswith("Ready")
-    assert world.received[0] == {"userId": "P1", "token": "TOKEN", "step": "3"}
+    assert world.received[0] == {"userId": "P1", "token": "TOKEN", "step": "3", "decodes": ["deflate", "jpeg"]}
 
 
 def test_the_start_button_appears_with_the_first_picture(world: World, tab: Any) -> None:

@@ -38,7 +38,6 @@ def play(world: World, phone: Any, size: tuple[int, int], trial: dict[str, Any],
     width, height = size
     phone.set_viewport_size({"width": width, "height": height})
     scene = {**SCENE, **trial.get("scene", {})}
-    world.subprotocol = "hippodrome.3"
     world.trial = {**trial, "scene": scene, "ui": dict.fromkeys(ui, True)}
     world.controls = {
         "UI": ui, "scene": scene, "assets": [], "maxEpisodes": 3, "actionSpace": ["noop", "up", "left", "right", "down", "wait"],

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from local.rehearsal.study_process import ROOT
-from tests.browser.world import FLAWS, PATIENCE, RED, World, deflated_zeros, pack, shot
+from tests.browser.world import FLAWS, OLD_BROWSERS, PATIENCE, RED, World, deflated_zeros, pack, shot
 from tests.browser.world import play as open_game
 from tests.trial.conftest import Running
 
@@ -121,6 +121,15 @@ def test_every_type_of_object_is_drawn_where_it_belongs(game: Any, tab: Any, wid
     assert easel[0] == easel[1] * tab.evaluate("devicePixelRatio")
 
 
+@pytest.mark.parametrize("lacks", OLD_BROWSERS.values(), ids=OLD_BROWSERS.keys())
+def test_a_browser_that_cannot_inflate_draws_objects(game: Any, tab: Any, lacks: str) -> None:
+    tab.add_init_script(lacks)
+    game()
+    tab.click("#overlay-button")
+    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_function(f"""() => ({SHOWN})([0.17, 0.6]) === "#b5533c" && ({SHOWN})([0.45, 0.83]) === "#c82040" """)
+
+
 def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -> None:
     game()
     tab.click("#overlay-button")
@@ -158,7 +167,7 @@ def test_between_the_tiles_of_a_grid_there_are_no_lines(
     world: World, tab: Any, kind: dict[str, Any], width: int
 ) -> None:
     scene = {"width": 585, "height": 315, "background": "#ffffff", "coordinates": "pixels"}
-    world.subprotocol, world.trial = "hippodrome.3", {"scene": scene}
+    world.trial = {"scene": scene}
     world.controls |= {"scene": scene, "assets": []}
     tab.set_viewport_size({"width": width, "height": 740})
     open_game(world, tab)
@@ -179,7 +188,7 @@ COUNT_DRAWINGS = """(() => {
 
 
 def test_a_scene_is_only_drawn_if_an_object_has_changed(world: World, tab: Any) -> None:
-    world.subprotocol, world.trial = "hippodrome.3", {"scene": SCENE}
+    world.trial = {"scene": SCENE}
     world.controls |= {"scene": SCENE | {"coordinates": "relative"}, "assets": []}
     tab.add_init_script(COUNT_DRAWINGS)
     open_game(world, tab)
@@ -293,7 +302,6 @@ def test_the_page_reads_the_size_of_an_image_without_decoding_it(tab: Any, form:
 
 def test_a_hostile_server_cannot_fill_the_memory_with_images_or_scenes(world: World, tab: Any) -> None:
     """It announces an image of a terabyte, sends one of 60,000 x 60,000 pixels, and a scene that unpacks to 256 MB."""
-    world.subprotocol = "hippodrome.3"
     world.trial = {"scene": SCENE}
     lost: list[int] = []
     about = json.dumps({"type": "image/png"}).encode()

@@ -466,7 +466,7 @@ def test_words_over_a_low_picture_are_seen_whole(group: World, tab: Any, width: 
     hold_timers(tab, MESSAGE)
     tab.set_viewport_size({"width": width, "height": height})
     low = {"width": 600, "height": 60}
-    group.trial, group.subprotocol = {"scene": low}, "hippodrome.3"
+    group.trial = {"scene": low}
     group.controls |= {"scene": low, "assets": []}
     start_game(group, tab)
     drawn = json.dumps({"new": True, "set": {}, "hud": "nothing yet"})
@@ -498,7 +498,6 @@ def test_players_have_the_names_that_the_researcher_gives_them(group: World, tab
 
 def open_with_image(group: World, tab: Any, size: int, stands: dict[str, Any]) -> None:
     """Open a game that is drawn by objects, whose one image of `size` bytes has not arrived."""
-    group.subprotocol = "hippodrome.3"
     group.trial = {"scene": WIDE}
     image = {"name": "cat", "bytes": size, "hash": "0" * 32}
     group.controls |= {"scene": WIDE, "assets": [image], **stands}
@@ -617,7 +616,6 @@ def test_words_over_and_above_a_low_picture_fit_a_phone(group: World, chromium: 
     page = context.new_page()
     ui = ["up", "down", "left", "right", "start"]
     group.trial = {"scene": WIDE, "ui": dict.fromkeys(ui, True)}
-    group.subprotocol = "hippodrome.3"
     group.controls |= {"UI": ui, "actionSpace": ["noop", *ui[:4]], "scene": WIDE, "assets": []}
     start_game(group, page)
     drawn = json.dumps({"new": True, "set": {}, "hud": "0 of 8 acorns, 36 turns left"})

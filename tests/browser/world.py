@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl
 import msgspec
 import pytest
 from websockets.sync.server import serve
+from websockets.typing import Subprotocol
 
 from hippodrome.model.project import Project, Step
 from hippodrome.participants import frame, pages
@@ -36,6 +37,16 @@ PROJECT = Project(
     researcher="Ada",
 )
 RED, BLUE = bytes((255, 0, 0)), bytes((0, 0, 255))
+OLD_BROWSERS = {
+    "Firefox before 113": "delete window.DecompressionStream",
+    "Safari before 15": "delete window.DecompressionStream; delete window.createImageBitmap",
+    "Chrome before 103": """const Newer = window.DecompressionStream;
+        window.DecompressionStream = function (format) {
+            if (format === "deflate-raw") throw new TypeError("unsupported format");
+            return new Newer(format);
+        }""",
+}
+"""What makes Chromium lack what these browsers lack, as scripts."""
 LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as web/game/overlay.js has it
 
 
@@ -76,8 +87,6 @@ class World:
     """The pages that the game page shows, by the key that names each."""
     controls: dict[str, Any] = field(default_factory=dict)
     """Fields of the trial server's first message that differ from the usual."""
-    subprotocol: str = "hippodrome.1"
-    """The subprotocol of the trial server."""
     trial_state: dict[str, Any] = field(default_factory=lambda: PLAYING)
     """What the trial server answers to `requestUI`."""
     started: dict[str, Any] = field(default_factory=lambda: PLAYING)
@@ -119,7 +128,7 @@ class World:
 
     def play(self, connection: Any) -> None:
         self.connections.append(connection)
-        assert connection.subprotocol == self.subprotocol
+        assert connection.subprotocol == "hippodrome"
         controls = {
             "UI": ["left", "right", "up", "down", "start", "pause", "reset"],
             "actionSpace": ["noop", "fire", "left", "right", "upleft"],
@@ -192,7 +201,7 @@ def world() -> Iterator[World]:
         lambda connection: here.play(connection),  # noqa: PLW0108 - a test may put another `play` there
         "127.0.0.1",
         0,
-        select_subprotocol=lambda _, offered: here.subprotocol if here.subprotocol in offered else None,
+        subprotocols=[Subprotocol("hippodrome")],
     )
     here.url = f"http://127.0.0.1:{web.server_port}/"
     here.game_url = f"ws://127.0.0.1:{game.socket.getsockname()[1]}/"

@@ -103,7 +103,7 @@ def test_connections_stay_while_the_certificate_changes(place, trial):
     async def stay():
         context = ssl.create_default_context(cadata=root)
         address = f"wss://k3f9-1.{DOMAIN}:{port}/"
-        async with connect(address, host="127.0.0.1", ssl=context, subprotocols=["hippodrome.1"], proxy=None) as held:
+        async with connect(address, host="127.0.0.1", ssl=context, subprotocols=["hippodrome"], proxy=None) as held:
             place.ahead = timedelta(days=61)
             serial = (await asyncio.to_thread(place.obtain)).stored.serial
             await asyncio.to_thread(wait_until_shown, port, root, serial)

@@ -22,7 +22,7 @@ from tests.trial.client_messages import TakesMessages
 from trial.pictures.frames import Decoder, Frame
 from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, PACKED_SCENE, SCENE, SceneDecoder
 from trial.recordings import recording
-from trial.wire.connection import SUBPROTOCOLS
+from trial.wire.connection import SUBPROTOCOL
 
 ROOT = Path(__file__).parents[2]
 
@@ -77,6 +77,9 @@ class Agent:
     def close(self):
         self.env.close()
 '''
+
+
+DECODES = ["deflate", "jpeg", "objects"]
 
 
 def grid_agent(length: int | None = None) -> str:
@@ -171,7 +174,10 @@ class Client(TakesMessages):
         await self.websocket.send(json.dumps(message))
 
     async def hello(self, **change: Any) -> None:
-        hello = {"userId": "P1", "token": "the-secret-token", "step": "3", **change}
+        hello: dict[str, Any] = {"userId": "P1", "token": "the-secret-token", "step": "3"}
+        if self.websocket.subprotocol is not None:
+            hello["decodes"] = DECODES
+        hello |= change
         await self.say(**{key: value for key, value in hello.items() if value is not None})
 
     async def take(self) -> None:
@@ -244,7 +250,7 @@ class Client(TakesMessages):
 
 
 @contextlib.asynccontextmanager
-async def client_of(address: str, *, subprotocols: tuple[str, ...] | None = SUBPROTOCOLS, **options: Any) -> Any:
+async def client_of(address: str, *, subprotocols: tuple[str, ...] | None = (SUBPROTOCOL,), **options: Any) -> Any:
     async with connect(
         address,
         subprotocols=subprotocols and [Subprotocol(name) for name in subprotocols],

@@ -110,7 +110,7 @@ def test_whatever_a_client_says_only_a_member_with_their_own_token_gets_in(user_
     settings = assignment.with_members(TrialSettings.from_env(ENV), document())
 
     class Socket:
-        subprotocol = "hippodrome.3"
+        subprotocol = "hippodrome"
 
     def admitted(shown):
         hello = Hello(user_id=user_id, token=shown, step=None, project_id=None)

@@ -217,7 +217,7 @@ async def test_the_idle_time_begins_when_the_session_is_formed_not_at_the_handov
 
 async def make_the_server_look(server):
     """Make the server look for its session, as a member's page with their token does."""
-    async with connect(server.address, subprotocols=["hippodrome.3"], proxy=None) as websocket:
+    async with connect(server.address, subprotocols=["hippodrome"], proxy=None) as websocket:
         await websocket.send(json.dumps(hello_of("anna")))
         with contextlib.suppress(Exception):
             await websocket.recv()

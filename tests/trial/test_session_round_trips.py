@@ -104,7 +104,7 @@ async def test_only_a_session_sends_pings_of_its_own(launch):
 
     async def pings(server, hello, most=math.inf, seconds=2):
         async with connect(
-            server.address, create_connection=CountsPings, subprotocols=["hippodrome.3"], proxy=None
+            server.address, create_connection=CountsPings, subprotocols=["hippodrome"], proxy=None
         ) as websocket:
             await websocket.send(json.dumps(hello))
             with contextlib.suppress(TimeoutError):

@@ -319,7 +319,7 @@ async def test_a_wrong_token_is_refused_whatever_the_origin(launch, token):
 
 async def test_our_own_page_always_needs_its_token(launch):
     server = launch(trial=TRIAL, PLAIN_ORIGINS=HERE)
-    _, code, _ = await closed_with(server, {"userId": "P1"}, origin=HERE, subprotocols=["hippodrome.2"])
+    _, code, _ = await closed_with(server, {"userId": "P1"}, origin=HERE, subprotocols=["hippodrome"])
     assert code == 4401
 
 

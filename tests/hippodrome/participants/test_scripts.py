@@ -142,7 +142,7 @@ def shortened_tokens(source: str) -> list[str]:
     return tokens(frame._plain("a.js", source))
 
 
-SHEET = re.compile(r"(?:\.replaceSync\(|^const css = )`[^`]*`", re.MULTILINE)
+SHEET = re.compile(r"(?:addStyle\(|^const css = )`[^`]*`", re.MULTILINE)
 """A style sheet in a script. Indentation means nothing in it."""
 
 

@@ -20,7 +20,7 @@ WEB = ROOT / "web"
 SOURCES = [*sorted(WEB.rglob("*.js")), *sorted(WEB.rglob("*.html"))]
 PYTHON = sorted((ROOT / "hippodrome" / "participants").rglob("*.py"))
 ALL_MODULES = (*game_modules.MODULES, *game_modules.OWN_WORDS, *game_modules.TOGETHER)
-NO_TEXTS = re.compile(r"new Error\([^)]*\)|replaceSync\(`[^`]*`\)")
+NO_TEXTS = re.compile(r"new Error\([^)]*\)|addStyle\(`[^`]*`\)")
 WORD = re.compile(r"\b[A-Z][a-z]+\b")
 NO_WORDS = {
     "ArrowUp",

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import gc
-import os
-import sys
 import threading
 import traceback
 from pathlib import Path
 from types import TracebackType
 from typing import Any
-
-import pytest
 
 from testing.waiting import PATIENCE, until_async
 from trial.agent.worker import Worker
@@ -158,21 +153,3 @@ def test_a_function_that_returns_when_its_loop_has_ended_does_no_harm() -> None:
     worker.close()
     worker._thread.join(60)
     assert not worker._thread.is_alive()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's descriptors")
-def test_a_worker_leaves_no_descriptor_open() -> None:
-    def used() -> None:
-        worker = Worker()
-        asyncio.run(worker.call(lambda: None, limit=10.0))
-        worker.close()
-        worker._thread.join()
-
-    def opened() -> set[str]:
-        gc.collect()
-        return set(os.listdir("/proc/self/fd"))
-
-    before = opened()
-    for _ in range(5):
-        used()
-    assert len(opened()) <= len(before)

@@ -55,3 +55,22 @@ def test_messages_have_the_form_of_docs_wire():
         "frameRate": 30,
     }
     assert json.loads(messages.done(1, math.nan))["score"] == 0
+
+
+@pytest.mark.parametrize(
+    ("said", "decodes"),
+    [
+        ("{}", {"deflate"}),
+        ('{"decodes": null}', {"deflate"}),
+        ('{"decodes": ["jpeg"]}', {"jpeg"}),
+        ('{"decodes": ["deflate", "jpeg", "objects", "a later one"]}', {"deflate", "jpeg", "objects"}),
+    ],
+)
+def test_the_first_message_says_what_a_client_decodes(said, decodes):
+    assert messages.parse_hello(said).decodes == decodes
+
+
+@pytest.mark.parametrize("said", ["[]", '["objects"]', '"jpeg"', "[1]", "[[]]", "7", "true", "{}"])
+def test_a_client_that_could_be_shown_no_picture_is_refused(said):
+    with pytest.raises(messages.BadMessage, match="decodes must"):
+        messages.parse_hello(f'{{"decodes": {said}}}')

@@ -23,7 +23,7 @@ from trial.pictures import frames
 from trial.pictures.encoder import Encoder
 from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
 from trial.wire import connection as connections
-from trial.wire.connection import SUBPROTOCOLS, Connection
+from trial.wire.connection import SUBPROTOCOL, Connection
 
 EXACT = {KEY, DIFFERENCE}
 
@@ -310,8 +310,9 @@ def test_the_decoder_refuses_broken_frames_and_changes_of_frames_that_it_does_no
 class SentMessages:
     """A websocket that keeps the messages that it is given to send."""
 
-    def __init__(self, subprotocol: str) -> None:
-        self.subprotocol = subprotocol
+    subprotocol = SUBPROTOCOL
+
+    def __init__(self) -> None:
         self.sent: list[Any] = []
         self.transport = self
 
@@ -322,21 +323,20 @@ class SentMessages:
         self.sent.append(data)
 
 
-def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[int], Frame]:
+def sent_over_a_connection(decodes: list[str], *, lossless: bool) -> tuple[list[int], Frame]:
     """Return the kinds of frames that a scrolling texture is sent as, and what is shown once it has stopped."""
     sequence = scrolling(10)
 
     async def talk(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
         # So that all pictures follow each other, however slow the machine is.
         monkeypatch.setattr(connections, "REST_SECONDS", 3600.0)
-        websocket = SentMessages(subprotocol)
-        connection = Connection(websocket, lossless=lossless)  # type: ignore[arg-type]
+        websocket = SentMessages()
+        connection = Connection(websocket, decodes=decodes, lossless=lossless)  # type: ignore[arg-type]
         running = asyncio.create_task(connection.run())
         for number, frame in enumerate(sequence):
             if number == len(sequence) - 1:
                 monkeypatch.undo()
-            connection.put_picture(frame, number)
-            connection.send_now()
+            connection.show(frame, number)
             async with asyncio.timeout(PATIENCE):
                 while len(websocket.sent) <= number:
                     await asyncio.sleep(0.001)
@@ -359,14 +359,14 @@ def sent_over_a_connection(subprotocol: str, *, lossless: bool) -> tuple[list[in
 
 
 def test_a_connection_makes_a_picture_exact_that_no_other_follows() -> None:
-    kinds, _ = sent_over_a_connection(SUBPROTOCOLS[0], lossless=False)
+    kinds, _ = sent_over_a_connection(["deflate", "jpeg"], lossless=False)
     assert kinds[:10] == [JPEG] * 10
     assert set(kinds[10:]) == {ROWS}
 
 
-@pytest.mark.parametrize(("subprotocol", "lossless"), [(SUBPROTOCOLS[0], True), (SUBPROTOCOLS[2], False)])
-def test_a_lossless_connection_and_one_of_the_oldest_subprotocol_send_no_jpeg(subprotocol: str, lossless: bool) -> None:
-    kinds, _ = sent_over_a_connection(subprotocol, lossless=lossless)
+@pytest.mark.parametrize(("decodes", "lossless"), [(["deflate", "jpeg"], True), (["deflate"], False)])
+def test_no_jpeg_is_sent_if_the_study_wants_none_or_the_client_decodes_none(decodes: list[str], lossless: bool) -> None:
+    kinds, _ = sent_over_a_connection(decodes, lossless=lossless)
     assert kinds == [KEY] + [DIFFERENCE] * 9
 
 
@@ -401,18 +401,18 @@ def textured(seen: Any) -> Any:
     return picture
 
 
-async def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_client: Any) -> None:
+async def test_a_texture_on_its_way_to_clients_with_and_without_jpegs(launch: Any, open_client: Any) -> None:
     server = launch(agent=TEXTURED, trial=SPACE)
-    async with open_client(server.address) as new:
-        assert new.websocket.subprotocol == "hippodrome.3"
-        await new.play(1)
+    async with open_client(server.address) as client:
+        await client.play(1)
         # Where the game is late, as on a busy machine, rows make its picture exact, and the next one may be a difference.
-        await new.until(lambda: new.kinds[-20:] == [JPEG] * 20)
-    async with open_client(server.address, subprotocols=("hippodrome.1",)) as old:
-        await old.play(20)
-        assert set(old.kinds) == EXACT
-        await old.say(command="pause")
-        await old.until(lambda: old.state["state"] == "paused")
+        await client.until(lambda: client.kinds[-20:] == [JPEG] * 20)
+    async with open_client(server.address) as simple:
+        await simple.start(decodes=["deflate"])
+        await simple.see(20)
+        assert set(simple.kinds) == EXACT
+        await simple.say(command="pause")
+        await simple.until(lambda: simple.state["state"] == "paused")
     async with open_client(server.address) as later:
         await later.hello()
         await later.until(lambda: later.frames and np.array_equal(later.frame, textured(later.frame)))
@@ -424,7 +424,6 @@ async def test_a_texture_on_its_way_to_new_and_old_clients(launch: Any, open_cli
 async def test_lossless_keeps_every_picture(launch: Any, open_client: Any) -> None:
     server = launch(agent=TEXTURED, trial={**SPACE, "lossless": True})
     async with open_client(server.address) as client:
-        assert client.websocket.subprotocol == "hippodrome.3"
         await client.play(30)
         assert set(client.kinds) == EXACT
 

@@ -5,16 +5,15 @@ import time
 
 import pytest
 from websockets.asyncio.client import connect
-from websockets.asyncio.server import serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.frames import Opcode
 
 from testing.waiting import until_async
 from tests.trial.far_away import far_away
 from trial.wire import round_trips
-from trial.wire.player_socket import PlayerSocket
 
 
-class Pinged(PlayerSocket):
+class Pinged(ServerConnection):
     """Counts pings that wait for their pong."""
 
     most = 0
