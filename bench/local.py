@@ -83,6 +83,7 @@ def _through(address: str, number: int) -> list[float]:
     return visitor.waits
 
 
+SUBPROTOCOLS = [Subprotocol("hippodrome"), Subprotocol("hippodrome.1")]  # the second: checkouts of November 2026
 CONFIG = """
 trial:
   game: ALE/MsPacman-v5
@@ -117,7 +118,7 @@ def _to_first_picture(visitor: Visitor, user: str) -> float:
         if time.perf_counter() - begun > PATIENCE:
             raise RuntimeError(f"no server after {PATIENCE:g} s: {state}")
         time.sleep(0.05)
-    with connect(state["url"], subprotocols=[Subprotocol("hippodrome.1")], max_size=None, proxy=None) as socket:
+    with connect(state["url"], subprotocols=SUBPROTOCOLS, max_size=None, proxy=None) as socket:
         socket.send(json.dumps({"userId": user, "token": state["token"], "step": "2"}))
         while not isinstance(socket.recv(PATIENCE), bytes):
             pass
