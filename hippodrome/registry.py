@@ -95,7 +95,7 @@ def _master_list(platform: Platform) -> tuple[Document | None, MasterList]:
         return None, MasterList()
     try:
         return found, read_list(found.body)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         failure("the list of projects cannot be read", error)
         text = f"{MASTER_LIST} cannot be read; the bucket keeps older versions: put the last good one in its place"
         raise NotRegistered([text]) from None

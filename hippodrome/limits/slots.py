@@ -110,7 +110,7 @@ class Slots:
             if entry.key in shards:
                 try:
                     found[entry.key] = self._shared.read(entry.key, ParticipantSlots)
-                except (ValueError, RecursionError) as error:
+                except ValueError as error:
                     failure("participants' slots cannot be read", error, project=project_id)
                     found[entry.key] = None
         return found
@@ -163,7 +163,7 @@ class Slots:
             if project.limits_servers:
                 try:
                     found[project.id] = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
-                except (ValueError, RecursionError) as error:
+                except ValueError as error:
                     failure("a project's slots cannot be read", error, project=project.id)
         return found
 

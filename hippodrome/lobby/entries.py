@@ -206,7 +206,7 @@ def read_body(body: bytes) -> WaitingDocument | None:
     """Read the content of the entry which says that a participant waits; None if it cannot be read."""
     try:
         found = from_json(body, WaitingDocument)
-    except (ValueError, RecursionError):
+    except ValueError:
         return None
     return found if ids.is_user_id(found.user_id) else None
 

@@ -96,7 +96,7 @@ class Matcher:
     def _read(self, key: str, project: Project) -> Question:
         try:
             return self._shared.read(key, Question)
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             failure("the question to match cannot be read and is made anew", error, project=project.id)
             return Question()
 

@@ -93,7 +93,7 @@ def read(body: bytes, question: Question) -> MatchAnswer:
     """Read the answer to `question` in a document that a server has written. The document may hold anything."""
     try:
         found = from_json(body, _Groups).groups
-    except (ValueError, RecursionError):
+    except ValueError:
         return MatchAnswer(problem="the answer of match cannot be read")
     asked, matched, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
     for labels in found[:MAX_WAITING]:

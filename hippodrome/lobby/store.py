@@ -45,7 +45,7 @@ class LobbyStore:
         """Return the document of decisions. If it cannot be read, replace it by an empty one."""
         try:
             return self._shared.read(decisions.key(project.id), Decisions)
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             failure("the lobby's document cannot be read and is made anew", error, project=project.id)
             return self.change(project, lambda document: document)
 

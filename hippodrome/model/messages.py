@@ -236,7 +236,7 @@ def _read(body: Any, kind: type[R]) -> R | None:
     """Read a record of this kind; None if the body is no such record."""
     try:
         return from_data(body, kind)
-    except (ValueError, RecursionError):
+    except ValueError:
         return None
 
 

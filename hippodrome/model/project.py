@@ -272,14 +272,14 @@ class _MasterListDocument(Record, frozen=True):
 
 
 def read_list(body: bytes) -> MasterList:
-    """Read the master list in a document. Raises ValueError or RecursionError if it is no list of entries."""
+    """Read the master list in a document. Raises ValueError if it is no list of entries."""
     projects: list[Project] = []
     unread: list[UnreadableEntry] = []
     others: list[bytes] = []  # HIPPO's entries. They are read last: of two entries with one id, ours counts
     for raw in map(bytes, from_json(body, _MasterListDocument).projects):
         try:
             projects.append(_checked(from_json(raw, Project)))
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             if hippo_entry.is_from_hippo(_as_object(raw)):
                 others.append(raw)
             else:
@@ -290,7 +290,7 @@ def read_list(body: bytes) -> MasterList:
             project = _checked(from_data(hippo_entry.fields_of(_as_object(raw)), Project))
             if any(known.id == project.id for known in projects):
                 raise ValueError("another entry has its id")
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             unread.append(_unreadable(raw, error))
         else:
             projects.append(project)

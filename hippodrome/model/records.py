@@ -33,19 +33,25 @@ def from_json(body: bytes, kind: type[T]) -> T:
     """Return the record in a document.
 
     Raises ValueError if the document holds no such record: `msgspec.DecodeError`, or `UnicodeDecodeError` if it is not
-    UTF-8. Raises RecursionError if it is nested too deep.
+    UTF-8.
     """
-    return _decoder(kind).decode(body)
+    try:
+        return _decoder(kind).decode(body)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
 
 
 def from_data(data: Any, kind: type[T]) -> T:
     """Return the record in plain JSON data.
 
     Raises ValueError if the data are no such record: `msgspec.ValidationError`, or `UnicodeEncodeError` for a text with
-    half of a surrogate pair. Raises RecursionError if they are nested too deep.
+    half of a surrogate pair.
     """
     _decoder(kind)
-    return msgspec.convert(data, kind)
+    try:
+        return msgspec.convert(data, kind)
+    except RecursionError:
+        raise ValueError("they are nested too deep") from None
 
 
 def _decoder(kind: type[T]) -> msgspec.json.Decoder[T]:

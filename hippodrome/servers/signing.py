@@ -338,7 +338,7 @@ def _read(request: Request) -> SigningRequest:
         raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
     try:
         asked = from_json(request.body, SigningRequest)
-    except (ValueError, RecursionError):
+    except ValueError:
         raise Refusal(400, "The body must be JSON with server, credential and requests.") from None
     if not 0 < len(asked.requests) <= MAX_REQUESTS:
         raise Refusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")

@@ -124,7 +124,7 @@ class Sweep:
         try:
             slots = self._slots.server_slots(self._project_cache.projects(fresh=timedelta(0)))
             return slots, list(self._pools.handovers())
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             failure("the list of projects cannot be read", error)
             self._result.failed += 1
             return {}, []
@@ -260,7 +260,7 @@ class Sweep:
         """The registered projects whose sessions have several players; none if the list cannot be read."""
         try:
             return [project for project in self._project_cache.projects() if project.has_sessions]
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             failure("the list of projects cannot be read", error)
             return []
 

@@ -31,7 +31,7 @@ class SharedDocuments:
     def read(self, key: str, kind: type[R]) -> R:
         """Return the record under a key; an empty one if there is no document. AWS calls: one.
 
-        Raises ValueError or RecursionError if the document cannot be read as such a record.
+        Raises ValueError if the document cannot be read as such a record.
         """
         found = self._documents.get(key)
         return from_json(found.body, kind) if found else kind()
@@ -40,8 +40,8 @@ class SharedDocuments:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
 
         If `change` returns an equal record, nothing is written. AWS calls: two; one if nothing is written. Raises
-        `RetryLater` after `TRIES` conflicts. If the document cannot be read as such a record, this raises ValueError or
-        RecursionError and writes nothing. With `anew`, which is for data that can be rebuilt, `change` is applied to
+        `RetryLater` after `TRIES` conflicts. If the document cannot be read as such a record, this raises ValueError
+        and writes nothing. With `anew`, which is for data that can be rebuilt, `change` is applied to
         `anew` instead, and the result replaces the document.
         """
         for _ in range(TRIES):
@@ -50,7 +50,7 @@ class SharedDocuments:
             if found:
                 try:
                     before = from_json(found.body, kind)
-                except (ValueError, RecursionError) as error:
+                except ValueError as error:
                     if anew is None:
                         raise
                     before, unreadable = anew, True

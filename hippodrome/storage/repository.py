@@ -50,7 +50,7 @@ class Repository:
         found = self._documents.get(participant.participant_key(project_id, user_id))
         try:
             return from_json(found.body, Participant) if found else None
-        except (ValueError, RecursionError):
+        except ValueError:
             logger.error("a participant's record cannot be read", extra={"project": project_id})
             return None
 
@@ -67,7 +67,7 @@ class Repository:
     def membership(self, project_id: str, user_id: str) -> Membership | None:
         """Return the participant's membership; None as long as it is not decided whether they play or are unmatched.
 
-        Raises ValueError or RecursionError if the document cannot be read.
+        Raises ValueError if the document cannot be read.
         """
         found = self._documents.get(membership_key(project_id, user_id))
         return memberships.read(found.body) if found else None

@@ -212,19 +212,12 @@ class _Observations:
 
 
 def snapshot(observation: Any) -> Any:
-    """Copy an observation, so that the environment cannot change it. If it contains itself, return it uncopied."""
-    try:
-        return _copied(observation)
-    except RecursionError:
-        return observation
-
-
-def _copied(observation: Any) -> Any:
+    """Copy an observation, so that the environment cannot change it."""
     if isinstance(observation, np.ndarray):
         return observation.copy()
     if isinstance(observation, Mapping):
-        return {key: _copied(value) for key, value in observation.items()}
+        return {key: snapshot(value) for key, value in observation.items()}
     if isinstance(observation, list | tuple):
-        copies = [_copied(value) for value in observation]
+        copies = [snapshot(value) for value in observation]
         return tuple(copies) if isinstance(observation, tuple) else copies
     return observation

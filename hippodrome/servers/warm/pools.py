@@ -100,7 +100,7 @@ class Pools:
         for project_id in sorted(configured | with_pool):
             try:
                 pool = self._shared.read(warm_pool.pool_key(project_id), Pool)
-            except (ValueError, RecursionError) as error:
+            except ValueError as error:
                 failure("a pool cannot be read", error, project=project_id)
                 unread.append(error)
                 self.request_adjustment(project_id)  # the adjustment replaces the document
