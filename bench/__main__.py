@@ -89,19 +89,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("measures", nargs="*", metavar="MEASURE", help=f"default: all of {', '.join(MEASURES)}")
     parser.add_argument("--against", type=Path, metavar="DIRECTORY", help="the other checkout")
-    given = parser.parse_args(arguments)
-    names: Iterable[str] = dict.fromkeys(given.measures or (COMPARED if given.against else MEASURES))
+    options = parser.parse_args(arguments)
+    names: Iterable[str] = dict.fromkeys(options.measures or (COMPARED if options.against else MEASURES))
     if unknown := [name for name in names if name not in MEASURES]:
         parser.error(f"unknown measure {unknown[0]!r}; expected one of {', '.join(MEASURES)}")
     progress, rows, begun = Console(stderr=True), list[Row](), time.monotonic()
     for name in names:
         with progress.status(f"measuring {name} …"):
-            new = compare(name, given.against) if given.against else measure(name)
+            new = compare(name, options.against) if options.against else measure(name)
         rows.extend(new)
         for row in new:
             text = f"{time.monotonic() - begun:5.0f} s  {table.line(row)}"
             progress.print(text, highlight=False, markup=False, soft_wrap=True)
-    if not given.against:
+    if not options.against:
         table.store(rows)
     output = Console()
     table.show(rows, output if output.is_terminal else Console(width=WIDTH))

@@ -272,7 +272,7 @@ def cold_start() -> Iterator[Row]:
         for key, body in documents.items():
             s3.put_object(Bucket="hippodrome", Key=key, Body=body)
         times: dict[str, list[float]] = {"ours": [], "bare": []}
-        made: dict[str, int] = {}
+        calls: dict[str, int] = {}
         for number in range(RUNS + 1):  # by turns, so that load on the machine slows down both
             event = aws_events.http_event(
                 "GET", f"projectId=ms-pacman&userId=P{number}", headers={"accept": "text/html"}
@@ -280,9 +280,9 @@ def cold_start() -> Iterator[Row]:
             for kind, code in (("ours", (OURS, json.dumps(event))), ("bare", (BARE, page, f"Y{number}", *others))):
                 before = len(requests())
                 times[kind].append(1000 * seconds(*code))
-                made[kind] = len(requests()) - before
-    if made["ours"] != made["bare"]:
-        raise RuntimeError(f"the two do not make as many calls: {made}")
+                calls[kind] = len(requests()) - before
+    if calls["ours"] != calls["bare"]:
+        raise RuntimeError(f"the two do not make as many calls: {calls}")
     ours, bare = (times[kind][1:] for kind in ("ours", "bare"))  # the first run writes bytecode
     yield row(
         "cold start of next_step: CPU from the first import to the first page",
@@ -293,7 +293,7 @@ def cold_start() -> Iterator[Row]:
         decides="the first participant after a pause waits for it; each new import of the function costs here",
         detail={
             "the yardstick": "botocore alone with the same calls",
-            "S3 requests of each": made["ours"],
-            "each": ours,
+            "S3 requests": calls["ours"],
+            "runs": ours,
         },
     )

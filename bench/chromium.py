@@ -31,16 +31,16 @@ PLAYABLE = "whether a participant can play: late or missing pictures feel like a
 # Notes each picture that is put on the canvas, and the ms from a key event until the corner shows it. `LEFT_EDGE` is
 # where the participant's block begins.
 WATCH = """(() => {
-  const seen = (window.seen = { draws: [], waits: [], wanted: null, since: 0 });
+  const seen = (window.seen = { draws: [], waits: [], expected: null, since: 0 });
   const watch = (name, corner) => {
     const plain = CanvasRenderingContext2D.prototype[name];
     CanvasRenderingContext2D.prototype[name] = function (...parts) {
       plain.apply(this, parts);
       const now = performance.now();
       seen.draws.push(now);
-      if (seen.wanted === null || corner(this, parts[0]) > 128 !== seen.wanted) return;
+      if (seen.expected === null || corner(this, parts[0]) > 128 !== seen.expected) return;
       seen.waits.push(now - seen.since);
-      seen.wanted = null;
+      seen.expected = null;
     };
   };
   const at = LEFT_EDGE + 8;
@@ -48,7 +48,7 @@ WATCH = """(() => {
   watch("drawImage", (context) => context.getImageData(at, 8, 1, 1).data[0]);
   const press = (down) => (event) => {
     if (event.repeat || event.code !== "ArrowLeft") return;
-    Object.assign(seen, { wanted: down, since: event.timeStamp });
+    Object.assign(seen, { expected: down, since: event.timeStamp });
   };
   addEventListener("keydown", press(true), true);
   addEventListener("keyup", press(false), true);
@@ -342,7 +342,7 @@ def two_players() -> Iterator[Row]:
         watched = [player.watch() for player in players]
     yield row(
         f"two players at {RATE}/s: frames drawn, the one who sees less",
-        min(one.share for one in watched),
+        min(view.share for view in watched),
         "of those due",
         at_least=0.99,
         better="more",
@@ -350,7 +350,7 @@ def two_players() -> Iterator[Row]:
     )
     yield row(
         f"two players at {RATE}/s: key to drawn effect, p50, the one who waits longer",
-        max(statistics.median(one.waits) for one in watched),
+        max(statistics.median(view.waits) for view in watched),
         "ms",
         at_most=round(TICK, 1),
         decides=PLAYABLE,

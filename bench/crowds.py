@@ -77,7 +77,7 @@ def small_account() -> Iterator[Row]:
     """Send participants to a new account, with the concurrency that the deploy command chooses there."""
     wires = {**WIRES, "start_server": WIRES["start_server"]._replace(concurrency=starts(EXECUTIONS))}
     _, people = crowd(FEW, WITHIN, wires=wires, concurrency=EXECUTIONS)
-    pages, late = (sum(getattr(one.visit, what) for one in people) for what in ("pages", "unanswered"))
+    pages, late = (sum(getattr(person.visit, what) for person in people) for what in ("pages", "unanswered"))
     yield row(
         f"simulated: {FEW} within a minute in an account of {EXECUTIONS} executions: pages that come at the first try",
         100 * (1 - late / pages),
@@ -141,13 +141,13 @@ def crowd(
     people: int, within: float, conditions: Conditions | None = None, kind: Any = SimulatedParticipant, **world: Any
 ) -> tuple[SimulatedWorld, list[Any]]:
     """Let so many participants come within so many seconds, until nothing is left, or for `HOURS` at most."""
-    made = SimulatedWorld(SEED, conditions, **world)
-    came = [kind(made, number) for number in range(people)]
+    simulated = SimulatedWorld(SEED, conditions, **world)
+    came = [kind(simulated, number) for number in range(people)]
     for person in came:
-        made.clock.spawn(person.walk, delay=made.clock.random.uniform(0, within))
+        simulated.clock.spawn(person.walk, delay=simulated.clock.random.uniform(0, within))
     with quiet():
-        made.settle(HOURS * 3600)
-    return made, came
+        simulated.settle(HOURS * 3600)
+    return simulated, came
 
 
 def through(name: str, world: SimulatedWorld, people: Sequence[Any], wrong: Sequence[str] = ()) -> Row:
@@ -171,7 +171,7 @@ def bill(world: SimulatedWorld) -> dict[str, float]:
     """Return the likely US dollars of a run by kind of cost, from counts and list prices; all servers on Spot."""
     prices, calls, now = Prices(), world.cloud.calls, world.clock.seconds
     tasks = world.platform.tasks.tasks.values()
-    hours = sum(max(FARGATE_MINIMUM, (now if one.closed is None else one.closed) - one.born) for one in tasks) / 3600
+    hours = sum(max(FARGATE_MINIMUM, (task.closed or now) - task.born) for task in tasks) / 3600
     writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deletions are free
     messages = SQS_REQUESTS * sum(queue.sent for queue in world.queues)
     named, properties = template.functions(), template.resources("AWS::Lambda::Function")

@@ -59,7 +59,7 @@ def crowd() -> Iterator[Row]:
         )
         with running(study) as address, ThreadPoolExecutor(PEOPLE) as people:
             begun = time.perf_counter()
-            waits = [wait for one in people.map(lambda n: _through(address, n), range(PEOPLE)) for wait in one]
+            waits = [wait for walk in people.map(lambda n: _through(address, n), range(PEOPLE)) for wait in walk]
             seconds = time.perf_counter() - begun
         answers = len(list(study.glob("data/crowd/users/*/answers/*.json")))
     if answers != PEOPLE * len(ANSWERS):
@@ -106,7 +106,7 @@ def first_picture() -> Iterator[Row]:
         statistics.median(took),
         "s",
         decides="the part of a participant's wait that is the server's own start; how soon a researcher sees a change",
-        detail={"each": took},
+        detail={"runs": took},
     )
 
 

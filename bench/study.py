@@ -98,8 +98,8 @@ class Visitor:
     def open(self) -> str:
         """Open the link; return the step of the page, `final` for the last one."""
         self.page = self._ask("GET").decode()
-        found = re.search(r'name="hippodrome-step" value="([^"]*)"', self.page)
-        return found[1] if found else "final"
+        step = re.search(r'name="hippodrome-step" value="([^"]*)"', self.page)
+        return step[1] if step else "final"
 
     def answer(self, fields: Mapping[str, object]) -> None:
         """Submit the form of the page with these answers."""
