@@ -20,8 +20,6 @@ the Service Authorization Reference (read November 2026):
 - S3: PutObject lacks the keys s3:if-match and s3:if-none-match.
 - PassRole is never judged. AWS judges it for RunTask (the task definition's roles and those of the overrides) and for
   schedules, with iam:PassedToService; and for CloudFormation, Lambda and others that no function of ours calls.
-- Roles that trust a service under conditions (aws:SourceAccount, aws:SourceArn) cannot be assumed. Here root may assume
-  them, in the place of the service.
 
 Gaps elsewhere:
 
@@ -193,12 +191,6 @@ def bridge_authorization() -> None:
             denied = denied or answer
         return denied
 
-    their_trust = iam_evaluator.evaluate_trust_policy
-
-    def evaluate_trust_policy(document: Any, caller: str, *more: Any, **context: Any) -> bool:
-        return caller.endswith(":root") or their_trust(document, caller, *more, **context)
-
-    iam_evaluator.evaluate_trust_policy = evaluate_trust_policy
     iam_actions.extract_resource_arn = extract_resource_arn
     iam_evaluator.enforce = enforce
 
