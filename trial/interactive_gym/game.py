@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import uuid
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from trial.core.players import ALL
@@ -47,37 +47,25 @@ class RemoteGame:
         self.total_negative_rewards: dict[Any, float] = collections.defaultdict(float)
         self.prev_rewards: dict[Any, float] = {}
         self.prev_actions: dict[Any, Any] = {}
-        self.current_infos: Any = {}
-        self.terminateds: Any = False
-        self.truncateds: Any = False
+        self._ends: Sequence[Any] = (False, False)  # `terminated` and `truncated` of the last step
         self.current_ping: dict[Any, int] = collections.defaultdict(int)
         self.document_focus_status: dict[Any, bool] = collections.defaultdict(lambda: True)
         self.record: Callable[[str, Any], None] = _unrecorded
         """In a callback: `record(name, value)` writes a value into the recording (docs/callbacks.md)."""
 
-    @property
-    def observation(self) -> Any:
-        """The observations that the environment returned last."""
-        return self.obs
-
-    @property
-    def rewards(self) -> dict[Any, float]:
-        """The rewards of the last step."""
-        return self.prev_rewards
-
-    def began(self, observation: Any, infos: Any) -> None:
+    def began(self, observation: Any) -> None:
         """Set the attributes after the environment has been reset."""
         self.status = GameStatus.Active
-        self.obs, self.current_infos = observation, infos
+        self.obs = observation
         self.prev_rewards, self.prev_actions = {}, {}
-        self.terminateds = self.truncateds = False
+        self._ends = (False, False)
         self.tick_num = 0
         self.episode_num += 1
         self.episode_rewards = collections.defaultdict(float)
 
     def stepped(self, actions: Mapping[Any, Any], result: tuple[Any, Any, Any, Any, Any]) -> None:
         """Set the attributes after a step has been taken."""
-        self.obs, rewards, self.terminateds, self.truncateds, self.current_infos = result
+        self.obs, rewards, *self._ends, _ = result
         self.prev_actions = dict(actions)
         self.prev_rewards = rewards if isinstance(rewards, dict) else {"reward": rewards}
         for key, reward in (rewards if isinstance(rewards, dict) else {0: rewards}).items():
@@ -93,7 +81,7 @@ class RemoteGame:
     @property
     def over(self) -> bool:
         """Whether the episode has ended for all players."""
-        ends = (self.terminateds, self.truncateds)
+        ends = self._ends
         if not all(isinstance(end, Mapping) for end in ends):
             return any(map(bool, ends))
         players = {player for end in ends for player in end} - {ALL}
@@ -111,31 +99,7 @@ class GameCallback:
         """Take any options, as Interactive Gym does."""
 
 
-class MultiCallback(GameCallback):
-    """Calls several callbacks in turn; `callbacks` are their classes.
-
-    Each method returns a map of the values that the callbacks return, by the names of their classes, without None.
-    """
-
-    def __init__(self, callbacks: Iterable[type[GameCallback]], **_options: Any) -> None:
-        super().__init__()
-        self.callbacks = [callback() for callback in callbacks]
-
-
-def _call_all(event: str) -> Any:
-    """Return the method of `MultiCallback` for an event."""
-
-    def call(self: MultiCallback, remote_game: RemoteGame) -> dict[str, Any] | None:
-        values = {type(callback).__name__: getattr(callback, event)(remote_game) for callback in self.callbacks}
-        return {name: value for name, value in values.items() if value is not None} or None
-
-    return call
-
-
-for _event in (
-    *("on_episode_start", "on_episode_end", "on_game_tick_start", "on_game_tick_end", "on_game_end"),
-    *("on_graphics_start", "on_graphics_end"),
-    *("on_waitroom_start", "on_waitroom_join", "on_waitroom_end", "on_waitroom_timeout"),
-):
-    setattr(GameCallback, _event, lambda _self, _remote_game: None)
-    setattr(MultiCallback, _event, _call_all(_event))
+_EVENTS = "episode_start episode_end game_tick_start game_tick_end graphics_start graphics_end game_end "
+_WAITING = "waitroom_start waitroom_join waitroom_end waitroom_timeout"
+for _event in (_EVENTS + _WAITING).split():
+    setattr(GameCallback, f"on_{_event}", lambda _self, _remote_game: None)

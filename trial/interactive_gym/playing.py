@@ -70,7 +70,7 @@ class ExperimentAgent:
             game.human_players[key] = os.environ.get(variables.USER_ID, "") if alone else str(key)
         result = self._raw.reset(seed=seed)
         observation, infos = map(self._own, result if isinstance(result, tuple) and len(result) == 2 else (result, {}))
-        game.began(observation, infos)
+        game.began(observation)
         self._first_picture = True
         return observation, infos
 

@@ -123,7 +123,7 @@ class ExperimentConfig:
 
 
 def game_of(config: Any) -> RemoteConfig:
-    """Return the game of an experiment. Raises Unplayable if it has not one game, or a page that cannot be shown."""
+    """Return the game of an experiment. Raises Unplayable if it has not one game."""
     if isinstance(config, RemoteConfig):
         return config
     scenes = config.stager.scenes if isinstance(config, ExperimentConfig) else []
@@ -133,9 +133,6 @@ def game_of(config: Any) -> RemoteConfig:
             f"the experiment has {len(games)} games (GymScene), and a study has one here: make an experiment of each, "
             "with its own file and link"
         )
-    for scene in scenes:
-        if scene is not games[0] and not isinstance(scene, StaticScene):
-            raise Unplayable(f"a {type(scene).__name__} is not a page; write a page of steps/ instead (docs/pages.md)")
     (game,) = games
     game.environment(**config.host_options, env_name=game.env_name or config.experiment_id)
     game.scenes = scenes

@@ -201,7 +201,7 @@ def test_the_game_counts_rewards_ticks_and_episodes_as_interactive_gym() -> None
     game = RemoteGame(config, Env(), {"a": "human", "b": "model"}, "P1")
     assert (game.human_players, game.bot_players, game.status) == ({"a": "P1"}, {"b": "model"}, "inactive")
     for episode in (1, 2):
-        game.began({}, {})
+        game.began({})
         assert (game.episode_num, game.tick_num, game.status) == (episode, 0, "active")
         game.stepped({"a": 0, "b": 1}, Env().step({}))
         game.stepped({"a": 0, "b": 1}, ({}, {"a": 3}, {"__all__": True}, {"__all__": False}, {}))
@@ -227,14 +227,14 @@ def test_a_game_is_over_when_each_player_is_terminated_or_truncated(
     terminated: dict[str, bool], truncated: dict[str, bool], over: bool
 ) -> None:
     game = RemoteGame(RemoteConfig(), None, {"a": "human", "b": "model"})
-    game.began({}, {})
+    game.began({})
     game.stepped({"a": 0, "b": 0}, ({}, {"a": 0.0, "b": 0.0}, terminated, truncated, {}))
     assert game.over is over
 
 
 def test_a_single_players_reward_is_a_number() -> None:
     game = RemoteGame(RemoteConfig(), None, {"human": "human"})
-    game.began(0, {})
+    game.began(0)
     game.stepped({"human": 1}, (0, 2.5, True, False, {}))
     assert (game.prev_rewards, game.episode_rewards[0], game.over) == ({"reward": 2.5}, 2.5, True)
 

@@ -82,6 +82,7 @@ def test_an_experiment_becomes_a_project(tmp_path: Path) -> None:
             "keys": {"ArrowLeft": "left", "ArrowRight": "right", "a+b": "right"},
             "scene": {"width": 600, "height": 400, "background": "#FFFFFF", "coordinates": "relative"},
             "instructions": "instructions",
+            "callbackSeconds": 10,
         },
     }
     config = read_project(project)

@@ -1,13 +1,12 @@
-"""RemoteConfig has every option of Interactive Gym, and the documentation says what becomes of each."""
+"""RemoteConfig has the options of Interactive Gym, and the documentation says what becomes of each."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from trial.interactive_gym import game, objects, options
+from trial.interactive_gym import objects, options
 from trial.interactive_gym.options import RemoteConfig
 from trial.pictures.scene import as_scene
 
@@ -136,36 +135,3 @@ def test_interactive_gyms_objects_become_a_scene_without_problems() -> None:
     assert scene.problems == ()
     assert set(scene.objects) == {"a", "b", "c", "d", "e"}
     assert scene.permanent == {"b"}
-
-
-def test_several_callbacks_are_told_in_turn() -> None:
-    told = []
-
-    class First(game.GameCallback):
-        def on_game_tick_end(self, remote_game: object) -> None:
-            told.append(("first", remote_game))
-
-    class Second(game.GameCallback):
-        def on_game_tick_end(self, remote_game: object) -> None:
-            told.append(("second", remote_game))
-
-    both = game.MultiCallback([First, Second])
-    both.on_game_tick_end("the game")
-    both.on_episode_start("the game")
-    assert told == [("first", "the game"), ("second", "the game")]
-
-
-class Score(game.GameCallback):
-    def on_episode_end(self, remote_game: object) -> Any:
-        return {"score": 3}
-
-
-class Pace(game.GameCallback):
-    def on_episode_end(self, remote_game: object) -> Any:
-        return [1, 2]
-
-
-def test_what_several_callbacks_return_is_kept_by_their_names() -> None:
-    several = game.MultiCallback([Score, game.GameCallback, Pace])
-    assert several.on_episode_end("the game") == {"Score": {"score": 3}, "Pace": [1, 2]}
-    assert several.on_game_tick_end("the game") is None
