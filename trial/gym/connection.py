@@ -47,7 +47,7 @@ class BlockingWebSocket:
 
     def __init__(self, connection: socket.socket, state: State = State.CONNECTING) -> None:
         logger = logging.getLogger("trial.gym.websockets")
-        logger.setLevel(logging.CRITICAL + 1)
+        logger.setLevel(logging.CRITICAL + 1)  # clients could write to the terminal by what they send
         self._socket = connection
         self._protocol = ServerProtocol(
             subprotocols=[SUBPROTOCOL],
@@ -78,10 +78,11 @@ class BlockingWebSocket:
         try:
             path, origin = urlsplit(request.path).path, request.headers.get("Origin")
             known_origin = origin is None or origin in settings.origins or urlsplit(origin).hostname in _LOOPBACK
+            upgrades = "websocket" in request.headers.get("Upgrade", "").lower()
             form = form_of(request.path)
         except (ValueError, LookupError):  # a malformed address or origin, or a header that is there twice
             return refuse(http.HTTPStatus.BAD_REQUEST, "This is no handshake of a WebSocket.\n")
-        if "websocket" not in request.headers.get("Upgrade", "").lower():
+        if not upgrades:
             return refuse(http.HTTPStatus.OK, f"Environments are served at {PATH}, by WebSocket.\n")
         if path.rstrip("/") != PATH:
             return refuse(http.HTTPStatus.NOT_FOUND, f"There is nothing here. Environments are served at {PATH}.\n")
@@ -233,13 +234,6 @@ def import_modules(modules: Sequence[str]) -> None:
     sys.path.insert(0, os.getcwd())
     for module in modules:
         importlib.import_module(module)
-
-
-def _silent() -> logging.Logger:
-    """Return a logger that logs nothing: clients could write to the terminal by what they send."""
-    logger = logging.getLogger("trial.gym.websockets")
-    logger.setLevel(logging.CRITICAL + 1)
-    return logger
 
 
 def _keep_alive(connection: socket.socket) -> None:

@@ -68,10 +68,10 @@ def serve(
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.create_server((host, port), family=family, backlog=512) as listener:
         server = _Server(listener, settings)
-        if not server.can_import_modules():
-            return 1
         before = signal.signal(signal.SIGTERM, _interrupt)
         try:
+            if not server.can_import_modules():
+                return 1
             address = f"{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}"
             print(f"Environments are served at ws://{address}{PATH}. Ctrl-C ends it.", flush=True)
             server.run()
@@ -202,7 +202,10 @@ class _Server:
             if status is None:
                 continue
             child = self._children.pop(pid)
-            _kill(pid)  # its group; on Linux its other descendants become children of this process
+            with contextlib.suppress(
+                OSError
+            ):  # its group; on Linux its other descendants become this process's children
+                os.killpg(pid, signal.SIGKILL)
             close = child.close
             if close is None and status != 0:
                 close = (_FAILED, self._how(status))

@@ -25,31 +25,37 @@ from trial.gym.spaces import CodecError, Space
 MAX_DEPTH = 100
 """The most levels of lists and objects in a value that is sent."""
 
-_MAX_LISTS = 3  # levels of lists around pictures: a vector returns a list, and each of its elements may be a list
+_MAX_LISTS = 3  # levels of lists around pictures: render modes such as rgb_array_list return lists
 _SPECIAL = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
 _WRITTEN = {"Infinity": "1e999", "-Infinity": "-1e999", "NaN": "null"}
 
 
 def to_text(value: Any) -> str:
     """Write `value` as JSON, numpy's types too. An object for which JSON has no form becomes the name of its class."""
-    try:
-        return _strict(value)
-    except (TypeError, ValueError, RecursionError):  # infinity, a key that is no text, an object within itself
-        text = json.dumps(_plain(value, 0), separators=(",", ":"))
-        return _SPECIAL.sub(lambda match: _WRITTEN.get(match[0], match[0]), text)
+    text = json.dumps(_plain(value, 0), separators=(",", ":"))
+    if "Infinity" not in text and "NaN" not in text:
+        return text
+    return _SPECIAL.sub(lambda match: _WRITTEN.get(match[0], match[0]), text)
 
 
 def _plain(value: Any, depth: int) -> Any:
     """Convert `value` to JSON's types, with texts as the keys of dicts; below MAX_DEPTH, to the name of its class."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if depth > MAX_DEPTH:
-        return type(value).__name__
-    if isinstance(value, Mapping):
-        return {_key(key): _plain(part, depth + 1) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part, depth + 1) for part in value]
-    return _plain(simple(value), depth + 1)
+    plain: Any = type(value).__name__
+    with contextlib.suppress(Exception):  # the object is the researcher's
+        if depth > MAX_DEPTH:
+            pass
+        elif hasattr(value, "__array__"):  # numpy's types, and those of other packages
+            array = np.asarray(value)
+            plain = array.tolist() if array.dtype.kind in "biufU" else _plain(array.tolist(), depth + 1)
+        elif isinstance(value, Enum):
+            plain = _plain(value.value, depth + 1)
+        elif isinstance(value, Mapping):
+            plain = {_key(key): _plain(part, depth + 1) for key, part in value.items()}
+        elif isinstance(value, Collection) and not isinstance(value, bytes | bytearray):
+            plain = [_plain(part, depth + 1) for part in value]
+    return plain
 
 
 def _key(key: Any) -> str:
@@ -57,26 +63,6 @@ def _key(key: Any) -> str:
         return json.dumps(key) if key is None or isinstance(key, bool) else str(key)
     except Exception:  # noqa: BLE001 - the key is the researcher's
         return type(key).__name__
-
-
-def simple(value: Any) -> Any:
-    """Convert an object to a number, text, list or dict; to its class's name if it holds no values."""
-    with contextlib.suppress(Exception):  # the object is the researcher's
-        if isinstance(value, Enum):
-            return value.value
-        if hasattr(value, "__array__"):  # numpy's types, and those of other packages
-            return np.asarray(value).tolist()
-        for kind in (bool, int, float, str):
-            if isinstance(value, kind):
-                return kind(value)
-        if isinstance(value, Mapping):
-            return dict(value)
-        if isinstance(value, Collection) and not isinstance(value, bytes | bytearray):
-            return list(value)
-    return type(value).__name__
-
-
-_strict = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=simple).encode
 
 
 def read(space: Space, data: Any, *, action: bool = False) -> Any:

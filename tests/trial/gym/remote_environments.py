@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -33,23 +34,19 @@ class Everything(gymnasium.Env[Any, Any]):
     observation_space = spaces.Tuple([EVERYTHING, EVERYTHING])
     action_space = EVERYTHING
 
-    def __init__(self, length: int = 3, quiet: bool = False) -> None:
+    def __init__(self, length: int = 3) -> None:
         self.length = length
-        self.quiet = quiet
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.observation_space.seed(int(self.np_random.integers(1000)))
         self.steps = 0
-        if self.quiet:
-            return self.observation_space.sample(), {}
         return self.observation_space.sample(), {"options": options, "odd": (1, np.float32(0.5), {2: np.arange(3)})}
 
     def step(self, action: Any) -> Any:
         self.steps += 1
         other, _ = self.observation_space.sample()
         info = {"nan": float("nan"), "steps": self.steps, "action": action, "lives": np.int16(3)}
-        info = {"steps": self.steps} if self.quiet else info  # Gymnasium's vectors cannot merge all of them
         return (action, other), np.float32(0.1) * self.steps, False, self.steps >= self.length, info
 
 
@@ -79,8 +76,48 @@ class Numbers(gymnasium.Env[Any, Any]):
         return self.observation_space.sample(), float(action["a"][0]), self.left <= 0, False, info
 
 
+class WithoutText(Exception):
+    """An exception whose text raises."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+def _raise(error: BaseException) -> Any:
+    raise error
+
+
+def _result(**changed: Any) -> Callable[[], Any]:
+    named = {"observation": np.zeros(2, np.float32), "reward": 1.0, "terminated": False, "truncated": False, "info": {}}
+    return lambda: tuple((named | changed).values())
+
+
+RESULTS: dict[str, Callable[[], Any]] = {
+    "calm": _result(),
+    "raises": lambda: _raise(RuntimeError("broken")),
+    "raises without text": lambda: _raise(WithoutText()),
+    "exits": lambda: _raise(SystemExit(3)),
+    "three values": lambda: (0, 1.0, False),
+    "nothing": lambda: None,
+    "generator": lambda: (part for part in range(5)),
+    "reward of text": _result(reward="much"),
+    "no reward": _result(reward=None),
+    "huge reward": _result(reward=10**400),
+    "info without end": lambda: (0, 1.0, False, False, {"text": "y" * 250_000_000}),
+    "dies": lambda: os._exit(3),
+    "sleeps": lambda: time.sleep(30),
+    "outside": _result(observation=np.array([np.nan, 7], np.float32)),
+    "another shape": _result(observation=np.zeros(3, np.float32)),
+    "text": _result(observation="hello"),
+    "reward in an array": _result(reward=np.array([2.0])),
+    "info of text": _result(info="word"),
+    "no info": _result(info=None),
+    "list": lambda: [*_result()()],
+}
+
+
 class Bad(gymnasium.Env[Any, Any]):
-    """An environment that misbehaves as its action says."""
+    """An environment whose steps return or do what the action names."""
 
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Text(40, charset="abcdefghijklmnopqrstuvwxyz ")
@@ -96,53 +133,12 @@ class Bad(gymnasium.Env[Any, Any]):
         return np.zeros(2, np.float32), {}
 
     def step(self, action: str) -> Any:
-        observation: Any = np.zeros(2, np.float32)
-        info: Any = {}
-        if action == "raise":
-            raise RuntimeError("broken")
-        if action == "exit":
-            raise SystemExit(3)
-        if action == "die":
-            os._exit(3)
-        if action == "sleep":
-            time.sleep(30)
-        if action == "print":
-            os.write(1, b"x" * 100_000)
-            print("y" * 100_000)
-        if action == "fork":
-            for _ in range(1000):
-                if os.fork() == 0:
-                    time.sleep(600)
-                    os._exit(0)
-        if action == "eat":
-            eaten = []
-            while True:
-                eaten.append(np.ones(10_000_000))
-        if action == "shape":
-            observation = np.zeros(3, np.float32)
-        if action == "text":
-            observation = "hello"
-        if action == "outside":
-            observation = np.array([np.nan, 7], np.float32)
-        if action == "three":
-            return observation, 0.0, True
-        if action == "info":
-            info = ["no dict"]
-        if action == "reward":
-            return observation, "much", False, False, {}
-        if action == "nothing":
-            return None
-        if action == "thing":
-            info = {"self": self, "lambda": lambda: 1}
-        if action == "close fds":
-            os.closerange(3, 200)
-        return observation, 1.0, False, False, info
+        return RESULTS[action]()
 
     def render(self) -> Any:
         return "drawn" if self.render_mode == "ansi" else np.full((4, 5, 3), 7, np.uint8)
 
 
 gymnasium.register("Everything-v0", Everything, disable_env_checker=True)
-gymnasium.register("Quiet-v0", Everything, disable_env_checker=True, kwargs={"quiet": True})
 gymnasium.register("Numbers-v0", Numbers, disable_env_checker=True)
 gymnasium.register("Bad-v0", Bad, disable_env_checker=True)

@@ -141,6 +141,19 @@ def test_10_mb_in_a_message_close_the_connection(asking: TextClient) -> None:
     assert (found.value.rcvd.code, "exceeds limit" in found.value.rcvd.reason) == (1009, True)
 
 
+def test_a_request_in_fragments_is_answered(asking: TextClient) -> None:
+    asking.websocket.send(['{"method": ', '"none", ', '"params": {}}'])
+    assert kind_and_sentence(json.loads(asking.websocket.recv(WITHIN)))[0] == "MethodNotFound"
+
+
+def test_a_text_that_is_no_utf_8_closes_the_connection(asking: TextClient) -> None:
+    asking.websocket.send(b"\xff", text=True)
+    with pytest.raises(ConnectionClosed) as found:
+        asking.websocket.recv(WITHIN)
+    assert found.value.rcvd is not None
+    assert found.value.rcvd.code == 1007
+
+
 def test_too_many_steps_for_one_reply_get_a_sentence(asking: TextClient) -> None:
     made = asking.make("Odd/Calm-v0")
     kind, _ = kind_and_sentence(asking.ask("step_many", instance_id=made, actions=[0] * 70_000))
@@ -286,7 +299,11 @@ def test_half_a_handshake_keeps_no_other_from_playing(server: GymServerProcess, 
 
 
 def test_a_connection_that_is_no_http_is_dropped(server: GymServerProcess) -> None:
-    for said in (b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a" * 20_000):
+    for said in (
+        b"\x16\x03\x01\x00\xa5" + bytes(200) + b"\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"a" * 20_000,
+        b"GET /gym HTTP/1.1\r\nUpgrade: websocket\r\nUpgrade: websocket\r\n\r\n",
+    ):
         with socket.create_connection(("127.0.0.1", server.port)) as raw, contextlib.suppress(ConnectionResetError):
             raw.settimeout(WITHIN)
             raw.sendall(said)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import re
 import signal
 import socket
 import threading
@@ -19,15 +20,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from testing.gym_server import gym_server
+from testing.gym_server import TextClient, gym_server
 from tests.trial.gym import remote_environments  # noqa: F401 - registers environments
-from tests.trial.gym.space_strategies import same
+from tests.trial.gym.comparing import same
 from trial.gym import ConnectionLost, RemoteEnv, RemoteError
-from trial.gym import client as client_module
-from trial.gym.settings import Limits
 from trial.gym.spaces import CodecError
 
-ODD = ("--import", "tests.trial.gym.remote_environments")
+ODD = ("--import", "tests.trial.gym.remote_environments", "--megabytes", "300")
 ENVIRONMENTS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1", "Blackjack-v1", "Taxi-v4", "Acrobot-v1", "Everything-v0"]
 
 
@@ -68,10 +67,6 @@ def test_an_environment_does_what_it_does_without_a_server(url: str, env_id: str
                     break
 
 
-def test_the_clients_time_limit_is_longer_than_the_servers() -> None:
-    assert Limits().seconds + 10 < client_module.TIMEOUT
-
-
 @pytest.mark.parametrize("seeds", [[0, None, 0], [5, None, None]])
 def test_seeds_are_gymnasiums_and_none_continues_the_random_numbers(url: str, seeds: list[int | None]) -> None:
     with RemoteEnv(url, "CartPole-v1") as remote, gymnasium.make("CartPole-v1") as local:
@@ -106,12 +101,6 @@ def test_pictures_are_those_of_the_environment(url: str) -> None:
         remote.reset(seed=3)
         local.reset(seed=3)
         assert same(remote.render(), local.render())
-
-
-def test_text_is_drawn_too(url: str) -> None:
-    with RemoteEnv(url, "Bad-v0", render_mode="ansi") as env:
-        env.reset()
-        assert env.render() == "drawn"
 
 
 def test_the_render_mode_human_is_refused_before_the_server_is_asked() -> None:
@@ -228,22 +217,59 @@ def test_the_sentence_shows_the_wrong_action(url: str) -> None:
             env.step(2)
 
 
-@pytest.mark.parametrize("action", ["raise", "exit", "three", "nothing"])
-def test_an_environments_mistake_gets_a_sentence_and_the_connection_remains(url: str, action: str) -> None:
+@pytest.fixture(scope="module")
+def asking(url: str) -> Iterator[TextClient]:
+    with TextClient(f"{url}gym?form=gymnasium") as client:
+        yield client
+
+
+MISTAKES = {
+    "raises": "RuntimeError: broken",
+    "raises without text": "WithoutText",
+    "exits": "SystemExit: 3",
+    "three values": "step() must return five values",
+    "nothing": "step() must return five values",
+    "generator": "step() must return five values",
+    "reward of text": "a reward that cannot be a float: str",
+    "no reward": "a reward that cannot be a float: NoneType",
+    "huge reward": "a reward that cannot be a float: int",
+    "info without end": "MemoryError",
+}
+
+
+@pytest.mark.parametrize("action", MISTAKES)
+def test_an_environments_mistake_gets_a_sentence_and_the_connection_remains(
+    url: str, asking: TextClient, action: str
+) -> None:
     with RemoteEnv(url, "Bad-v0") as env:
         env.reset(seed=1)
-        with pytest.raises(RemoteError, match=r"\S \S") as caught:
+        with pytest.raises(RemoteError, match=re.escape(MISTAKES[action])) as caught:
             env.step(action)
         assert not isinstance(caught.value, ConnectionLost)
-        assert env.step("a")[1] == 1.0
+        assert env.step("calm")[1] == 1.0
+    made = asking.make("Bad-v0")
+    asking.ask("reset", instance_id=made)
+    assert MISTAKES[action] in asking.ask("step", instance_id=made, action=action)["error"]["message"]
+    assert asking.ask("step", instance_id=made, action="calm")[1] == 1.0
 
 
-def test_an_observation_outside_its_space_arrives(url: str) -> None:
+def test_the_error_in_one_of_many_steps_has_its_number(url: str) -> None:
+    with RemoteEnv(url, "Bad-v0") as env:
+        env.reset()
+        with pytest.raises(RemoteError, match=r"WithoutText \(step 2 of this request\)"):
+            env.step_many(["calm", "calm", "raises without text"])
+
+
+def test_what_a_step_returns_arrives(url: str) -> None:
     with RemoteEnv(url, "Bad-v0") as env:
         env.reset()
         assert same(env.step("outside")[0], np.array([np.nan, 7], np.float32))
-        assert same(env.step("shape")[0], np.zeros(3, np.float32))
+        assert same(env.step("another shape")[0], np.zeros(3, np.float32))
         assert env.step("text")[0] == "hello"
+        assert env.step("reward in an array")[1] == 2.0
+        assert env.step("info of text")[4] == {"info": "word"}
+        assert env.step("no info")[4] == {}
+        assert env.step("list")[1] == 1.0
 
 
 def test_a_reset_that_raises_gets_a_sentence(url: str) -> None:
@@ -258,9 +284,9 @@ def test_an_environment_that_ends_its_process_ends_its_connection_alone(url: str
         env.reset()
         other.reset(seed=1)
         with pytest.raises(ConnectionLost):
-            env.step("die")
+            env.step("dies")
         with pytest.raises(ConnectionLost, match="any more"):
-            env.step("a")
+            env.step("calm")
         assert other.step(1)[1] == 1.0
 
 
@@ -269,7 +295,7 @@ def test_an_answer_that_does_not_come_in_time_ends_the_connection(url: str) -> N
         env.reset()
         begun = time.monotonic()
         with pytest.raises(ConnectionLost, match="within 4 s"):
-            env.step("sleep")
+            env.step("sleeps")
         assert time.monotonic() - begun < 10
 
 
@@ -280,7 +306,7 @@ def test_an_interrupted_request_ends_the_connection(url: str) -> None:
         timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
         timer.start()
         with pytest.raises(KeyboardInterrupt):
-            env.step("sleep")
+            env.step("sleeps")
         timer.join()
         with pytest.raises(ConnectionLost, match="interrupted"):
             env.reset()
