@@ -231,8 +231,13 @@ class Player:
         return waits
 
     def until(self, kind: str, count: int) -> None:
-        """Wait until the page has noted so many `draws` or `waits`."""
-        self.page.wait_for_function(REACHED, arg=[kind, count], polling=10)
+        """Wait until the page has noted so many `draws` or `waits`. Raises RuntimeError with the text of the page."""
+        from playwright.sync_api import TimeoutError as TookTooLong
+
+        try:
+            self.page.wait_for_function(REACHED, arg=[kind, count], polling=10)
+        except TookTooLong:
+            raise RuntimeError(f"fewer than {count} {kind}; the page: {self.page.inner_text('body')}") from None
 
 
 def serving(port: int) -> psutil.Process:
