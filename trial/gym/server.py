@@ -90,6 +90,8 @@ class _Child:
     """The close code and the sentence for its client, if the server has killed the process."""
     refuses: bool = False
     """Whether the process only refuses a client, or tells it why its connection ends."""
+    gone_since: float | None = None
+    """When it was first seen that the client has gone."""
 
 
 class _Server:
@@ -179,14 +181,18 @@ class _Server:
             _exit(status)
 
     def _check_usage(self) -> None:
-        """End connections whose environments have too many processes, or use too much memory."""
-        if time.monotonic() - self._usage_checked < _USAGE_SECONDS:
+        """End connections whose environments have too many processes, use too much memory, or outlast their client."""
+        now, limits = time.monotonic(), self._limits
+        if now - self._usage_checked < _USAGE_SECONDS:
             return
-        self._usage_checked = time.monotonic()
-        limits = self._limits
-        for pid in self._children:
+        self._usage_checked = now
+        for pid, child in self._children.items():
+            if _has_gone(child.connection):
+                child.gone_since = child.gone_since or now
             started = linux.descendants(pid)
-            if len(started) > limits.processes:
+            if child.gone_since is not None and now - child.gone_since > limits.seconds:
+                self._end(pid, "The client has gone.")  # the environment hangs, and has taken SIGALRM for itself
+            elif len(started) > limits.processes:
                 self._end(pid, f"The environments started more than {limits.processes} processes; all were ended.")
             elif sum(map(linux.used_megabytes, (pid, *started))) > limits.megabytes:
                 self._end(pid, f"The environments used more than {limits.megabytes} MB; their process was ended.")
@@ -260,6 +266,13 @@ def _imported_without_threads() -> ModuleType:
         else:
             os.environ[name] = before
     return connection
+
+
+def _has_gone(connection: socket.socket) -> bool:
+    """Whether the client has ended the connection. Reads nothing, which is its process's part."""
+    poll = select.poll()
+    poll.register(connection, getattr(select, "POLLRDHUP", select.POLLHUP))
+    return bool(poll.poll(0))
 
 
 def _ended(pid: int) -> int | None:

@@ -6,6 +6,7 @@ import ctypes
 import itertools
 import mmap
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -88,6 +89,14 @@ class Hanging(Calm):
 
     def misbehave(self) -> None:
         sum(itertools.repeat(1, 10**13))
+
+
+class Stubborn(Looping):
+    """Hangs, and has taken the signal that should end it."""
+
+    def misbehave(self) -> None:
+        signal.signal(signal.SIGALRM, signal.SIG_IGN)
+        super().misbehave()
 
 
 class Printing(Calm):
@@ -180,5 +189,5 @@ class OldSeeded(Calm):
 
 
 OLD = (Old, OldSeeded)
-for made in (*Calm.__subclasses__(), Calm):
+for made in (*Calm.__subclasses__(), Stubborn, Calm):
     gymnasium.register(f"Odd/{made.__name__}-v0", made, disable_env_checker=True, order_enforce=made not in OLD)

@@ -235,7 +235,7 @@ def test_what_an_environment_prints_disturbs_no_answer(asking: TextClient) -> No
     assert first_step(asking, "Odd/Printing-v0")[0] == [1.0, 0.5]
 
 
-@pytest.mark.parametrize("env_id", ["Odd/Looping-v0", "Odd/Hanging-v0", "Odd/Calm-v0"])
+@pytest.mark.parametrize("env_id", ["Odd/Looping-v0", "Odd/Hanging-v0", "Odd/Stubborn-v0", "Odd/Calm-v0"])
 def test_a_client_that_vanishes_during_a_step_leaves_nothing_behind(server: GymServerProcess, env_id: str) -> None:
     client = TextClient(server.url)
     begin_step(client, env_id)
