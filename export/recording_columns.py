@@ -21,8 +21,6 @@ GROUP_ROWS = 8_192  # rows written at once
 GROUP_BYTES = 16 * 1024 * 1024  # of observations; with so many, fewer rows are written at once
 _MAX_OBSERVATION = 256 * 1024 * 1024  # the most bytes of an observation
 _DTYPE = re.compile(r"bool|(?:u?int|float)(8|16|32|64)")
-_DTYPES = {"i": "int", "u": "uint", "f": "float"}
-_BYTE_ORDER = re.compile(r"[<>|]([iuf])([1248])")  # as an earlier version has recorded arrays of another byte order
 _NOT_STORED = {"kind", "v", "session", "trial", "observation"}
 
 
@@ -243,9 +241,6 @@ def unpack_array(recorded: Any) -> tuple[bytes, str, list[int]]:
     """Return the bytes (C order), dtype and shape of a recorded array. Raises KeyError, TypeError, ValueError or
     zlib.error for any other value."""
     dtype, shape = recorded["dtype"], [int(side) for side in recorded["shape"]]
-    order = _BYTE_ORDER.fullmatch(dtype)
-    if order:
-        dtype = f"{_DTYPES[order[1]]}{8 * int(order[2])}"
     found = _DTYPE.fullmatch(dtype)
     if not found or dtype == "float8" or any(side < 0 or side >= 2**31 for side in shape):
         raise ValueError("no array")
@@ -256,8 +251,4 @@ def unpack_array(recorded: Any) -> tuple[bytes, str, list[int]]:
     data = unpack.decompress(base64.b64decode(recorded["zlib"], validate=True), size + 1)
     if len(data) != size:
         raise ValueError("another size")
-    if order:
-        import numpy as np
-
-        data = np.frombuffer(data, order[0]).astype(dtype).tobytes()
     return data, dtype, shape

@@ -32,7 +32,7 @@ from hippodrome.model.project import MASTER_LIST, Project, read_list
 
 PRIVATE = "private"
 _STATE = f"{PRIVATE}/state.sqlite"
-_DATASETS = 3  # the version of what datasets hold: those of an earlier version are made again
+_DATASETS = 1  # raised with what datasets hold: those with another number are made again
 _MAX_MASTER_LIST = 64 * 1024 * 1024  # bytes
 
 

@@ -93,12 +93,10 @@ def _text(value: Any) -> str | None:
 
 
 def _in_session(found: Mapping[str, Any], player: str | None) -> list[Any]:
-    """The session, the player, and the frames that the substitute played; None for the frames if an earlier version
-    has converted the recording."""
+    """The session, the player, and the frames that the substitute played."""
     if player is None:
         return [found.get("session"), None, None]
-    steps = found.get("byPolicy")
-    return [found.get("session"), clean(player), None if steps is None else steps.get(player, 0)]
+    return [found.get("session"), clean(player), found["byPolicy"].get(player, 0)]
 
 
 def _humans(

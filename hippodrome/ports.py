@@ -275,9 +275,9 @@ class Settings:
 
 
 def _game_sources(domain: str, host: str) -> str:
-    """The sources for servers' names: below the servers' domain, and directly below the root, as earlier versions."""
-    parents = [f"{host}.{domain}", domain] if host else [domain]
-    return " ".join(f"wss://*.{parent}:{port}" for parent in parents for port in PORTS) if domain else ""
+    """The sources for servers' names, which are directly below the servers' domain."""
+    parent = f"{host}.{domain}" if host else domain
+    return " ".join(f"wss://*.{parent}:{port}" for port in PORTS) if domain else ""
 
 
 class Platform(Protocol):

@@ -26,7 +26,7 @@ def handler(event: dict[str, Any], context: Any) -> dict[str, str]:
         platform.documents,
         platform.challenges,
         platform.now,
-        location(domain, platform.settings.root_domain),
+        location(domain),
         tell=lambda stage: logger.info("certificate", extra={"stage": stage.value}),
         note=failure,
     )

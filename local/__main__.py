@@ -22,7 +22,7 @@ from local.activity.log import ActivityLog
 from local.backend import files
 from local.backend.processes import end_everything
 from local.publish import NotPublished
-from local.study import OTHERS, Study, from_here
+from local.study import Study, from_here
 from local.web import server
 from local.web.access import origin_of
 
@@ -116,8 +116,6 @@ def _run_study(
     state = root / data.resolve().name
     root.mkdir(parents=True, exist_ok=True)
     hold = files.Hold(root / f"{state.name}.lock")
-    if root.stat().st_mode & OTHERS:  # an earlier version let other users read it
-        root.chmod(0o700)
     if fresh:
         _move_aside(data.resolve(), state, activity_log)
     _allow_more_files()

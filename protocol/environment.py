@@ -1,8 +1,7 @@
 """The environment variables that a participant's server is started with.
 
 `hippodrome/servers/start.py`, `hippodrome/aws/tasks.py`, `deploy/study/definition.py` and `local/` write them;
-`trial/settings.py` reads them. HIPPO and earlier versions use the same names, so they must not change. All values are
-text; durations are seconds.
+`trial/settings.py` reads them. All values are text; durations are seconds.
 """
 
 from __future__ import annotations

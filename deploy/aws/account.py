@@ -149,25 +149,26 @@ class Installation:
         return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
     def __getitem__(self, output: str) -> str:
-        """Return an output of the stack. Raises `Problem` if the stack is older than that output."""
+        """Return an output of the stack. Raises `Problem` if the stack has no output of that name."""
         try:
             return self.outputs[output]
         except KeyError:
             raise Problem(
-                f"The stack {self.stack} has no output {output}: it was made by an older version.",
+                f"The stack {self.stack} has no output {output}.",
                 "Bring it up to date with `make deploy` or `python -m deploy apply`.",
             ) from None
 
     @property
     def servers_domain(self) -> str:
         """The domain directly above servers' names."""
-        root, host = self["RootDomain"].strip(".").lower(), self.outputs.get("ServersHost", "")
-        return Settings(root_domain=root, servers_host=host).servers_domain
+        return Settings(
+            root_domain=self["RootDomain"].strip(".").lower(), servers_host=self["ServersHost"]
+        ).servers_domain
 
     @property
     def certificate(self) -> Location:
         """The place of the servers' certificate in the bucket."""
-        return location(self.servers_domain, self["RootDomain"].strip(".").lower())
+        return location(self.servers_domain)
 
     @property
     def env(self) -> dict[str, str]:
@@ -177,7 +178,7 @@ class Installation:
             "BUCKET": self["Bucket"],
             "HOSTED_ZONE_ID": self["HostedZoneId"],
             "ROOT_DOMAIN": self["RootDomain"],
-            "SERVERS_HOST": self.outputs.get("ServersHost", ""),  # older stacks lack this output
+            "SERVERS_HOST": self["ServersHost"],
             "MAX_RUNTIME": self["MaxRuntime"],
             "CLUSTER": self["Cluster"],
             "SUBNET": self["Subnets"],

@@ -167,10 +167,9 @@ class Removal:
                 screen.success(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
 
     def _acme_records(self, addresses: Addresses) -> None:
-        """Delete the challenge records that interrupted orders of certificates left, also those of earlier versions."""
-        for domain in dict.fromkeys((addresses.servers, addresses.root)):
-            for name in names_of(domain):
-                self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
+        """Delete the challenge records that interrupted orders of certificates left."""
+        for name in names_of(addresses.servers):
+            self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
 
     def _acme_record(self, name: str, zone: str) -> None:
         client = self.account.client("route53")

@@ -1,8 +1,6 @@
 """Checks and prepares a change of an installation's domain of servers, site or network.
 
-Earlier versions named servers directly below the installation's domain; now servers have a level of their own. Running
-servers keep their names and the certificate for these (`hippodrome.certificates.rules.location`). Servers get new names
-only when there is a certificate for them.
+None of these changes while a server runs. Servers get new names only when there is a certificate for them.
 """
 
 from __future__ import annotations
@@ -19,12 +17,11 @@ from deploy.stack import certificate
 from deploy.stack.certificate import Choice
 from deploy.stack.changes import Prepared
 from hippodrome.certificates.rules import Verdict
-from hippodrome.model import ids
 from hippodrome.model.server import Server
 
-_WAIT = "Wait until they have ended, or end them with `python -m deploy stop`; then apply again."
-_WAIT_FOR_WARM_TOO = (
-    f"{_WAIT} Warm servers end for good when their study is closed (`python -m deploy register --no-live`)."
+_WAIT = (
+    "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end for good "
+    "when their study is closed (`python -m deploy register --no-live`)."
 )
 
 
@@ -39,14 +36,12 @@ def check(prepared: Prepared) -> None:
     if not moves(prepared):
         return
     before, after = _before(prepared), servers_domain(prepared.parameters)
-    if after != prepared.parameters["RootDomain"]:  # a zone's own domain has an NS record that is no delegation
-        _must_not_be_delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
+    _must_not_be_delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
     _must_not_cover_a_site(prepared, after)
     if before is not None:
         _refuse(
-            [one for one in _running(prepared.account, before) if _stays(one, prepared)],
-            f"Servers run below {before.servers_domain} whose names the installation could not remove any more.",
-            _WAIT,
+            _running(prepared.account, before),
+            f"Servers run below {before.servers_domain}. No page could reach them, and their names would stay.",
         )
 
 
@@ -62,7 +57,6 @@ def check_site(prepared: Prepared) -> None:
     _refuse(
         _running(prepared.account, before),
         f"Servers run that store their answers and recordings by way of {site}, which would be gone.",
-        _WAIT_FOR_WARM_TOO,
     )
 
 
@@ -77,14 +71,13 @@ def check_network(prepared: Prepared) -> None:
     _refuse(
         _running(prepared.account, before),
         "Servers run in the present network. It could not be removed, and they would lose their way out of it.",
-        _WAIT_FOR_WARM_TOO,
     )
 
 
-def _refuse(running: Collection[Server], why: str, advice: str) -> None:
+def _refuse(running: Collection[Server], why: str) -> None:
     """Raise `Problem` if any server runs."""
     if running:
-        raise Problem(why, advice, [f"{len(running)} of them"])
+        raise Problem(why, _WAIT, [f"{len(running)} of them"])
 
 
 def certify(prepared: Prepared) -> None:
@@ -128,7 +121,7 @@ def _must_be_uploaded(account: Account, after: Installation) -> None:
 
 
 def _before(prepared: Prepared) -> Installation | None:
-    """Return the present installation; None if there is none, or its version is too old to name its resources."""
+    """Return the present installation; None if there is none, or it is not complete."""
     if prepared.existing is None:
         return None
     found = Installation.of(prepared.account, prepared.existing)
@@ -141,12 +134,6 @@ def _before(prepared: Prepared) -> Installation | None:
 def _running(account: Account, installation: Installation) -> list[Server]:
     platform = account.platform(installation)
     return Records(platform.documents).open(platform.settings.max_runtime, datetime.now(UTC))
-
-
-def _stays(server: Server, prepared: Prepared) -> bool:
-    """Whether the server's DNS record would stay in the zone: functions may only delete names like those of servers."""
-    moved = any(prepared.before.get(key) != prepared.parameters[key] for key in ("RootDomain", "HostedZoneId"))
-    return bool(server.host) and (moved or ids.parse_server_name(server.dns.partition(".")[0]) is None)
 
 
 def _must_not_be_delegated(account: Account, zone: str, domain: str) -> None:

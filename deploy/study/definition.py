@@ -12,7 +12,6 @@ from deploy.aws.account import Account, Installation
 from deploy.aws.resource_names import TAG
 from hippodrome.aws import errors
 from hippodrome.model.messages import CONTAINER
-from hippodrome.model.project import LEGACY_PORT
 from protocol import environment
 
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, for a server's last recording; Fargate allows no more
@@ -23,7 +22,7 @@ PRIVILEGED = 1024  # only a privileged user may listen on lower ports
 
 def port(installation: Installation) -> int:
     """Return the port on which the servers of a study will listen if it is registered now."""
-    return int(installation.outputs.get("ServerPort", LEGACY_PORT))  # older stacks have no such output
+    return int(installation["ServerPort"])
 
 
 def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
@@ -85,7 +84,7 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
         if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
-    if found.get("status", "ACTIVE") != "ACTIVE" or found.get("taskRoleArn"):  # earlier versions had a task role
+    if found.get("status", "ACTIVE") != "ACTIVE":
         return None
     return str(found["taskDefinitionArn"]) if _contains(found, wanted) else None
 

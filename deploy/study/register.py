@@ -27,7 +27,7 @@ from deploy.study import definition, image, pages
 from hippodrome.aws.documents import S3Documents
 from hippodrome.config import agent_imports, parse_registration, remarks
 from hippodrome.config.step_order import changed_pages
-from hippodrome.model.project import LEGACY_PORT, Project, UnreadableEntry
+from hippodrome.model.project import DEFAULT_PORT, Project, UnreadableEntry
 from hippodrome.model.records import from_data
 
 QR_FILES = {".svg", ".png", ".pdf"}
@@ -68,7 +68,7 @@ class RegisterPlan:
     pages: pages.Changes
     image: image.ImagePlan | None
     definition: str | None  # the ARN of the newest revision if it has the right content
-    port: int = LEGACY_PORT
+    port: int = DEFAULT_PORT
 
     @property
     def steps(self) -> list[str]:

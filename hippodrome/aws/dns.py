@@ -88,18 +88,16 @@ class Route53Dns:
     def list(self) -> Iterator[DnsRecord]:
         """Yield the A records that have the form of the servers' records, which `change` creates.
 
-        Records directly below `ROOT_DOMAIN` are included: earlier versions created them there. AWS calls: one for each
-        300 records of the zone.
+        AWS calls: one for each 300 records of the zone.
         """
-        domain = self._need("ROOT_DOMAIN").strip(".").lower()
-        parents = {domain, f"{self._host}.{domain}"}
+        domain = f"{self._host}.{self._need('ROOT_DOMAIN').strip('.').lower()}"
         for page in self._pages():
             for record in page["ResourceRecordSets"]:
                 name = _normalised(record["Name"])
                 label, _, parent = name.partition(".")
                 values = [item["Value"] for item in record.get("ResourceRecords", ())]
                 like_ours = record["Type"] == "A" and record.get("TTL") == TTL and "SetIdentifier" not in record
-                if like_ours and len(values) == 1 and parent in parents and ids.parse_server_name(label):
+                if like_ours and len(values) == 1 and parent == domain and ids.parse_server_name(label):
                     yield DnsRecord(name, values[0])
 
     def browser_host(self, record: DnsRecord) -> str:

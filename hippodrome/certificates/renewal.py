@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from hippodrome.certificates import rules
 from hippodrome.certificates.rules import (
     ACCOUNT,
-    FORMER,
     CertificateRecord,
     Decision,
     FailureReason,
@@ -104,20 +103,14 @@ class Renewal:
     def last_directory(self) -> str:
         """Return the ACME directory that issued the present certificate or, if it is gone, the one ordered last.
 
-        The result is "" if no certificate was ever ordered, or if the administrator put the present one there. For a
-        location that never had a certificate, it is the directory of the certificate at `FORMER`.
+        The result is "" if no certificate was ever ordered, or if the administrator put the present one there.
         """
         state, stored = self.read()
-        found = stored.directory if stored else state.directory
-        if found or stored or self._location == FORMER:
-            return found
-        return self._at_former().last_directory()
+        return stored.directory if stored else state.directory
 
     def last_roots(self, directory: str) -> str:
         """Return the root certificates (PEM) last trusted at this directory's HTTPS address; "" for the public ones."""
         state = self.read()[0]
-        if not state.directory and self._location != FORMER:
-            state = self._at_former().read()[0]
         return state.trusted if state.directory == directory else ""
 
     def decide(self, wanted: RenewalRequest) -> Decision:
@@ -150,9 +143,6 @@ class Renewal:
         return RenewalOutcome(decision, issued.stored)
 
     # ---- the state
-
-    def _at_former(self) -> Renewal:
-        return Renewal(self._documents, self._challenges, self._now, FORMER, note=self._note)
 
     def _state(self) -> tuple[CertificateRecord, Document | None]:
         found = self._documents.get(self._location.state)

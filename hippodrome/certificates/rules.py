@@ -1,16 +1,14 @@
 """Decides where the servers' TLS certificate is stored, and when to order a new one. Pure.
 
 All servers show one certificate for `*.<the servers' domain>`, ordered by ACME (RFC 8555) with a DNS-01 challenge. It
-is stored under `SSL/<the servers' domain>/`, so that every server reads a certificate for its own name, also while an
-installation moves from one domain to another:
+is stored under `SSL/<the servers' domain>/`, so that every server reads a certificate for its own name:
 
 * `privkey.pem`: a line that names the certificate's ACME directory, the private key, and its chain. Writing this one
   document replaces the old certificate, so no reader ever sees a key without its chain.
 * `fullchain.pem`: a copy of the chain, where HIPPO's `ssl` section and other readers expect it.
 * `certificate.json`: a `CertificateRecord`, which says what was ordered and when.
 
-`SSL/account.json` has the keys of our accounts, one for each ACME directory. Earlier versions kept a certificate for
-`*.<root domain>` in `SSL/` itself (`FORMER`). Servers with names directly below the root domain read that one.
+`SSL/account.json` has the keys of our accounts, one for each ACME directory.
 
 If `privkey.pem` lacks that first line, the administrator has put it there, and no order replaces it.
 
@@ -61,14 +59,8 @@ class Location(NamedTuple):
     state: str
 
 
-FORMER = Location("SSL/fullchain.pem", "SSL/privkey.pem", "SSL/certificate.json")
-"""Where earlier versions kept the certificate of `*.<root domain>`."""
-
-
-def location(domain: str, root_domain: str) -> Location:
+def location(domain: str) -> Location:
     """Return the keys of the documents of the certificate for names directly below `domain`."""
-    if domain == root_domain:
-        return FORMER
     return Location(*(f"SSL/{domain}/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")))
 
 

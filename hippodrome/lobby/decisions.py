@@ -23,21 +23,20 @@ class OpenSession(Record, frozen=True):
 
     `requested`: when its server was requested. `by`: the label of the participant for whom it was requested; "" if the
     sweep requested it, or the participant is erased. `players`: for how many participants it is; its server runs the
-    registration for that number. 0 in documents of earlier versions.
+    registration for that number.
     """
 
     id: str
     requested: datetime
     by: str = ""
-    players: int = 0
+    players: int = 2
 
     def is_usable(self, players: int, now: datetime, open_for: timedelta) -> bool:
         """Return whether the session, which is for `players`, may still get members.
 
-        It may until `open_for` after its server was requested. A session of an earlier version, which does not name its
-        number of players, fits any number.
+        It may until `open_for` after its server was requested.
         """
-        return now - self.requested < open_for and self.players in (0, players)
+        return now - self.requested < open_for and self.players == players
 
 
 class Proposal(Record, frozen=True):
@@ -45,14 +44,14 @@ class Proposal(Record, frozen=True):
 
     `id` identifies the proposal: its members confirm it by this id. `ahead`: the open session whose server it gets, if
     there is one; if this proposal falls apart, another proposal may get that server. `players`: the project's number
-    when the session was proposed; 0 in documents of earlier versions.
+    when the session was proposed.
     """
 
     id: str
     labels: tuple[str, ...]
     at: datetime
     ahead: OpenSession | None = None
-    players: int = 0
+    players: int = 2
 
     @property
     def session_id(self) -> str:
@@ -82,7 +81,7 @@ class Formed(Record, frozen=True):
     at: datetime
     ahead: bool = False
     waits_for: OpenSession | None = None
-    players: int = 0  # the number of players, empty places included; 0 in documents of earlier versions
+    players: int = 2  # the number of players, empty places included
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -76,7 +76,7 @@ class NoServerYet:
     session: str
     members: int
     record: Server | None
-    players: int  # empty places included; 0 in documents of earlier versions
+    players: int  # empty places included
 
 
 @dataclass(frozen=True, slots=True)

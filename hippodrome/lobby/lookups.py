@@ -121,7 +121,7 @@ class Lookups:
             if any(isinstance(one, Exception) for one in known):
                 continue
             able = [one for one in known if isinstance(one, Matched)]
-            if len(able) == len(known) and each.players in (0, project.players):
+            if len(able) == len(known) and each.players == project.players:
                 members[each.id] = able
             else:
                 broken.append(each.id)

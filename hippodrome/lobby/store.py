@@ -147,7 +147,7 @@ class LobbyStore:
         members = tuple(session.Member(each.user_id, each.group, seat) for seat, each in enumerate(formed.members))
         made = SessionDocument(
             formed.id,
-            max(formed.players or project.players, len(members)),
+            formed.players,
             members,
             group=next((each.group for each in formed.members if each.label), None),
             formed=time_text(formed.at),

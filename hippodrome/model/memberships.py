@@ -13,7 +13,7 @@ class Membership(Record, frozen=True, omit_defaults=False):
     """The document of a membership. `session` is the session's id; None for an unmatched participant.
 
     `seat` counts the human players of the environment from 0. `members` is how many participants the session has;
-    `players`, how many it is for, empty places included (0 in documents of earlier versions). An unmatched participant
+    `players`, how many it is for, empty places included; both are 0 if the participant is unmatched, who
     sees `completion_code` instead of the code in `participant.json`. `waited`: the seconds that the participant spent
     in the lobby.
     """

@@ -16,7 +16,7 @@ MASTER_LIST = "project_master_list.json"
 STEPS_FOLDER: Literal["steps"] = "steps"
 GAME_PAGES = ("instructions", "betweenEpisodes")
 """The keys of `trial` that may name a page."""
-LEGACY_PORT = 5000  # for registrations of earlier versions, which name no port
+DEFAULT_PORT = 5000  # HIPPO's port, for registrations that name none; also the trial's default
 MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRuntime is at least this plus the project's
 
 
@@ -70,7 +70,7 @@ class ForPlayers(Record, frozen=True):
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     game_pages: Mapping[str, int] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
-    server_port: int = LEGACY_PORT
+    server_port: int = DEFAULT_PORT
     use_a_w_s: bool = msgspec.field(default=False, name="useAWS")
     aws_setup: AwsSetup | None = None
 
@@ -108,7 +108,7 @@ class Project(Record, frozen=True):
     texts: Mapping[str, str] = msgspec.field(default_factory=dict)  # the study's own words, by the names in `texts.py`
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     task_definition: str | None = None
-    server_port: int = LEGACY_PORT  # on AWS; the task definition must open it
+    server_port: int = DEFAULT_PORT  # on AWS; the task definition must open it
     game_pages: Mapping[str, int] = msgspec.field(default_factory=dict)
     """The number of variants of each page that the game page shows, by the key of `trial` that names the page."""
     page_folder: Literal["steps", ""] = STEPS_FOLDER

@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from hippodrome.model import ids, sessions, warm_pool
-from hippodrome.model.project import LEGACY_PORT, Project
+from hippodrome.model.project import DEFAULT_PORT, Project
 from hippodrome.model.records import Record
 from hippodrome.ports import Address, DnsRecord, Settings
 from protocol.session import is_session_id
@@ -100,13 +100,13 @@ class Server(Record, frozen=True):
     spot: bool = True
     task: str | None = None  # the task's id, once the task runs
     host: str | None = None  # the address in its DNS record, exactly as in the zone
-    port: int | None = None  # the port on which it is to listen; once its task runs, the port on which it listens
+    port: int = DEFAULT_PORT  # the port on which it is to listen; once its task runs, the port on which it listens
     running: datetime | None = None
     ready: datetime | None = None
     closed: datetime | None = None
     reason: Reason | None = None
     cause: str = ""  # why it failed, if it did (`servers.causes.Cause`)
-    cpu: float = 0  # vCPU; 0 in records of earlier versions
+    cpu: float = 0  # vCPU
     memory: float = 0  # GB
     earlier: tuple[PastAttempt, ...] = ()  # oldest first
     counted: bool = False  # whether it holds one of its project's slots until it is closed
@@ -116,7 +116,7 @@ class Server(Record, frozen=True):
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # the steps whose answers it may store: the project's when it was started
     may_match: bool = False  # with `matching: match`: whether it answers questions to `match` while it has no members
-    players: int = 0  # how many players a session's trial is for; 0 in records of earlier versions
+    players: int = 0  # how many players a session's trial is for; 0 if it is no session's
 
     @property
     def label(self) -> str:
@@ -149,10 +149,9 @@ class Server(Record, frozen=True):
     def lacks(self, step_key: str) -> bool:
         """Return whether this server may not store the answer to this game step, which was registered after it started.
 
-        The result is False for records of earlier versions, which do not name their steps, and for a session's server,
-        on which others play.
+        The result is False for a session's server, on which others play.
         """
-        return bool(self.game_steps) and not self.is_of_session and step_key not in self.game_steps
+        return not self.is_of_session and step_key not in self.game_steps
 
     def is_open(self, attempt: int) -> bool:
         """Return whether the record is at this attempt and not closed."""
@@ -341,7 +340,7 @@ def naming(server: Server, task: str, address: Address, now: datetime) -> Server
 
     It is written before the DNS record is created, so that each DNS record has an owner.
     """
-    port = address.port or server.port or LEGACY_PORT  # neither has a port in records of earlier versions
+    port = address.port or server.port
     return msgspec.structs.replace(
         server, state=ServerState.NAMING, task=task, host=address.host, port=port, running=now
     )

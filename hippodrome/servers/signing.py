@@ -290,7 +290,7 @@ class Signing:
         return found
 
     def _access(self, record: Server, name: str) -> ServerAccess | None:
-        keys = location(record.domain, self._platform.settings.root_domain)
+        keys = location(record.domain)
         certificate = (keys.fullchain, keys.privkey)
         if not record.is_warm_server:
             return access_of(record, name, certificate)

@@ -16,7 +16,7 @@ from hippodrome.log import logger
 from hippodrome.model import ids, server
 from hippodrome.model.matching import MATCH
 from hippodrome.model.messages import KeepWarm, StartServer, StopServer, to_message
-from hippodrome.model.project import LEGACY_PORT, Project
+from hippodrome.model.project import Project
 from hippodrome.model.server import Reason, Server, ServerState
 from hippodrome.model.sessions import lifetime_asked_for
 from hippodrome.ports import Conflict, NoCapacity, Refused, Settings, TaskRequest, Topic
@@ -181,7 +181,7 @@ class Start:
             cpu=project.size.cpu,
             memory=project.size.memory,
             environment=_environment(project, record, self._platform.settings, self._services.secrets.get_or_create()),
-            port=record.port or LEGACY_PORT,
+            port=record.port,
             spot=record.spot,
             nonce=record.nonce,
         )
@@ -197,7 +197,7 @@ class Start:
 
 def _environment(project: Project, record: Server, settings: Settings, secret: Secret) -> dict[str, str]:
     """The environment variables of a trial server (`protocol/environment.py`)."""
-    certificate = location(record.domain, settings.root_domain)
+    certificate = location(record.domain)
     return {
         **_owner_environment(project, record, settings),
         **({environment.MATCHING: MATCH} if project.asks_match else {}),

@@ -22,7 +22,7 @@ from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed,
 
 ROOT_DOMAIN = "example.org"
 DOMAIN = f"servers.{ROOT_DOMAIN}"
-PLACE = certificate.location(DOMAIN, ROOT_DOMAIN)
+PLACE = certificate.location(DOMAIN)
 FULLCHAIN, PRIVKEY, STATE = PLACE
 
 

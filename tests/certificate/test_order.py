@@ -317,7 +317,7 @@ class Nowhere:
     def remove(self, *_): pass
 folder, directory, trusted = sys.argv[1:]
 Renewal(FolderDocuments(Path(folder, "bucket"), Path(folder, "state")), Nowhere(), lambda: datetime.now(UTC),
-    location("servers.example.org", "example.org")).obtain(RenewalRequest("servers.example.org", directory, trusted=trusted))
+    location("servers.example.org")).obtain(RenewalRequest("servers.example.org", directory, trusted=trusted))
 """
     command = [sys.executable, "-c", program, str(tmp_path), place.pebble.directory, place.pebble.trusted]
     ended = subprocess.run(command, check=False, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=60)

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from hippodrome.certificates.rules import ACCOUNT, FORMER, OrderFailed
+from hippodrome.certificates.rules import ACCOUNT, OrderFailed
 from hippodrome.ports import Settings
 from lambdas import installed
 from lambdas.renew_certificate import MARGIN, handler
-from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY, ROOT_DOMAIN
+from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY
 from tests.certificate.pebble import answer_as_route_53
 
 
@@ -78,16 +78,6 @@ def test_the_function_ends_before_lambdas_timeout(function, place):
         function(Context(seconds=MARGIN + 30))
     assert place.state.claim == ""
     assert float(place.state.failures[-1].text) < 30.0
-
-
-def test_after_a_change_of_names_a_new_certificate_comes_from_the_earlier_authority(function, place):
-    """Servers that earlier versions named keep their certificate; that of the new names comes from the same directory."""
-    place.renewal(at=FORMER).obtain(place.wish(domain=ROOT_DOMAIN))
-    former = [place.read(key) for key in FORMER]
-    assert function()["certificate"] == "ordered"
-    assert place.state.names == (f"*.{DOMAIN}",)
-    assert [place.read(key) for key in FORMER] == former
-    assert function()["certificate"] == "fresh"
 
 
 def test_a_certificate_that_was_put_there_by_hand_is_not_renewed(function, place, tmp_path):

@@ -115,7 +115,7 @@ class RunningInstallation(Installed):
         self.authority = made.certificate
         certificate, key = made.issue(f"*.{self.root_domain}", f"*.servers.{self.root_domain}")
         SecretCache(self.platform.documents).get_or_create()  # there is one once a server has started
-        files = location(self.platform.settings.servers_domain, self.root_domain)
+        files = location(self.platform.settings.servers_domain)
         self.put(files.fullchain, certificate)
         self.put(files.privkey, key)
         self._site = _site(self, Path(self._temporary), certificate + key)

@@ -265,7 +265,7 @@ def test_the_sweep_removes_our_leftovers_and_nothing_of_others(study: StudyOnMot
     before = zone(world)
 
     leftover = ids.server_name(ids.server_label(PROJECT, alice.user), 1)
-    add_name(world, f"{leftover}.example.org", "203.0.113.66")
+    add_name(world, f"{leftover}.servers.example.org", "203.0.113.66")
     lost = run(world, leftover)
     world.platform.timers.set(leftover, datetime.now(UTC) + timedelta(hours=1), {"projectId": PROJECT})
 

@@ -108,7 +108,7 @@ async def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_c
 
 def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_client):
     record = town.start()
-    files = location(record.domain, town.settings.root_domain)
+    files = location(record.domain)
     chain, private = certificate(7)
     with town.lock:
         town.documents.put(files.fullchain, chain)

@@ -41,7 +41,7 @@ class Standing:
 
     @property
     def players(self) -> int:
-        """How many participants the session is for; 0 without a session, and in documents of earlier versions."""
+        """How many participants the session is for; 0 without a session."""
         return self.found.players if isinstance(self.found, Membership | NoServerYet) else 0
 
     @property
@@ -121,7 +121,7 @@ class SharedGame:
             return state
         if standing.is_unmatched:
             state["state"] = UNMATCHED
-        return state | {"session": True, "players": standing.players or project.players, "members": found.members}
+        return state | {"session": True, "players": standing.players, "members": found.members}
 
     def _standing(self, project: Project, found: LobbyState | NoServerYet | Membership) -> Standing:
         if isinstance(found, NoServerYet):

@@ -22,7 +22,7 @@ from tests.deploy.certificates import chain
 from tests.deploy.lifecycle.test_destroy import TAG, buckets, make_bucket
 from tests.deploy.stack_world import DOMAIN, REGION, World
 
-FULLCHAIN, PRIVKEY, STATE = location(f"servers.{DOMAIN}", DOMAIN)
+FULLCHAIN, PRIVKEY, STATE = location(f"servers.{DOMAIN}")
 
 
 class Authority:

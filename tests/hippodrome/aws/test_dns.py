@@ -17,7 +17,7 @@ from testing.moto_world import MotoWorld
 
 def _record(n: int, host: str | None = None) -> DnsRecord:
     name = ids.server_name(ids.server_label("study", f"P{n}"), 1)
-    return DnsRecord(f"{name}.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
+    return DnsRecord(f"{name}.servers.example.org", host or f"203.0.{n // 250}.{n % 250 + 1}")
 
 
 RECORDS = [_record(n) for n in range(4)]
@@ -219,10 +219,10 @@ def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
     others = [
         ("www.example.org", "A", ["203.0.113.1"]),
         ("example.org", "A", ["203.0.113.1"]),
-        (f"{label}.deeper.example.org", "A", ["203.0.113.1"]),
-        (f"_acme.{label}.example.org", "TXT", ['"x"']),
-        (f"{label[:-1]}2.example.org", "A", ["203.0.113.1", "203.0.113.2"]),
-        (f"{label[:-1]}3.example.org", "AAAA", ["2001:db8::1"]),
+        (f"{label}.deeper.servers.example.org", "A", ["203.0.113.1"]),
+        (f"_acme.{label}.servers.example.org", "TXT", ['"x"']),
+        (f"{label[:-1]}2.servers.example.org", "A", ["203.0.113.1", "203.0.113.2"]),
+        (f"{label[:-1]}3.servers.example.org", "AAAA", ["2001:db8::1"]),
         ("*.example.org", "A", ["203.0.113.1"]),
     ]
     changes = [
@@ -244,12 +244,15 @@ def test_only_servers_names_are_listed(moto_world: MotoWorld) -> None:
     assert list(moto_world.platform.dns.list()) == RECORDS[:1]
 
 
-def test_servers_are_listed_at_the_present_level_of_names_and_at_that_of_earlier_versions(
-    moto_world: MotoWorld,
-) -> None:
+def test_only_names_directly_below_the_servers_domain_are_listed(moto_world: MotoWorld) -> None:
     label = "s" + "a" * 20
-    ours = [f"{label}-1.servers.example.org", f"{label}-2.example.org"]
-    others = [f"{label}-3.other.example.org", f"{label}-4.a.servers.example.org", "alice.servers.example.org"]
+    ours = [f"{label}-1.servers.example.org", f"{label}-2.servers.example.org"]
+    others = [
+        f"{label}-2.example.org",
+        f"{label}-3.other.example.org",
+        f"{label}-4.a.servers.example.org",
+        "alice.servers.example.org",
+    ]
     names = moto_world.platform.dns
     names.change(add=[DnsRecord(name, "203.0.113.9") for name in (*ours, *others)])
     assert sorted(record.name for record in names.list()) == sorted(ours)

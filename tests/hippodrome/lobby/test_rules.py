@@ -447,15 +447,6 @@ def test_fields_that_the_document_leaves_out_have_defaults() -> None:
     )
 
 
-def test_a_document_of_an_earlier_version_has_no_number_of_players_and_no_code() -> None:
-    when = '"2026-03-04T12:00:00Z"'
-    told = f"""{{"open": [{{"id": "o", "requested": {when}}}], "formed": [{{"id": "f", "members": [], "at": {when}}}],
-        "proposed": [{{"id": "p", "labels": [], "at": {when}}}], "unmatched": [{{"label": "a", "userId": "A", "at": {when}}}]}}"""
-    found = from_json(told.encode(), Decisions)
-    assert [each.players for each in (*found.open, *found.proposed, *found.formed)] == [0, 0, 0]
-    assert (found.unmatched[0].completion_code, found.unmatched[0].waited) == ("", None)
-
-
 def test_the_key_of_the_document() -> None:
     assert decisions.key("maze") == "_lobbies/maze.json"
 

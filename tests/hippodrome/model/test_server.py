@@ -118,8 +118,6 @@ def test_only_a_participants_own_server_lacks_a_step_that_was_registered_after_i
     own, of_session = new_record(), new_record(ids.new_session_id(), players=2)
     assert [own.lacks(step) for step in ("3", "4")] == [False, True]
     assert [of_session.lacks(step) for step in ("3", "4")] == [False, False], "others play on it"
-    of_an_earlier_version = msgspec.structs.replace(own, game_steps=())
-    assert not of_an_earlier_version.lacks("4")
 
 
 def test_a_server_owns_its_dns_record_once_it_has_an_address() -> None:
@@ -159,8 +157,6 @@ def test_a_servers_port_is_that_of_its_task_or_else_the_registered_one() -> None
     told = new_record(server_port=443)
     assert server.naming(told, "task", Address("192.0.2.1"), LATER).port == 443
     assert server.naming(told, "task", Address("192.0.2.1", 40000), LATER).port == 40000
-    of_an_earlier_version = msgspec.structs.replace(told, port=None)
-    assert server.naming(of_an_earlier_version, "task", Address("192.0.2.1"), LATER).port == 5000
 
 
 def test_a_tombstone_is_closed_from_the_beginning() -> None:

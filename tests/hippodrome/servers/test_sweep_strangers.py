@@ -41,7 +41,7 @@ from testing.moto_world import MotoWorld, _InvalidBatch
 from testing.quiet_log import quiet
 from testing.studies import study
 
-DOMAIN = "example.org"
+DOMAIN = "servers.example.org"
 STUDY = study(task_definition="hippodrome")
 THINGS = ("tasks", "names", "timers", "clusters")
 

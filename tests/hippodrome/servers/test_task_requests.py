@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hippodrome.model import ids, server
 from hippodrome.model.messages import StartServer
-from hippodrome.model.project import AwsSetup, Project, Ssl, Step
+from hippodrome.model.project import AwsSetup, Project, Step
 from hippodrome.model.records import from_json
 from hippodrome.model.server import Server
 from hippodrome.ports import TaskRequest
@@ -71,13 +71,6 @@ def certificate_of(request: TaskRequest) -> list[str]:
 def test_a_project_without_its_own_image_runs_the_installations() -> None:
     platform, request, _ = started(study())
     assert request.definition == platform.settings.task_definition
-
-
-def test_a_server_gets_the_installations_certificate_and_no_other() -> None:
-    """No request for another certificate would be signed."""
-    _, request, _ = started(study(ssl=Ssl("mine", "chain", "key")))
-    told = {name: value for name, value in request.environment.items() if name.startswith("SSL_")}
-    assert told == {"SSL_FULLCHAIN": OWN[0], "SSL_PRIVKEY": OWN[1]}
 
 
 def test_a_repeated_request_is_the_same_request() -> None:
