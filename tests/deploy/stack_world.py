@@ -35,6 +35,7 @@ Parameters:
   SiteHost: {Type: String, Default: study}
   AlarmEmail: {Type: String, Default: ""}
   MaxRuntime: {Type: Number, Default: 120}
+  ServersHost: {Type: String, Default: servers}
   VpcId: {Type: String, Default: ""}
   SubnetIds: {Type: String, Default: ""}
   CodeBucket: {Type: String}
@@ -153,6 +154,7 @@ class World:
             "RootDomain": DOMAIN,
             "HostedZoneId": self.zone,
             "SiteHost": "study",
+            "ServersHost": "servers",
             "AlarmEmail": "",
             "MaxRuntime": "120",
             "VpcId": "",

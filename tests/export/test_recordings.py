@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import itertools
 import json
@@ -406,12 +405,6 @@ def test_if_minari_has_no_space_the_run_and_the_dataset_say_that_observations_we
     assert "The observations were recorded, but Minari has no space" in dataset.storage.metadata["description"]
     rows = pyarrow.dataset.dataset(tmp_path / "out/recordings").to_table(columns=["kind", "other"]).to_pylist()
     assert next(json.loads(row["other"])["observation"] for row in rows if row["kind"] == "step") == look(1)
-
-
-def test_an_array_of_another_byte_order_that_was_recorded_by_an_earlier_version_is_read() -> None:
-    data = np.arange(3, dtype=">f4")
-    packed = {"dtype": ">f4", "shape": [3], "zlib": base64.b64encode(zlib.compress(data.tobytes())).decode()}
-    assert recording_columns.unpack_array(packed) == (np.arange(3, dtype=np.float32).tobytes(), "float32", [3])
 
 
 def test_without_observations_a_dataset_holds_step_numbers_and_the_run_says_so(

@@ -154,7 +154,12 @@ def sweeps(world: MotoWorld, study: StudyOnMoto, carol: Person, dave: Person) ->
     """Leftovers of each kind, a server past its deadline, one that lost its task."""
     leftover = ids.server_name(ids.server_label(PROJECT, dave.user), 1)
     world.client("ecs").create_cluster(clusterName=leftover, capacityProviders=["FARGATE"])
-    record = {"Name": f"{leftover}.servers.example.org", "Type": "A", "TTL": 60, "ResourceRecords": [{"Value": "203.0.113.9"}]}
+    record = {
+        "Name": f"{leftover}.servers.example.org",
+        "Type": "A",
+        "TTL": 60,
+        "ResourceRecords": [{"Value": "203.0.113.9"}],
+    }
     world.client("route53").change_resource_record_sets(
         HostedZoneId=world.ids["zone"], ChangeBatch={"Changes": [{"Action": "UPSERT", "ResourceRecordSet": record}]}
     )

@@ -20,7 +20,7 @@ from console.problem import Problem
 from deploy.aws.account import Installation, open_account
 
 OUTPUTS = (
-    "Bucket HostedZoneId RootDomain MaxRuntime Cluster Subnets SecurityGroup StartServerTopic StopServerTopic "
+    "Bucket HostedZoneId RootDomain ServersHost MaxRuntime Cluster Subnets SecurityGroup StartServerTopic StopServerTopic "
     "ScheduleGroup ScheduleRole"
 )
 HANDED_ON = {

@@ -278,15 +278,18 @@ def test_a_domain_that_is_not_delegated_is_a_problem_with_the_name_servers_to_se
 
 @pytest.mark.parametrize("kind", ["CNAME", "NS"])
 def test_a_record_that_hides_the_proof_of_the_servers_domain_is_a_problem(world: World, kind: str) -> None:
-    record(world, f"_acme-challenge.{DOMAIN}", kind, "elsewhere.example.net")
+    record(world, f"_acme-challenge.servers.{DOMAIN}", kind, "elsewhere.example.net")
     found = only(findings(world))
     assert found.mark is Mark.BAD
-    assert f"The zone has a record {kind} of _acme-challenge.{DOMAIN}, so no authority can see the proof" in found.text
+    assert (
+        f"The zone has a record {kind} of _acme-challenge.servers.{DOMAIN}, so no authority can see the proof"
+        in found.text
+    )
 
 
 def test_dns_that_cannot_be_asked_is_a_remark(world: World) -> None:
     world.delegated = Delegation((), "Whether example.org is delegated could not be asked: LifetimeTimeout.", False)
-    world.caa[DOMAIN] = caa.Caa(certain=False)
+    world.caa[f"servers.{DOMAIN}"] = caa.Caa(certain=False)
     domain, authorities = findings(world)
     assert (domain.mark, authorities.mark) == (Mark.LOOK, Mark.LOOK)
 
@@ -349,8 +352,8 @@ EVERY = {"study.lab.example.org", "lab.example.org", "example.org", "org"}
         (["mail.example.org"], {"example.org", "org"}),
         (["a.lab.example.org"], {"lab.example.org", "example.org", "org"}),
         (["a.study.lab.example.org"], EVERY),
-        (["*.lab.example.org"], EVERY),
-        (["*.example.org"], EVERY),
+        (["*.lab.example.org"], {*EVERY, "servers.lab.example.org"}),
+        (["*.example.org"], {*EVERY, "servers.lab.example.org"}),
     ],
 )
 def test_dns_is_not_asked_for_names_that_do_not_exist_yet(

@@ -104,12 +104,12 @@ def test_leftovers_are_removed_but_not_what_may_belong_to_another_installation(w
     platform = world.platform
     for name in (closed, nobody):
         platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))
-        platform.dns.change(add=[DnsRecord(f"{name}.example.org", "203.0.113.9")])
+        platform.dns.change(add=[DnsRecord(f"{name}.servers.example.org", "203.0.113.9")])
         platform.timers.set(name, platform.now(), {})
     platform.dns.change(add=[DnsRecord("www.example.org", "203.0.113.1")])
     assert world.run(capsys, "stop", "--yes").code == Exit.DONE
     assert (running_servers(world), world.timers()) == ([], {})
-    assert set(world.records()) == {f"{nobody}.example.org", "www.example.org"}
+    assert set(world.records()) == {f"{nobody}.servers.example.org", "www.example.org"}
 
 
 def test_another_installations_server_in_a_cluster_of_its_own_is_left_alone(world: Installed, capsys: Any) -> None:
