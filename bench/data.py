@@ -110,7 +110,7 @@ def _recording() -> bytes:
     """Make the lines of a recording, as many and as long as those of the example's game."""
     from trial.recordings import recording
 
-    stamp = {"v": 1, "session": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}
+    stamp = {"v": 1, "server": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}
     lines = [recording.line("header", **stamp, actionSpace=["noop"] * 9, episode=1, seed=5)]
     lines += [recording.line("reset", **stamp, episode=1, seed=5, info={"lives": 3})]
     lines += [

@@ -92,7 +92,7 @@ def convert(
         )
         if not header and done.rows:
             done.problems.append("there is no header")
-        hidden = set() if shown else {"user", "server", "session"}
+        hidden = set() if shown else {"userId", "server"}
         metadata = {
             "schema": SCHEMA,
             "complete": done.complete,

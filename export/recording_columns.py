@@ -21,7 +21,7 @@ GROUP_ROWS = 8_192  # rows written at once
 GROUP_BYTES = 16 * 1024 * 1024  # of observations; with so many, fewer rows are written at once
 _MAX_OBSERVATION = 256 * 1024 * 1024  # the most bytes of an observation
 _DTYPE = re.compile(r"bool|(?:u?int|float)(8|16|32|64)")
-_NOT_STORED = {"kind", "v", "session", "trial", "observation"}
+_NOT_STORED = {"kind", "v", "server", "trial", "observation"}
 
 
 @functools.cache

@@ -100,7 +100,7 @@ def record(
     """Make a recording by the trial's own code, and return its bytes."""
     path = folder / f"{next(_numbers)}.gz"
     made = Recording(path, "unused")
-    stamp = {"v": recording.SCHEMA, "session": server(user, attempt), "trial": "t-1"}
+    stamp = {"v": recording.SCHEMA, "server": server(user, attempt), "trial": "t-1"}
     clock: Iterator[int] = itertools.count(1)
     look = picture or (lambda number: np.array([number % 256, 7], np.uint8))
 
@@ -109,7 +109,7 @@ def record(
         made.add(recording.line(kind, **stamp, time=f"2026-11-21T14:46:40.{number:06d}Z", ns=number, **fields))
 
     line(
-        "header", project=PROJECT.id, user=user, server=server(user, attempt), step=step, game="grid",
+        "header", project=PROJECT.id, userId=user, step=step, game="grid",
         actionSpace=["noop", "up", "down"], frameRate=30, episode=1, seed=5, versions=recording.versions(),
         **head,
     )  # fmt: skip

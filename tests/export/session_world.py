@@ -65,7 +65,7 @@ def lines(
     In the steps of `replaced` the substitute has played in the place of the right player.
     """
     clock = itertools.count(1)
-    stamp = {"v": recording.SCHEMA, "session": server(session_id, attempt), "trial": "t-1"}
+    stamp = {"v": recording.SCHEMA, "server": server(session_id, attempt), "trial": "t-1"}
     people = dict(zip(PLAYERS, members, strict=False))
     made: list[bytes] = []
 
@@ -74,7 +74,7 @@ def lines(
         made.append(recording.line(kind, **stamp, time=f"2026-11-21T14:46:40.{n:06d}Z", ns=n, **fields))
 
     line(
-        "header", project=PROJECT.id, sessionId=session_id, group=1, server=server(session_id, attempt), step="3",
+        "header", project=PROJECT.id, session=session_id, group=1, step="3",
         game="grid", actionSpace=["noop", "up", "down"], frameRate=30, actionBufferLifespan=1, episode=1, seed=5,
         players=head or {name: {"kind": "human", "seat": seat} for seat, name in enumerate(PLAYERS)},
         pace="realtime", input="held", frameSkip=1, idleActions=dict.fromkeys(PLAYERS, 0),

@@ -84,8 +84,8 @@ async def test_each_member_has_an_answer_and_the_recording_is_the_sessions(launc
     assert bert["answers"]["score"] == bert["answers"]["scores"]["right"]
     assert anna["answers"]["score"] == anna["answers"]["scores"]["left"]
     (lines,) = recordings(server.store).values()
-    assert (lines[0]["sessionId"], lines[0]["session"], lines[0]["group"]) == (SID, "pair-1", 1)
-    assert "user" not in lines[0]
+    assert (lines[0]["session"], lines[0]["server"], lines[0]["group"]) == (SID, "pair-1", 1)
+    assert "userId" not in lines[0]
 
 
 async def test_recordings_and_log_hold_no_members_id(launch):

@@ -76,14 +76,14 @@ async def test_the_recording_says_what_happened(launch, open_client, grid, tmp_p
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     header, reset, *steps, end = lines
     assert header["kind"] == "header"
-    assert (header["project"], header["user"], header["server"], header["step"]) == ("study", "P1", "a1", "3")
+    assert (header["project"], header["userId"], header["server"], header["step"]) == ("study", "P1", "a1", "3")
     assert header["actionSpace"][3] == "left"
     assert {"trial", "pillow"} <= header["versions"].keys()
     assert reset["kind"] == "reset"
     assert reset["seed"] == header["seed"]
     assert isinstance(reset["info"]["start"], int)
     assert [line["step"] for line in steps] == list(range(1, len(steps) + 1))
-    assert all(line["session"] == "a1" and line["trial"] == header["trial"] and line["v"] == 1 for line in lines)
+    assert all(line["server"] == "a1" and line["trial"] == header["trial"] and line["v"] == 1 for line in lines)
     assert [line["ns"] for line in steps] == sorted(line["ns"] for line in steps)
     left = [line for line in steps if line["actionName"] == "left"]
     assert len(left) >= 5

@@ -163,7 +163,7 @@ async def test_the_participant_plays_and_the_files_are_where_other_servers_store
     assert server.answer()["group"] == 2
     assert server.answer()["answers"]["outcome"] == "stopped"
     (lines,) = server.recordings(server=OWN).values()
-    assert (lines[0]["user"], lines[0]["server"], lines[0]["session"]) == ("P1", OWN, OWN)
+    assert (lines[0]["userId"], lines[0]["server"]) == ("P1", OWN)
     assert len(steps(lines)) == server.answer()["answers"]["frames"]
     assert not (server.store / "study/users/P1/trials" / WARM_SERVER).exists()
     assert not list(server.store.rglob("*.part"))

@@ -43,13 +43,12 @@ class ConnectionRecorder:
             file = Recording(self._folder / key, key)
         except OSError as error:
             raise _not_written(error) from error
-        recorded = Recorded(env, file, {"v": recording.SCHEMA, "session": server, "trial": server})
+        recorded = Recorded(env, file, {"v": recording.SCHEMA, "server": server, "trial": server})
         count, first = environments.count_of(env.action_space), environments.first_number(env.action_space)
         recorded.write(
             "header",
             project=PROJECT,
-            user=self._user,
-            server=server,
+            userId=self._user,
             step=step,
             game=env_id,
             actionSpace=[str(first + at) for at in range(count or 0)],

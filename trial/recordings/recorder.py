@@ -82,7 +82,7 @@ class Recorder:
         """Return the fields with which each line begins. May be called on any thread."""
         return {
             "v": recording.SCHEMA,
-            "session": self._settings.server,
+            "server": self._settings.server,
             "trial": self._trial_id,
             "time": datetime.now(UTC),
             "ns": time.monotonic_ns(),
@@ -107,7 +107,6 @@ class Recorder:
             **self.stamp(),
             project=settings.project_id,
             **_whose(settings),
-            server=settings.server,
             step=self._step,
             game=config.game,
             actionSpace=list(opening.action_space),
@@ -226,7 +225,7 @@ class Recorder:
 
 def _whose(settings: TrialSettings) -> dict[str, Any]:
     """Return the fields that say whose recording it is. The recording of a session contains no participant's id."""
-    return {"sessionId": settings.session, "group": settings.group} if settings.session else {"user": settings.user_id}
+    return {"session": settings.session, "group": settings.group} if settings.session else {"userId": settings.user_id}
 
 
 def rules(config: TrialSection, players: Sequence[Player]) -> dict[str, Any]:
