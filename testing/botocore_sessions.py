@@ -7,7 +7,17 @@ from typing import Any
 import botocore.loaders
 import botocore.session
 
-_descriptions = botocore.loaders.create_loader()
+
+class _Descriptions(botocore.loaders.Loader):  # type: ignore[misc]
+    """The descriptions of services that this process has read."""
+
+    @property
+    def search_paths(self) -> list[str]:
+        """Where descriptions are: botocore's own folder. Each session of boto3 adds one, which would count for all."""
+        return list(super().search_paths)
+
+
+_descriptions = _Descriptions()
 
 
 def botocore_session() -> Any:

@@ -31,7 +31,7 @@ from moto.s3.models import s3_backends
 from moto.sns.models import sns_backends
 
 from deploy.__main__ import main
-from deploy.aws.account import Account, open_account
+from deploy.aws.account import Account
 from hippodrome.model import ids, server, warm_pool
 from hippodrome.model.messages import StartServer, parse_task_changed
 from hippodrome.model.participant import Participant, participant_key
@@ -45,6 +45,7 @@ from protocol.answer import Answer
 from protocol.keys import answer_key
 from testing import processes
 from testing.aws_events import ACCOUNT
+from testing.botocore_sessions import botocore_session
 from testing.moto_world import MotoWorld
 from testing.servers import Servers
 from testing.studies import INSTALLATION_SECRET, study
@@ -302,6 +303,11 @@ def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: 
     return CommandResult(ran.returncode, out, err)
 
 
+def account_here() -> Account:
+    """Open the account of moto, with the credentials of the environment."""
+    return Account(botocore_session(), KEYS["AWS_REGION"])
+
+
 @pytest.fixture
 def access_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put the access keys of an administrator into the environment."""
@@ -312,7 +318,7 @@ def access_keys(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def account(access_keys: None) -> Account:
     """Return the account as the commands open it."""
-    return open_account()
+    return account_here()
 
 
 @pytest.fixture

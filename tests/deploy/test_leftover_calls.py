@@ -8,7 +8,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from deploy.aws.account import find_installation, open_account
+from deploy.aws.account import find_installation
 from deploy.core.stages import Executor
 from deploy.operate.eraser import Eraser
 from deploy.operate.stop import Stopper
@@ -17,7 +17,7 @@ from hippodrome.model.server import Reason
 from hippodrome.servers.sweep import Sweep
 from hippodrome.storage.repository import Repository
 from testing.studies import study
-from tests.deploy.installation import Installed
+from tests.deploy.installation import Installed, account_here
 from tests.deploy.operate.test_stop import start
 
 
@@ -30,7 +30,7 @@ def stop(world: Installed) -> None:
 
 
 def erase(world: Installed) -> None:
-    account = open_account()
+    account = account_here()
     executor = Executor(lambda _: None)
     assert not Eraser(account, find_installation(account), "maze", "alice", late=False, executor=executor).run()
 

@@ -12,7 +12,6 @@ import msgspec
 import pytest
 
 from console.problem import Exit
-from deploy.aws.account import open_account
 from deploy.code.template import Template
 from deploy.cost.billed import billed
 from deploy.cost.cost import _fixed_resources, _study
@@ -31,7 +30,7 @@ from deploy.cost.spent import spent
 from hippodrome.config import read_project
 from hippodrome.model.server import PastAttempt, Reason, Server, ServerState
 from testing.studies import study
-from tests.deploy.installation import ROOT, Installed, environment, process
+from tests.deploy.installation import ROOT, Installed, account_here, environment, process
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 MAZE = StudyToEstimate(participants=100, steps=5, cpu=1, memory=2, max_runtime=30, minutes=15)
@@ -482,7 +481,7 @@ def test_bills_of_many_pages_are_added_up(installed: Installed, monkeypatch: Any
         "ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": [ecs]}, {"Groups": [ecs]}], "NextPageToken": "more"}
     )
     installed.answer("ce:GetCostAndUsage", {"ResultsByTime": [{"Groups": [ecs]}]})
-    found = billed(open_account(), "hippodrome", date(2026, 10, 1), date(2026, 11, 22))
+    found = billed(account_here(), "hippodrome", date(2026, 10, 1), date(2026, 11, 22))
     assert (found.tagged, found.fargate, found.requests) == ({"Amazon Elastic Container Service": 4.5}, None, 2)
 
 

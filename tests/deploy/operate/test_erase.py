@@ -17,7 +17,7 @@ import pytest
 
 from console.problem import Exit
 from deploy.aws import versions as versioned
-from deploy.aws.account import find_installation, open_account
+from deploy.aws.account import find_installation
 from deploy.aws.versions import Version, VersionedBucket
 from deploy.core import stages
 from deploy.core.stages import Executor
@@ -33,7 +33,7 @@ from hippodrome.storage.repository import Repository
 from testing import template as cfn
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import CommandResult, Installed
+from tests.deploy.installation import CommandResult, Installed, account_here
 from tests.test_docs import code
 
 STUDY = msgspec.structs.replace(study(), task_definition="hippodrome")
@@ -326,7 +326,7 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
 def eraser(
     world: Installed, clock: Callable[[], float] = monotonic, sleep: Callable[[float], None] | None = None
 ) -> Eraser:
-    account = open_account()
+    account = account_here()
     return Eraser(account, find_installation(account), "maze", ANN, executor=Executor(sleep, clock))
 
 

@@ -16,7 +16,7 @@ import pytest
 from botocore.client import BaseClient
 
 from console.problem import Exit
-from deploy.aws.account import find_installation, open_account
+from deploy.aws.account import find_installation
 from deploy.core import stages
 from deploy.core.stages import Executor
 from deploy.operate.eraser import SIGNING, Eraser
@@ -34,7 +34,7 @@ from protocol.session import parse
 from testing.exploration import sample
 from testing.servers import Servers
 from testing.studies import study
-from tests.deploy.installation import CommandResult, Installed
+from tests.deploy.installation import CommandResult, Installed, account_here
 from tests.export.session_world import (
     ANN,
     BOB,
@@ -106,7 +106,7 @@ def start(world: Installed, session_id: str = SID) -> str:
 
 
 def eraser(world: Installed, user: str = ANN, **how: Any) -> Eraser:
-    account = open_account()
+    account = account_here()
     return Eraser(account, find_installation(account), "maze", user, **how)
 
 

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from console.problem import Exit
-from deploy.aws.account import find_installation, open_account
+from deploy.aws.account import find_installation
 from deploy.core.participants import registered_projects
 from deploy.operate.doctor.play import play as whole
 from deploy.operate.doctor.play import upkeep, walk
@@ -39,7 +39,7 @@ from testing.moto_world import MotoWorld
 from testing.simulation import conditions, tasks
 from testing.studies import study
 from testing.waiting import until
-from tests.deploy.installation import ROOT, CommandResult
+from tests.deploy.installation import ROOT, CommandResult, account_here
 from tests.deploy.running_installation import RunningInstallation, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
 from tests.trial.two_players import two_players
@@ -202,7 +202,7 @@ def test_ctrl_c_during_the_rehearsal_removes_everything(
 
 
 def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInstallation, capsys: Any) -> None:
-    account = open_account()
+    account = account_here()
     installation = find_installation(account)
     platform = account.platform(installation)
     copy = Copy(account, installation, platform)
@@ -218,7 +218,7 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInst
 
 
 def test_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
-    account = open_account()
+    account = account_here()
     installation = find_installation(account)
     platform = account.platform(installation)
     copy = Copy(account, installation, platform)

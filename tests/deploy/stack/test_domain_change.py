@@ -9,14 +9,14 @@ import pytest
 from moto.route53.models import HostedZoneIdentifier
 
 from console.problem import Problem
-from deploy.aws.account import Account, open_account
+from deploy.aws.account import Account
 from deploy.core.finding import Mark
 from deploy.lifecycle import preflight
 from deploy.stack import domain_change
 from deploy.stack.changes import Prepared
 from deploy.stack.stack import Stack
 from hippodrome.model.server import ServerState
-from tests.deploy.installation import Installed
+from tests.deploy.installation import Installed, account_here
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def prepared(world: Installed, account: Account | None = None, **changed: str) -
         **{"StackName": "hippodrome", "StackStatus": "UPDATE_COMPLETE"},
         **{"Outputs": outputs, "Parameters": parameters},
     }
-    account = account or open_account()
+    account = account or account_here()
     nothing: Any = None
     wanted = {**stands, "ServersHost": "servers", **changed}
     return Prepared(account, Stack(account, "hippodrome"), found, nothing, (), wanted, nothing)

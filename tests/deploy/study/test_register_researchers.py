@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 
 from console.problem import Exit
-from deploy.aws.account import find_installation, open_account
+from deploy.aws.account import find_installation
 from deploy.study import register
 from testing.aws_events import ACCOUNT
 from testing.iam.actions import Ask
 from testing.iam.enforcement import account_of
 from testing.iam.judge import Judge, evaluator
+from tests.deploy.installation import account_here
 from tests.deploy.registering import CONFIG, RegisterWorld, write_study
 
 Capsys = pytest.CaptureFixture[str]
@@ -26,16 +27,14 @@ Capsys = pytest.CaptureFixture[str]
 
 def _together(register_world: RegisterWorld, *folders: Path) -> list[dict[str, Any] | BaseException]:
     """Register these folders at the same moment."""
-    account = open_account(region="us-east-1")
+    account = account_here()
     installation = find_installation(account)
     gate, results = threading.Barrier(len(folders)), [None] * len(folders)
 
     def work(index: int, folder: Path) -> None:
         gate.wait()
         try:
-            results[index] = register.register(
-                open_account(region="us-east-1"), installation, folder, register.RegisterRequest()
-            )
+            results[index] = register.register(account_here(), installation, folder, register.RegisterRequest())
         except BaseException as error:  # noqa: BLE001 - whatever it was, it is looked at
             results[index] = error
 
