@@ -24,10 +24,6 @@ class Clock:
         """Return the date and time, as a platform's `now` does."""
         return self._began + timedelta(seconds=self.seconds)
 
-    def seconds_at(self, moment: datetime) -> float:
-        """Return the seconds from the beginning to this moment."""
-        return (moment - self._began).total_seconds()
-
     def after(self, seconds: float, act: Callable[[], object]) -> None:
         """Call `act` when that many seconds have passed."""
         heapq.heappush(self._due, (self.seconds + max(seconds, 0.0), next(self._numbers), act))

@@ -71,7 +71,7 @@ class WarmServers(NamedTuple):
 
     ready: int
     there: int
-    taken_today: int
+    assigned_today: int
 
 
 class ServerFailure(NamedTuple):

@@ -170,7 +170,7 @@ def as_data(look: Snapshot, installation: Installation, bill: Billed | None = No
 def _warm(look: Snapshot, project: Project) -> Mapping[str, int]:
     found = look.warm(project.id)
     wanted = project.warm_servers if project.live else 0
-    return {"wanted": wanted, "ready": found.ready, "there": found.there, "takenToday": found.taken_today}
+    return {"wanted": wanted, "ready": found.ready, "there": found.there, "assignedToday": found.assigned_today}
 
 
 def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
@@ -296,7 +296,8 @@ def _warm_lines(look: Snapshot) -> list[RenderableType]:
         warm = _warm(look, project)
         if warm["wanted"]:
             text = f"{project.id}: {warm['ready']} of {warm['wanted']} warm servers ready"
-            lines.append(Text(text + (f"; {warm['takenToday']:,} taken today." if warm["takenToday"] else ".")))
+            assigned = f"; {warm['assignedToday']:,} assigned today." if warm["assignedToday"] else "."
+            lines.append(Text(text + assigned))
         elif warm["there"]:
             lines.append(Text(f"{project.id}: {count(warm['there'], 'warm server')} on the way out."))
     return lines

@@ -183,7 +183,7 @@ class SimulatedWorld:
             "tasks": sum(task.last is not Life.STOPPED for task in self.platform.tasks.tasks.values()),
             "names": len(self.platform.dns.records) - len(self.platform.dns.strangers),
             "timers": len(self.platform.timers.due),
-            "places": sum(
+            "slots": sum(
                 len(json.loads(kept[key][0]).get("slots", ())) for key in kept if key.startswith(SERVER_SLOTS)
             ),
             "waiting": sum(

@@ -318,27 +318,3 @@ def test_only_events_of_our_tasks_reach_the_queue(payload: str) -> None:
     ours, own = detail["clusterArn"]
     assert ours.endswith(":cluster/hippodrome")
     assert own["prefix"].endswith(":cluster/s")
-
-
-@pytest.mark.parametrize(
-    ("writer", "document"),
-    [("StartServer", "_servers/"), ("UpdateProjectMasterList", "project_master_list.json")],
-)
-def test_writers_of_new_documents_are_updated_after_their_readers(writer: str, document: str) -> None:
-    """CloudFormation updates a resource after those that it depends on."""
-    readers = {
-        name
-        for name, function in cfn.resources("AWS::Lambda::Function").items()
-        for policy in cfn.role_documents(function["Role"]["Fn::GetAtt"][0])
-        for statement in policy["Statement"]
-        if "s3:GetObject" in statement["Action"] and document in json.dumps(statement["Resource"])
-    }
-    assert len(readers) >= 7
-    assert readers - {writer} <= waits_for(writer)
-
-
-def waits_for(name: str) -> set[str]:
-    """Return the resources that CloudFormation makes and updates before this one because it says so."""
-    found = cfn.template()["Resources"][name].get("DependsOn", [])
-    before = {found} if isinstance(found, str) else set(found)
-    return before.union(*map(waits_for, before))

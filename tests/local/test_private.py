@@ -43,7 +43,7 @@ def test_only_the_owner_may_read_the_files_of_a_study(local: Make) -> None:
     assert open_to_others(here.data, here.state.parent) == []
 
 
-def test_open_folders_of_an_earlier_version_are_closed_or_reported(local: Make) -> None:
+def test_folders_that_others_can_read_are_closed_or_reported(local: Make) -> None:
     here = local()
     here.state.mkdir(parents=True)
     here.data.mkdir()

@@ -156,7 +156,7 @@ class World:
         if not ids.is_warm_id(user_id):
             return user_id
         label = ids.server_label(self.project.id, user_id)
-        return self._labels.setdefault(label, f"spare{len(self._labels)}")
+        return self._labels.setdefault(label, f"warm{len(self._labels)}")
 
     # State
 
@@ -206,7 +206,7 @@ class World:
             "names": [self.who(name) for name in account.zone.records if name not in self.strangers["names"]],
             "timers": [self.who(name) for name in account.due if name not in self.strangers["timers"]],
             "clusters": [self.who(n) for n in account.fleet.own_clusters if n not in self.strangers["clusters"]],
-            "places": [
+            "slots": [
                 self.who(label)
                 for key in account.kept
                 if key.startswith("_slots/")

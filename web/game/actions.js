@@ -5,7 +5,7 @@ import { game } from "./state.js";
 
 const held = new Map(); // action -> the set of keys and fingers that hold it down
 
-export const isRunning = () => game.state === "playing" || game.state === "break";
+const isRunning = () => game.state === "playing" || game.state === "break";
 
 export function press(action, source) {
   if (game.state === "elsewhere") return;

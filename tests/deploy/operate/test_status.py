@@ -166,14 +166,14 @@ def test_warm_servers_are_counted_separately_and_not_as_participants(world: Inst
     world.record("alice", warm_server_name="s" + "a" * 20 + "-1")
     found = look(world, capsys)
     maze, old = found["projects"]
-    assert maze["warmServers"] == {"wanted": 4, "ready": 3, "there": 4, "takenToday": 1}
-    assert old["warmServers"] == {"wanted": 0, "ready": 0, "there": 0, "takenToday": 0}
+    assert maze["warmServers"] == {"wanted": 4, "ready": 3, "there": 4, "assignedToday": 1}
+    assert old["warmServers"] == {"wanted": 0, "ready": 0, "there": 0, "assignedToday": 0}
     assert maze["participants"] == 0
     assert found["servers"]["byState"] == {"ready": 4, "starting": 1}
     assert sorted(server["warm"] for server in found["servers"]["open"]) == [False, True, True, True, True]
     assert found["servers"]["closedToday"] == {}  # a participant plays on it
     text = world.run(capsys, "status").out
-    assert "maze: 3 of 4 warm servers ready; 1 taken today." in text
+    assert "maze: 3 of 4 warm servers ready; 1 assigned today." in text
     assert "4 ready, 1 starting, 4 of them warm" in text
     assert text.count("Spot, warm") == 4
     assert "~" not in text
