@@ -282,8 +282,7 @@ def _tell(made: dict[str, Any], target: Path) -> None:
     screen.success(
         f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {target}/"
     )
-    if made["minari"]:
-        datasets = ", ".join(dataset["id"] for dataset in made["minari"])
+    if datasets := ", ".join(dataset["id"] for dataset in made["minari"] if dataset["episodes"]):
         screen.info(f"  MINARI_DATASETS_PATH={target.resolve() / 'minari'} {datasets}")
     if made["identities"] == "apart":
         screen.info(f"  Who is who: {target / 'private/identities.csv'}. Share everything but private/.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import ipaddress
 import sys
 from collections.abc import Sequence
@@ -70,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             record=given["record"],
         )
     except (OSError, UnicodeError) as error:
-        print(f"Cannot listen at {host}:{given['port']}: {unusable(error)}.", file=sys.stderr)
+        hint = " Take another port: --port 5001." if getattr(error, "errno", None) == errno.EADDRINUSE else ""
+        print(f"Cannot listen at {host}:{given['port']}: {unusable(error)}.{hint}", file=sys.stderr)
         return 1
     if status == 0:
         where = f" Recordings are in {given['record']}." if given["record"] else ""

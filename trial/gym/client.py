@@ -125,7 +125,10 @@ def _is_this_machine(host: str) -> bool:
 
 def _trusting(ca: str) -> ssl.SSLContext:
     context = ssl.create_default_context()
-    context.load_verify_locations(ca)
+    try:
+        context.load_verify_locations(ca)
+    except OSError as error:
+        raise ValueError(f"{ca} cannot be read as certificates: {error.strerror}") from error
     return context
 
 
@@ -142,4 +145,6 @@ def _reason(error: BaseException) -> str:
         return "the address must begin with ws:// or wss://"
     if isinstance(error, TimeoutError):
         return "it took too long"
+    if isinstance(error, ConnectionRefusedError):
+        return "no server listens there (`make gym` starts one)"
     return str(error).rstrip(".") or type(error).__name__

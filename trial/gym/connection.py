@@ -191,7 +191,7 @@ def _answer_requests(websocket: BlockingWebSocket, session: GymSession, limits: 
             reply = session.answer(message)
             signal.setitimer(signal.ITIMER_REAL, 0)
             if isinstance(reply, GymError):
-                websocket.close(reply.code, reply.close_reason)
+                websocket.close(reply.code, str(reply))
                 return
             websocket.send(reply)
             seconds = limits.idle_seconds

@@ -1,7 +1,8 @@
 """The errors of requests, with the names and sentences that Gymie 0.5.4 has for them.
 
 Gymie's server closes the connection with a code and the sentence (gymie/server.py, `message_handle`): 1003 if the
-message cannot be read, 1007 for every other error. Its client gives them to the program as an exception.
+message cannot be read, 1007 for every other error. Its client gives them to the program as an exception. Here the
+reason follows the sentence.
 """
 
 from __future__ import annotations
@@ -22,11 +23,6 @@ class GymError(Exception):
     def brief(self) -> str:
         """Return Gymie's sentence for the error, without the reason."""
         return short(str(self.args[0]) if self.args else type(self).__name__, _LONGEST)
-
-    @property
-    def close_reason(self) -> str:
-        """Return what a client of Gymie's is told."""
-        return self.brief
 
 
 class InvalidMessage(GymError):
@@ -63,11 +59,6 @@ class EnvironmentMalformed(_Named):
     """The environment's id is wrong, or the environment cannot be made."""
 
     sentence = "Environment `{}` is malformed"
-
-    @property
-    def close_reason(self) -> str:
-        """Return Gymie's sentence and the reason: Gymie calls an environment malformed also if a package is missing."""
-        return str(self)
 
 
 class InstanceNotFound(_Named):

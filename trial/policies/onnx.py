@@ -129,7 +129,8 @@ class OnnxPolicy:
             size = "one number" if row.size == 1 else f"{row.size} numbers"
             action_output = self._ports.action if self._ports else ""
             raise PolicyError(
-                f"{self._spec} returns {size} as {action_output!r}; expected {self._count}, one for each action"
+                f"{self._spec} returns {size} as {action_output!r}; expected {self._count}, one for each action, "
+                f"as its first output; export it so, or {_INSTEAD}"
             )
         values = row.astype(np.float64)
         if np.isnan(values).any():

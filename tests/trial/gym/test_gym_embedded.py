@@ -132,7 +132,8 @@ def test_a_port_that_is_taken_is_reported(program: GymServerProcess) -> None:
         cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 1
-    assert done.stderr == f"Cannot listen at 127.0.0.1:{program.port}: Address already in use.\n"
+    said = f"Cannot listen at 127.0.0.1:{program.port}: Address already in use. Take another port: --port 5001.\n"
+    assert done.stderr == said
 
 
 @pytest.mark.parametrize(

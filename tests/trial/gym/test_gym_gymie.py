@@ -138,7 +138,9 @@ def test_an_error_closes_with_gymies_code_and_sentence(
     client: TextClient, message: str, code: int, sentence: str
 ) -> None:
     """gymie/tests/test_gymie.py, `test_message_handle`."""
-    assert close_reason(client, message) == (code, sentence)
+    closed_with, reason = close_reason(client, message)
+    assert closed_with == code
+    assert reason.startswith(sentence)
 
 
 def test_the_close_names_the_package_that_an_environment_lacks(client: TextClient) -> None:
@@ -151,11 +153,18 @@ def test_the_close_names_the_package_that_an_environment_lacks(client: TextClien
     )
 
 
-def test_a_wrong_action_closes_with_gymies_sentence(client: TextClient) -> None:
+def test_a_step_before_the_first_reset_closes_with_the_reason(client: TextClient) -> None:
+    step = json.dumps({"method": "step", "params": {"instance_id": client.make("CartPole-v1"), "action": 1}})
+    code, sentence = close_reason(client, step)
+    assert code == 1007
+    assert sentence.startswith("Action `1` is wrong: ResetNeeded: ")
+
+
+def test_a_wrong_action_closes_with_gymies_sentence_and_the_reason(client: TextClient) -> None:
     made = client.make("CartPole-v1")
     client.ask("reset", instance_id=made)
     step = json.dumps({"method": "step", "params": {"instance_id": made, "action": -123}})
-    assert close_reason(client, step) == (1007, "Action `-123` is wrong")
+    assert close_reason(client, step) == (1007, "Action `-123` is wrong: The action is not in Discrete(2).")
 
 
 def test_after_close_the_environment_is_gone(client: TextClient) -> None:

@@ -51,6 +51,28 @@ def test_recorded_episodes_load_in_minari(tmp_path: Path, monkeypatch: pytest.Mo
     assert episode.terminations.tolist() == [False] * (length - 1) + [True]
 
 
+def test_an_environment_without_whole_numbers_as_actions_is_not_named_as_a_dataset(tmp_path: Path, capsys: Any) -> None:
+    with gym_server("--record", str(tmp_path / "data")) as server, TextClient(server.url + "?form=gymnasium") as client:
+        made = client.make("Pendulum-v1", seed=5)
+        client.ask("reset", instance_id=made)
+        client.ask("step_many", instance_id=made, actions=[[0.5]] * 200)
+        client.ask("close", instance_id=made)
+    command = [
+        "data",
+        str(tmp_path / "out"),
+        "--project",
+        "gym",
+        "--from",
+        str(tmp_path / "data"),
+        "--format",
+        "minari",
+    ]
+    assert main(command) == Exit.DONE
+    said = capsys.readouterr().err
+    assert "gym-Pendulum-v1-v0: 1 episodes were left out" in said
+    assert "MINARI_DATASETS_PATH" not in said
+
+
 def test_the_command_of_the_documentation_converts_the_recordings() -> None:
     (command,) = re.findall(r"^make data .*$", (ROOT / "docs/gym.md").read_text(), re.M)
     done = subprocess.run([*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, text=True, check=True)

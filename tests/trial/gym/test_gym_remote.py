@@ -324,8 +324,15 @@ def test_the_end_of_the_server_gets_a_sentence() -> None:
 def test_a_missing_server_gets_a_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
-    with pytest.raises(ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}"):
+    with pytest.raises(
+        ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}/: no server listens .*`make gym`"
+    ):
         RemoteEnv(f"ws://127.0.0.1:{port}/", "CartPole-v1")
+
+
+def test_a_missing_file_of_certificates_is_named() -> None:
+    with pytest.raises(ConnectionLost, match=r"absent\.pem cannot be read as certificates: No such file"):
+        RemoteEnv("wss://127.0.0.1:1/", "CartPole-v1", ca="absent.pem")
 
 
 def test_a_proxy_is_not_asked_for_this_machine(url: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -368,7 +368,10 @@ def test_an_observation_without_numbers_gets_a_sentence(tmp_path: Path) -> None:
 
 def test_a_file_for_another_number_of_actions_is_refused(tmp_path: Path) -> None:
     onnx_files.linear(tmp_path / "p.onnx", WEIGHTS)
-    assert refusal("p.onnx", tmp_path, 6) == "p.onnx returns 3 numbers as 'output'; expected 6, one for each action"
+    assert refusal("p.onnx", tmp_path, 6) == (
+        "p.onnx returns 3 numbers as 'output'; expected 6, one for each action, as its first output; export it so, or "
+        "write a class with act() in agent.py that runs the file"
+    )
 
 
 def test_an_action_that_does_not_exist_is_refused(tmp_path: Path) -> None:
