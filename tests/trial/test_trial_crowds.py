@@ -9,7 +9,7 @@ import struct
 from pathlib import Path
 
 from tests.trial.test_trial_tls import KEYS, put
-from trial.server.listener import MAX_UNAUTHENTICATED_WEBSOCKETS
+from trial.server.listener import MAX_UNAUTHENTICATED_WEBSOCKETS, PINGS_A_SECOND
 
 SILENT = b""
 SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # the rest is never sent
@@ -171,6 +171,12 @@ async def test_a_flood_of_pings_or_tiny_fragments_ends_the_connection(launch, op
     assert memory(server) - before < 50_000_000
     await connect_and_play(server, open_client)
     assert "Traceback" not in server.log_text()
+
+
+async def test_a_client_that_sends_hundreds_of_pings_is_cut_off(launch):
+    server = launch()
+    code, _ = send_frames(server.port, masked(9, b"") * 10 * PINGS_A_SECOND)
+    assert code is None
 
 
 async def test_a_stranger_with_endless_headers_is_cut_off(launch, open_client):

@@ -6,9 +6,12 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 from functools import partial
+from typing import Any
 
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.frames import Frame, Opcode
+from websockets.protocol import Event
 from websockets.typing import Subprotocol
 
 from trial.recordings.store import Store
@@ -16,11 +19,14 @@ from trial.server.certificate import RELOAD_SECONDS, Certificate
 from trial.server.handshake import process_request, select_subprotocol
 from trial.settings import TrialSettings
 from trial.wire.connection import SUBPROTOCOL
+from trial.wire.inbound import RateLimit
 
 log = logging.getLogger("trial")
 
 MAX_MESSAGE = 4096
 """The most bytes in a client's message."""
+PINGS_A_SECOND = 50
+"""The most pings and pongs that a client may send in a second. Browsers only answer the server's few pings."""
 MAX_UNAUTHENTICATED_WEBSOCKETS = 64
 """The most WebSockets that have not authenticated. One more closes the oldest."""
 CLOSE_SECONDS = 2.0
@@ -29,6 +35,28 @@ CLOSE_SECONDS = 2.0
 
 class PortNotPermitted(Exception):
     """The system does not let this process listen on the port."""
+
+
+class _Connection(ServerConnection):
+    """Cuts off a client that sends too many pings: to answer them would keep the server from the others' game."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._pings = RateLimit(PINGS_A_SECOND)
+
+    def data_received(self, data: bytes) -> None:
+        """Read received bytes in parts, so that of a flood only the first part is read."""
+        for start in range(0, len(data), MAX_MESSAGE):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + MAX_MESSAGE])
+
+    def process_event(self, event: Event) -> None:
+        """Count a ping or pong."""
+        pings = isinstance(event, Frame) and event.opcode in (Opcode.PING, Opcode.PONG)
+        if pings and self._pings.exceeded(self.loop.time()):
+            self.transport.abort()
+        super().process_event(event)
 
 
 class Listener:
@@ -70,6 +98,7 @@ class Listener:
             subprotocols=[Subprotocol(SUBPROTOCOL)],
             select_subprotocol=select_subprotocol,
             process_request=partial(process_request, gym=settings.trial.gym),
+            create_connection=_Connection,
             server_header=None,
             compression=None,
             max_size=MAX_MESSAGE,
