@@ -113,8 +113,15 @@ def requirements(files: Mapping[str, bytes], others: Iterable[str]) -> bytes:
 
 
 def _imports(source: bytes) -> Iterator[str]:
-    """Yield the top-level names of the modules that a module imports."""
-    for node in ast.walk(ast.parse(source)):
+    """Yield the top-level names of the modules that a module imports; none if this Python cannot read it.
+
+    The script has imported what it needs, so such a module is another one of its folder, as for Python 2.
+    """
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError):
+        return
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

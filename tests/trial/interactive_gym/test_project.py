@@ -120,6 +120,13 @@ def test_a_package_that_the_experiment_names_is_not_required_twice(tmp_path: Pat
     assert lines == ["Gymnasium[classic_control]~=1.2", "typing.extensions !=4.0"]
 
 
+def test_a_file_beside_the_experiment_that_python_cannot_read_does_not_matter(tmp_path: Path) -> None:
+    (tmp_path / "old.py").write_text('print "for Python 2"\n')
+    project, _ = project_of(tmp_path, ALONE)
+    assert (project / "requirements.txt").read_text().startswith("gymnasium==")
+    assert (project / "old.py").is_file()
+
+
 def test_a_folder_with_more_than_a_server_should_carry_is_refused(tmp_path: Path) -> None:
     with (tmp_path / "film.bin").open("wb") as film:
         film.truncate(600 * 2**20)
