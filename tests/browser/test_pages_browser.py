@@ -529,7 +529,7 @@ def test_a_lost_connection_is_made_again_where_the_server_is_now(world: World, t
     world.state = {**world.state, "token": "NEW"}
     world.connections[0].socket.close()
     world.connections[0].close()
-    world.wait_for({"userId": "P1", "token": "NEW", "step": "3"})
+    world.wait_for({"userId": "P1", "token": "NEW", "step": "3", "decodes": ["deflate", "jpeg"]})
     tab.wait_for_selector("#overlay-button:visible")
 
 

@@ -215,7 +215,7 @@ def ran(minutes: float, *, spot: bool = False, earlier: tuple[PastAttempt, ...] 
         "user_id": "alice",
         "attempt": 1 + len(earlier),
         "state": ServerState.CLOSED,
-        "token": "",
+        "nonce": "",
         "requested": start,
         "deadline": start + timedelta(hours=1),
         "cluster": "hippodrome",
