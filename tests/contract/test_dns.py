@@ -9,7 +9,7 @@ import pytest
 from hippodrome.ports import Dns, DnsRecord, Platform
 from tests.contract.backends import name
 
-RECORDS = [DnsRecord(f"{name(n)}.example.org", f"203.0.113.{n}") for n in range(1, 5)]
+RECORDS = [DnsRecord(f"{name(n)}.servers.example.org", f"203.0.113.{n}") for n in range(1, 5)]
 
 
 @pytest.fixture

@@ -50,7 +50,7 @@ def test_a_participant_gets_a_warm_server_and_their_recording_has_its_usual_plac
     [recording] = (users / "trials").rglob("*.gz")
     assert recording.parent.name.endswith("-1")
     assert recording.parent.name != waiting
-    assert json.loads(gzip.decompress(recording.read_bytes()).splitlines()[0])["user"] == "P1"
+    assert json.loads(gzip.decompress(recording.read_bytes()).splitlines()[0])["userId"] == "P1"
     assert not list((here.data / "quick" / "handovers").glob("*.json"))
     ready(here, 2)
     wait_for(here, 1)

@@ -293,7 +293,7 @@ def test_the_record_that_names_a_warm_server_is_erased_last(machine: Machine, ow
     machine.put(session_key("maze", SID), session(ANN, "").to_json())
     now, label = datetime.now(UTC), ids.server_label("maze", "~warm")
     name = ids.server_name(label, 1)
-    record = Server("maze", owner, 1, ServerState.CLOSED, "", now, now, "c", warm_server_name=name)
+    record = Server("maze", owner, 1, ServerState.CLOSED, now, now, "c", warm_server_name=name)
     machine.put(server.key(record.label), to_json(record))
     machine.put(server.key(label), to_json(msgspec.structs.replace(record, user_id="~warm", assigned_to=record.label)))
     machine.put(handover_key("maze", name), Handover(owner, None, name).to_json())

@@ -531,7 +531,7 @@ def test_a_game_on_a_warm_server_that_is_killed_can_be_read(here: Here) -> None:
     assert "the process was killed" in stopped["stoppedReason"], "and not that its memory was full"
     [file] = (here.data / PLAYED).iterdir()
     lines = recording.read(file.read_bytes())
-    assert lines[0]["user"] == "P1"
+    assert lines[0]["userId"] == "P1"
     assert [line["kind"] for line in lines].count("step") > 20
     assert not list((here.state / "spool").rglob("*.part"))
 

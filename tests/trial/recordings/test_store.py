@@ -34,7 +34,7 @@ class OpenedStore(NamedTuple):
 def opened(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[OpenedStore]:
     with StrictS3().serving() as bucket:
         project, now = study(id="study"), bucket.now()
-        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, token="t", nonce="n")
+        record = server.new_attempt(project, "P1", 1, settings=bucket.settings, now=now, nonce="n")
         recording = f"{FOLDER}/trials/{record.name}/3-episode-0001.jsonl.gz"
         if request.param == "folder":
             yield OpenedStore(open_store(str(tmp_path)), recording, lambda key: (tmp_path / key).read_bytes())
