@@ -70,7 +70,7 @@ def find_project(source: Source, project_id: str) -> Project | None:
         listed = read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST))
     except FileGone:
         return None
-    except (TooLarge, ValueError, RecursionError):
+    except (TooLarge, ValueError):
         screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
         return None
     found = listed.find(project_id)
@@ -100,7 +100,7 @@ def _registered(source: Source) -> list[str]:
     """Return the ids of the projects that are registered in the source, as far as their list can be read."""
     try:
         return sorted(project.id for project in read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST)).projects)
-    except (FileGone, TooLarge, ValueError, RecursionError):
+    except (FileGone, TooLarge, ValueError):
         return []
 
 

@@ -60,7 +60,7 @@ def _changed(documents: Documents, config: Config) -> str:
     found = documents.get(MASTER_LIST)
     try:
         before = read_list(found.body).find(config.project.id) if found else None
-    except (ValueError, RecursionError):  # the registration below reports a list that cannot be read
+    except ValueError:  # the registration below reports a list that cannot be read
         return ""
     if before is None:
         return ""

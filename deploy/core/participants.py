@@ -48,7 +48,7 @@ def registered_projects(documents: Documents, unread: list[UnreadableEntry] | No
         else:
             unread += listed.unreadable
         return sorted(listed.projects, key=lambda project: project.id)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise Problem(
             f"The list of projects cannot be read: {error}.",
             f"The bucket keeps older versions of {MASTER_LIST}: put the last good one in its place.",

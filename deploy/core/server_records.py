@@ -91,7 +91,7 @@ class Records:
         document = self._documents.get(key)
         try:
             record = from_json(document.body, Server) if document else None
-        except (ValueError, RecursionError):
+        except ValueError:
             return None
         # A record names its server. A record under another server's key does not count.
         return record if record and key == server.key(record.label) else None

@@ -191,7 +191,7 @@ class Eraser:
         document = self._platform.documents.get(key)
         try:
             return from_json(document.body, Server) if document else None
-        except (ValueError, RecursionError):  # no record; the document is deleted like any other
+        except ValueError:  # no record; the document is deleted like any other
             return None
 
     def _is_in_zone(self, record: DnsRecord) -> bool:

@@ -102,7 +102,7 @@ class FolderEraser:
         key = server.key(label)
         try:
             record = from_json((self._folder.root / key).read_bytes(), Server)
-        except (OSError, ValueError, RecursionError):
+        except (OSError, ValueError):
             record = None
         keys = (*keys_of_warm_servers(self.project, warm_servers_of(record)), key)
         return [version for each in keys for version in self._folder.versions_of(each)]
@@ -113,7 +113,7 @@ class FolderEraser:
             body = self._folder.read(version)
             try:
                 held = from_json(body, ParticipantSlots)
-            except (ValueError, RecursionError):
+            except ValueError:
                 continue
             if self._label in held.labels:
                 self._folder.replace(version.key, body, to_json(held.without(self._label)))
@@ -188,7 +188,7 @@ def projects(data: Path) -> list[str]:
         for path in data.iterdir()
         if any((data / folder).is_dir() for folder in (keys.prefix(path.name), sessions_folder(path.name)))
     }
-    with contextlib.suppress(OSError, ValueError, RecursionError):
+    with contextlib.suppress(OSError, ValueError):
         present.update(project.id for project in read_list((data / MASTER_LIST).read_bytes()).projects)
     return sorted(filter(ids.is_project_id, present))
 

@@ -46,7 +46,7 @@ class LobbyEraser:
             return True
         try:
             decided = from_json(body, Decisions)
-        except (ValueError, RecursionError):
+        except ValueError:
             self.unreadable.append(self._decisions)
             return True
         after = decisions.next_version(decided, rules.without(decided, self._label))

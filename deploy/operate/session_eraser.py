@@ -89,7 +89,7 @@ class SessionEraser:
                 if not version.marker:
                     found = memberships.read(self._storage.read(version))
                     return FoundSession(found.session, found.seat, others=True) if found.session else None
-        except (ValueError, RecursionError):
+        except ValueError:
             return None
         return None
 

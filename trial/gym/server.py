@@ -208,9 +208,8 @@ class _Server:
             if status is None:
                 continue
             child = self._children.pop(pid)
-            with contextlib.suppress(
-                OSError
-            ):  # its group; on Linux its other descendants become this process's children
+            # Its group ends here. On Linux its other descendants become this process's children.
+            with contextlib.suppress(OSError):
                 os.killpg(pid, signal.SIGKILL)
             close = child.close
             if close is None and status != 0:

@@ -158,12 +158,12 @@ def _is_readable(documents: Documents, key: str, kind: type[Any]) -> bool:
 
 
 def _can_be_read(documents: Documents, key: str, read: Callable[[bytes], object]) -> bool:
-    """Whether `read`, which raises ValueError or RecursionError, accepts a document, or there is none."""
+    """Whether `read`, which raises ValueError, accepts a document, or there is none."""
     found = documents.get(key)
     try:
         if found:
             read(found.body)
-    except (ValueError, RecursionError):
+    except ValueError:
         return False
     return True
 

@@ -170,7 +170,7 @@ def _lobby_sessions(documents: Documents, project_id: str) -> list[str]:
     found = documents.get(decisions.key(project_id))
     try:
         return sorted(from_json(found.body, Decisions).session_ids()) if found else []
-    except (ValueError, RecursionError):  # the sweep stops servers that no lobby lists
+    except ValueError:  # the sweep stops servers that no lobby lists
         return []
 
 
