@@ -272,20 +272,31 @@ def playing(config: str, agent: str, players: int = 1) -> Iterator[list[Player]]
 # The measures
 
 
+def frames_drawn(name: str, share: float, which: str = "") -> Row:
+    """Return the row of the frames that a page has drawn. `which` says whose page, if there are several."""
+    return row(f"{name}: frames drawn{which}", share, "of those due", at_least=0.99, better="more", decides=PLAYABLE)
+
+
+def key_to_effect(name: str, median: float, detail: dict[str, float] | None = None, which: str = "") -> Row:
+    """Return the row of the milliseconds from a key to its drawn effect."""
+    return row(
+        f"{name}: key to drawn effect, p50{which}",
+        median,
+        "ms",
+        at_most=round(TICK, 1),
+        decides=PLAYABLE,
+        detail=detail,
+    )
+
+
 def example() -> Iterator[Row]:
     """Measure the example's game, Ms. Pac-Man."""
     with playing(EXAMPLE_CONFIG, EXAMPLE) as (player,):
         watched = player.watch()
     name = f"Ms. Pac-Man at {RATE}/s"
-    yield row(f"{name}: frames drawn", watched.share, "of those due", at_least=0.99, better="more", decides=PLAYABLE)
-    yield row(
-        f"{name}: key to drawn effect, p50",
-        statistics.median(watched.waits),
-        "ms",
-        at_most=round(TICK, 1),
-        decides=PLAYABLE,
-        detail={"p95": statistics.quantiles(watched.waits, n=20)[-1], "presses": len(watched.waits)},
-    )
+    p95 = statistics.quantiles(watched.waits, n=20)[-1]
+    yield frames_drawn(name, watched.share)
+    yield key_to_effect(name, statistics.median(watched.waits), {"p95": p95, "presses": len(watched.waits)})
     yield row(
         f"{name}: bytes of a frame",
         watched.bytes_a_frame,
@@ -313,14 +324,8 @@ def texture() -> Iterator[Row]:
     with playing(TEXTURE_CONFIG, TEXTURE) as (player,):
         watched = player.watch()
     name = f"scrolling texture of 600 x 400 at {RATE}/s"
-    yield row(f"{name}: frames drawn", watched.share, "of those due", at_least=0.99, better="more", decides=PLAYABLE)
-    yield row(
-        f"{name}: key to drawn effect, p50",
-        statistics.median(watched.waits),
-        "ms",
-        at_most=round(TICK, 1),
-        decides=PLAYABLE,
-    )
+    yield frames_drawn(name, watched.share)
+    yield key_to_effect(name, statistics.median(watched.waits))
     yield row(
         f"{name}: bytes of a frame", watched.bytes_a_frame, "bytes", decides="what a 3D environment asks of a network"
     )
@@ -345,18 +350,8 @@ def two_players() -> Iterator[Row]:
     """Measure two participants of one game."""
     with playing(PAIR_CONFIG, PAIR, 2) as players:
         watched = [player.watch() for player in players]
-    yield row(
-        f"two players at {RATE}/s: frames drawn, the one who sees less",
-        min(view.share for view in watched),
-        "of those due",
-        at_least=0.99,
-        better="more",
-        decides=PLAYABLE,
-    )
-    yield row(
-        f"two players at {RATE}/s: key to drawn effect, p50, the one who waits longer",
-        max(statistics.median(view.waits) for view in watched),
-        "ms",
-        at_most=round(TICK, 1),
-        decides=PLAYABLE,
+    name = f"two players at {RATE}/s"
+    yield frames_drawn(name, min(view.share for view in watched), ", the one who sees less")
+    yield key_to_effect(
+        name, max(statistics.median(view.waits) for view in watched), which=", the one who waits longer"
     )
