@@ -28,8 +28,7 @@ PATIENCE = 30_000  # ms to wait for anything
 TICK = 1_000 / RATE + 5  # ms: the goal from a key to its effect is one tick, and five more
 PLAYABLE = "whether a participant can play: late or missing pictures feel like a bad keyboard"
 
-# Notes each picture that is put on the canvas, and the ms from a key event until the corner shows it. `LEFT_EDGE` is
-# where the participant's block begins.
+# Notes each picture that is put on the canvas, and the ms from a key event until the corner shows it.
 WATCH = """(() => {
   const seen = (window.seen = { draws: [], waits: [], expected: null, since: 0 });
   const watch = (name, corner) => {
@@ -43,7 +42,7 @@ WATCH = """(() => {
       seen.expected = null;
     };
   };
-  const at = LEFT_EDGE + 8;
+  const at = 8;
   watch("putImageData", (_, image) => image.data[4 * (8 * image.width + at)]);
   watch("drawImage", (context) => context.getImageData(at, 8, 1, 1).data[0]);
   const press = (down) => (event) => {
@@ -132,7 +131,7 @@ class Agent:
 """
 OBJECTS_CONFIG = TEXTURE_CONFIG + '  scene: {width: 600, height: 400, background: "#202830"}\n'
 
-# Two participants on one picture, each with a block of their own.
+# Two participants on one picture. They press their keys one after the other, so one block shows both.
 PAIR = """
 import numpy as np
 class Agent:
@@ -149,8 +148,7 @@ class Agent:
     def render(self):
         picture = np.zeros((120, 160, 3), np.uint8)
         picture[60:70, self.t % 150:self.t % 150 + 10] = 200
-        for seat, player in enumerate(self.possible_agents):
-            picture[:16, 16 * seat:16 * seat + 16] = 255 * (self.actions[player] == 1)
+        picture[:16, :16] = 255 * (1 in self.actions.values())
         return picture
     def close(self):
         pass
@@ -179,11 +177,11 @@ class Watched:
 class Player:
     """A participant in a context of their own."""
 
-    def __init__(self, browser: Any, address: str, user: str, left_edge: int = 0) -> None:
+    def __init__(self, browser: Any, address: str, user: str) -> None:
         self.context = browser.new_context(viewport={"width": 1280, "height": 800})
         self.context.set_default_timeout(PATIENCE)
         self.page = self.context.new_page()
-        self.page.add_init_script(WATCH.replace("LEFT_EDGE", str(left_edge)))
+        self.page.add_init_script(WATCH)
         self.server = 0  # the port of their server
         self.received: list[int] = []  # the bytes of each binary message
         self.page.on("websocket", self._connected)
@@ -263,7 +261,7 @@ def playing(config: str, agent: str, players: int = 1) -> Iterator[list[Player]]
     with folder() as study, chromium() as browser:
         write_game(study, config, agent)
         with running(study) as address:
-            present = [Player(browser, address, f"P{seat}", 16 * seat) for seat in range(players)]
+            present = [Player(browser, address, f"P{number}") for number in range(players)]
             if players == 1:
                 present[0].begin()
             yield present
