@@ -73,6 +73,8 @@ class _Member:
     gone_on: bool = False
     """They have gone on from the page before the game or between two episodes."""
     over: Over | None = None
+    counted: bool = False
+    """Whether the others have waited during the member's present absence: then what was left stays, however little."""
 
     @property
     def takes_part(self) -> bool:
@@ -371,9 +373,13 @@ class Presence:
         waits = self.waits
         for member in self._members.values():
             if member.gone and waits:
-                member.waiting.run(now, self.time_left(member.player))
+                member.waiting.run(now, member.waiting.left if member.counted else self.time_left(member.player))
+                member.counted = True
+            elif member.gone:
+                member.waiting.stop(now)
             else:
-                member.waiting.stop(now, 0.0 if member.gone else self._least)
+                member.waiting.stop(now, self._least)
+                member.counted = False
             if member.is_measured_now:
                 member.measuring.run(now, member.measuring.left)
             else:

@@ -121,3 +121,12 @@ def test_a_member_who_comes_and_goes_cannot_use_up_the_time_of_one_who_is_away()
     for _ in range(20):
         driver.go(1).wait(0.01).come(1).wait(0.01)
     assert driver.outcomes == {"P0": "partnerLeft", "P1": "left", "P2": "partnerLeft"}
+
+
+def test_who_waits_and_loads_the_page_again_waits_no_less_for_who_has_not_come() -> None:
+    driver = SessionDriver(gather=30).come(0).wait(29)
+    driver.go(0)
+    driver.come(0).wait(0.9)
+    assert not driver.trial.progress.over
+    driver.wait(0.2)
+    assert driver.trial.progress.outcome == "partnerLeft"
