@@ -7,7 +7,7 @@ DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
 # Installs the study's own packages (requirements.txt).
-PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
+PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m hippodrome.local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
 USER_ID ?=
 DATA_GIVEN = $(strip $(DATA))# DATA may be empty in the environment
@@ -51,26 +51,26 @@ help: ## list these commands
 .PHONY: run
 run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
 	@$(PACKAGES)
-	@$(BIN)/python -m local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
+	@$(BIN)/python -m hippodrome.local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
 	@$(PACKAGES)
-	@$(BIN)/python -m local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
+	@$(BIN)/python -m hippodrome.local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
 # The default of PORT= is for `make run`. Without PORT=, this server takes 5000, the port of Gymie.
 .PHONY: gym
 gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
-	@$(BIN)/python -m trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+	@$(BIN)/python -m hippodrome.trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
 
 .PHONY: new
 new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPLATE= (without it: which there are)
-	@$(BIN)/python -m local.new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
+	@$(BIN)/python -m hippodrome.local.new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
 
 .PHONY: check
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
 	@$(PACKAGES)
-	@$(BIN)/python -m local.check "$(PROJECT)" $(ARGS)
+	@$(BIN)/python -m hippodrome.local.check "$(PROJECT)" $(ARGS)
 
 .PHONY: deploy
 deploy: $(VENV)/deploy ## install on AWS (DOMAIN=, EMAIL=): the stack, its certificate, the study of PROJECT=.
@@ -106,8 +106,8 @@ certificate doctor status cost data erase logs stop destroy:
 WORKERS ?=
 # Many tests wait for processes, so two cores have four workers. `loadscope` gives a worker the tests of a module.
 PYTEST = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(or $(WORKERS),4) --dist loadscope
-QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/hippodrome tests/lambdas tests/protocol tests/trial/core \
-	$(addprefix --ignore ,tests/hippodrome/aws tests/hippodrome/servers/test_sweep_strangers.py tests/hippodrome/test_moto_journey.py)
+QUICK = $(filter-out tests/test_docs.py,$(wildcard tests/test_*.py)) tests/control tests/functions tests/protocol tests/trial/core \
+	$(addprefix --ignore ,tests/control/aws tests/control/servers/test_sweep_strangers.py tests/control/test_moto_journey.py)
 
 .PHONY: test
 test: $(VENV)/dev $(MINISTACK)/ready ## run the tests
@@ -135,7 +135,7 @@ lint: $(VENV)/dev ## ruff and mypy
 
 .PHONY: audit
 audit: $(VENV)/dev $(AUDIT)/ready ## look for known vulnerabilities: bandit in the code, pip-audit (online) in the packages
-	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r protocol hippodrome lambdas local trial deploy export console bots
+	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r hippodrome lambdas deploy
 	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
 .PHONY: format

@@ -1,7 +1,8 @@
 """Measures this tree (`python -m bench`), or compares it with another checkout (`python -m bench --against DIRECTORY`).
 
-Each measure runs in a process of its own, and reaches the product through what others use: `python -m local`, pages,
-the handlers of the functions, commands, the simulated account. So one bench measures different versions of the product.
+Each measure runs in a process of its own, and reaches the product through what others use: `python -m
+hippodrome.local`, pages, the handlers of the functions, commands, the simulated account. So one bench measures
+different versions of the product.
 
 Rows go to bench/results.json. A missed goal is no error: the exit status is 1 only if something was not measured.
 """

@@ -42,9 +42,9 @@ class MeasuredStudy:
     """
 
     def __init__(self, world: Any) -> None:
-        from hippodrome.aws import AwsPlatform
-        from hippodrome.config import read_project
-        from lambdas import installed, update_project_master_list
+        from hippodrome.control.aws import AwsPlatform
+        from hippodrome.control.config import read_project
+        from hippodrome.functions import installed, update_project_master_list
 
         class Aging(AwsPlatform):
             clock = datetime.now(UTC)
@@ -69,7 +69,7 @@ class MeasuredStudy:
 
     def invoke(self, function: ModuleType, event: Mapping[str, Any]) -> dict[str, Any]:
         """Run a function, and note its AWS calls; return its answer."""
-        from lambdas import installed
+        from hippodrome.functions import installed
 
         name = function.__name__.rpartition(".")[2]
         installed._made = self._caches.setdefault(name, {})  # each function is a process of its own
@@ -82,7 +82,7 @@ class MeasuredStudy:
 
     def request(self, method: str, user: str, more: str = "", body: str | None = None) -> str:
         """Send a request of a browser to `next_step`; return the body of the answer."""
-        from lambdas import next_step
+        from hippodrome.functions import next_step
 
         headers = {"accept": "application/json" if more else "text/html"}
         if body is not None:
@@ -102,8 +102,8 @@ class MeasuredStudy:
         polls once. A DNS change is PENDING at the first look, and in sync at the second. Raises RuntimeError if
         anything else is left.
         """
-        from lambdas import start_server, stop_server, task_changed
-        from protocol.keys import answer_key
+        from hippodrome.functions import start_server, stop_server, task_changed
+        from hippodrome.protocol.keys import answer_key
 
         world = self.world
 
@@ -144,8 +144,8 @@ class MeasuredStudy:
 @contextlib.contextmanager
 def on_moto() -> Iterator[MeasuredStudy]:
     """Make the study in a new account for the block. Logs of functions are not shown."""
-    from hippodrome.log import logger
-    from lambdas import installed
+    from hippodrome.control.log import logger
+    from hippodrome.functions import installed
     from testing.moto_world import MotoWorld
 
     handler = logger.registered_handler
@@ -193,7 +193,7 @@ OURS = """
 import json, sys, time
 event = json.loads(sys.argv[1])
 begun = time.process_time()
-from lambdas import next_step
+from hippodrome.functions import next_step
 answer = next_step.handler(event, None)
 assert answer["statusCode"] == 200 and len(answer["body"]) > 5000, answer
 print(time.process_time() - begun)

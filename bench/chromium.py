@@ -1,4 +1,4 @@
-"""Measures what participants see in a real Chromium: each opens the link of a study that `python -m local` runs.
+"""Measures what participants see in a real Chromium: each opens the link of a study that `make run` runs.
 
 A block in the corner of each picture is white while the participant's action is "left". The page notes by its own clock
 when it draws, and how long after a press the corner shows it.

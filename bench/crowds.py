@@ -15,9 +15,9 @@ from typing import Any
 import msgspec
 
 from bench.row import Row, row
-from deploy.aws.concurrency import starts
-from deploy.cost.estimate import DNS_QUERIES
-from deploy.cost.prices import FARGATE_MINIMUM, Prices
+from hippodrome.deployment.aws.concurrency import starts
+from hippodrome.deployment.cost.estimate import DNS_QUERIES
+from hippodrome.deployment.cost.prices import FARGATE_MINIMUM, Prices
 from testing import template
 from testing.quiet_log import quiet
 from testing.simulation import session_checks

@@ -78,15 +78,15 @@ def serve(people: int) -> None:
     """Serve a bucket with so many participants until the input ends."""
     from moto.s3.models import s3_backends
 
-    from hippodrome.model import ids
-    from hippodrome.model.project import MASTER_LIST, MasterList
-    from hippodrome.model.records import to_json
-    from protocol.keys import answer_key
+    from hippodrome.control.model import ids
+    from hippodrome.control.model.project import MASTER_LIST, MasterList
+    from hippodrome.control.model.records import to_json
+    from hippodrome.protocol.keys import answer_key
     from testing.aws_events import ACCOUNT
     from testing.studies import study
 
     project, recording = study(), gzip.compress(_recording(), 6)
-    with importlib.import_module("tests.deploy.installation").Installed() as world:
+    with importlib.import_module("tests.deployment.installation").Installed() as world:
         backend, bucket = s3_backends[ACCOUNT]["aws"], world.env["BUCKET"]
 
         def put(key: str, body: bytes) -> None:
@@ -108,7 +108,7 @@ def serve(people: int) -> None:
 
 def _recording() -> bytes:
     """Make the lines of a recording, as many and as long as those of the example's game."""
-    from trial.recordings import recording
+    from hippodrome.trial.recordings import recording
 
     stamp = {"v": 1, "server": "s-1", "trial": "t", "time": WHEN, "ns": 123456789012345}
     lines = [recording.line("header", **stamp, actionSpace=["noop"] * 9, episode=1, seed=5)]

@@ -1,4 +1,4 @@
-"""Measures pages and the start of a game with `python -m local`."""
+"""Measures pages and the start of a game with `python -m hippodrome.local`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The command line for AWS: installs Hippodrome, registers studies, shows servers and costs, fetches data, removes."""
+"""`python -m deploy`: the command line for AWS, of hippodrome/deployment/."""

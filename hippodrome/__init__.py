@@ -1,1 +1,1 @@
-"""The control plane: pure records and transitions, the services over them, and the ports on AWS."""
+"""Online human-AI experiments on AWS: a server for each participant, and none left behind."""

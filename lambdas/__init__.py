@@ -1,1 +1,1 @@
-"""The handlers, one file per Lambda function. Each reads its event, calls `hippodrome` and shapes the reply."""
+"""The Lambda functions, by the names that infra/template.yml gives them. Their code is in hippodrome/functions/."""

@@ -1,11 +1,5 @@
-"""HTTP GET and POST: shows the page of the due step, stores answers, and publishes start and stop messages."""
+"""HTTP requests to `/next`, and for the studies' files: shows the page of the due step and stores answers."""
 
-from typing import Any
+from hippodrome.functions.next_step import handler
 
-from hippodrome.participants.journey import Journey
-from lambdas import installed, web
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """Respond to a request of API Gateway's HTTP API: show the due step's page, or store an answer."""
-    return web.respond(event, lambda request: installed.shared(Journey).respond(request))
+__all__ = ["handler"]

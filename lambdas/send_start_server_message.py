@@ -1,11 +1,5 @@
-"""HTTP POST or GET: publishes a participant's start message to the start topic."""
+"""HTTP requests to `/start`: publishes a participant's start message."""
 
-from typing import Any
+from hippodrome.functions.send_start_server_message import handler
 
-from hippodrome.participants.relays import Relays
-from lambdas import installed, web
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """Respond to a request of API Gateway's HTTP API: publish a participant's start message."""
-    return web.respond(event, lambda request: installed.shared(Relays).start(request))
+__all__ = ["handler"]

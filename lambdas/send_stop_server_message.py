@@ -1,11 +1,5 @@
-"""HTTP POST or GET: publishes a participant's stop message to the stop topic, after a delay if the request has one."""
+"""HTTP requests to `/stop`: publishes a participant's stop message."""
 
-from typing import Any
+from hippodrome.functions.send_stop_server_message import handler
 
-from hippodrome.participants.relays import Relays
-from lambdas import installed, web
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """Respond to a request of API Gateway's HTTP API: publish a participant's stop message, now or after a delay."""
-    return web.respond(event, lambda request: installed.shared(Relays).stop(request))
+__all__ = ["handler"]

@@ -1,16 +1,5 @@
-"""HTTP POST from a trial server: returns presigned requests for that server's own documents."""
+"""HTTP requests of trial servers to `/sign`: presigns requests for their own documents."""
 
-from typing import Any, cast
+from hippodrome.functions.sign_requests import handler
 
-from hippodrome.ports import Platform
-from hippodrome.servers.signing import Signing, SigningPlatform
-from lambdas import installed, web
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """Respond to a request of API Gateway's HTTP API: return presigned requests to a server with its own credential."""
-    return web.respond(event, lambda request: installed.shared(_signing).respond(request))
-
-
-def _signing(platform: Platform) -> Signing:
-    return Signing(cast(SigningPlatform, platform))  # AWS's platform, since this function runs on AWS only
+__all__ = ["handler"]

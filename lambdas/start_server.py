@@ -1,21 +1,5 @@
-"""Start topic → queue: starts servers, each with its shutdown timer, and keeps the pools of warm servers filled."""
+"""The start queue: starts servers, each with its shutdown timer."""
 
-from typing import Any
+from hippodrome.functions.start_server import handler
 
-from hippodrome.model import messages
-from hippodrome.model.messages import KeepWarm, StartServer
-from hippodrome.servers.services import ServerServices
-from hippodrome.servers.start import Start
-from lambdas import installed, queue
-
-
-def handler(event: dict[str, Any], context: object) -> queue.BatchResponse:
-    """Handle the start messages of an SQS batch, or of an event that SNS sends to the function itself.
-
-    Returns the partial batch response with the messages that SQS must deliver again.
-    """
-    found: list[tuple[str, StartServer | KeepWarm]] = queue.read(event, messages.parse_start_server)
-    services = installed.shared(ServerServices)
-    failed = queue.one_by_one(found, Start(services).handle)
-    queue.report_failures(services)
-    return queue.response(event, failed)
+__all__ = ["handler"]

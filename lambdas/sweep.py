@@ -1,21 +1,5 @@
-"""Timer: removes resources that no open record owns, sends lost messages again, and reports both as metrics."""
+"""A timer, every five minutes: removes what no open record owns, and sends lost messages again."""
 
-import os
-from dataclasses import asdict
-from typing import Any
+from hippodrome.functions.sweep import handler
 
-from hippodrome import metrics
-from hippodrome.servers.sweep import Sweep
-from lambdas import installed
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, int]:
-    """Run a sweep, and return its counts, which are the fields of `SweepResult`.
-
-    Writes metrics to the log if the variable `STACK` names the installation.
-    """
-    sweep = Sweep(installed.platform())
-    swept = sweep.run()
-    if stack := os.environ.get("STACK"):
-        metrics.report(stack, sweep.running, swept)
-    return asdict(swept)
+__all__ = ["handler"]

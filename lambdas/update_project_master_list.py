@@ -1,14 +1,5 @@
-"""Direct invocation: adds or replaces a project in `project_master_list.json`, signs links, or moves old secrets."""
+"""Direct invocation by `register`: writes a project into `project_master_list.json`."""
 
-from typing import Any
+from hippodrome.functions.update_project_master_list import handler
 
-from hippodrome import registry
-from lambdas import installed
-
-
-def handler(event: dict[str, Any], context: object) -> dict[str, Any]:
-    """Register the project in `{"project": registration}`; return `{"registered": …}` or `{"problems": […]}`.
-
-    `registry.handle` describes the other events.
-    """
-    return registry.handle(installed.platform(), event)
+__all__ = ["handler"]

@@ -16,7 +16,7 @@ Events and requests
 Platforms, from the fastest to the one most like AWS; `fake_platform` and `moto_world` pass the contract of the ports (`tests/contract`)
     `fake_platform`   the five ports in memory; time and messages move when the test says so. For services
     `simulation/`     AWS with quotas, latencies, lost and late events on a `GreenletClock`. For crowds, and for the bench
-    `moto_world`      the adapters of `hippodrome/aws` on moto; each call is judged by the role of its function (`iam/`)
+    `moto_world`      the adapters of `hippodrome/control/aws` on moto; each call is judged by the role of its function (`iam/`)
     `moto_study`      the example study on `moto_world`; the test delivers messages
     `strict_s3`       an HTTP server that checks presigned requests as S3 does
     `ministack/`      the whole stack on the emulator, in processes of its own

@@ -11,8 +11,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from hippodrome.model.project import Project, Step
-from hippodrome.participants import pages
+from hippodrome.control.model.project import Project, Step
+from hippodrome.control.participants import pages
 
 NO_CHROMIUM = "there is no Chromium on this machine; to measure this row: apt-get install chromium"
 # The features that Playwright 1.65 itself disables. Chromium takes only the last of two lists, so ours repeats them.

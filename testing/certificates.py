@@ -13,7 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from local.backend.authority import SIGNS_CERTIFICATES, general_name
+from hippodrome.local.backend.authority import SIGNS_CERTIFICATES, general_name
 
 _AGO = timedelta(hours=1)  # so long before now all certificates begin to be valid
 

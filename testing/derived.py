@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from hippodrome.model.project import Project
-from hippodrome.model.records import from_data, from_json
-from hippodrome.model.server import Server
-from hippodrome.storage.secret import Secret
+from hippodrome.control.model.project import Project
+from hippodrome.control.model.records import from_data, from_json
+from hippodrome.control.model.server import Server
+from hippodrome.control.storage.secret import Secret
 
 
 def project_secret(secret: bytes, project: Mapping[str, Any]) -> str:

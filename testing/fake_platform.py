@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
-from hippodrome.model import ids
-from hippodrome.ports import (
+from hippodrome.control.model import ids
+from hippodrome.control.ports import (
     Address,
     Conflict,
     DnsRecord,

@@ -7,11 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-from local.rehearsal.study_process import ROOT, Process, StudyProcess, logs_of
-from protocol import environment
+from hippodrome.local.rehearsal.study_process import Process, StudyProcess, logs_of
+from hippodrome.protocol import environment
+from hippodrome.trial.recordings.recording import read
+from hippodrome.trial.settings import STALLED_SECONDS
 from testing import processes
-from trial.recordings.recording import read
-from trial.settings import STALLED_SECONDS
 
 
 class HeldStudy(StudyProcess):
@@ -30,11 +30,11 @@ class HeldStudy(StudyProcess):
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         options["env"] = {
             **options["env"],
-            "PYTHONPATH": os.environ.get("PYTHONPATH") or str(ROOT),
+            "PYTHONPATH": os.environ.get("PYTHONPATH") or str(processes.ROOT),
             environment.STALLED_SECONDS: str(self._stalled),
         }
         arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
-        return processes.start("local", arguments, **options)
+        return processes.start("hippodrome.local", arguments, **options)
 
     def steps_written(self, owner: str = "*") -> int:
         """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""

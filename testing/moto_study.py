@@ -14,10 +14,17 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from hippodrome.config import read_project
-from hippodrome.model import ids, server
-from lambdas import installed, next_step, start_server, stop_server, task_changed, update_project_master_list
-from protocol.keys import membership_key
+from hippodrome.control.config import read_project
+from hippodrome.control.model import ids, server
+from hippodrome.functions import (
+    installed,
+    next_step,
+    start_server,
+    stop_server,
+    task_changed,
+    update_project_master_list,
+)
+from hippodrome.protocol.keys import membership_key
 from testing import aws_events
 from testing.moto_world import MotoWorld
 from testing.visitors import body_of, hidden

@@ -53,7 +53,7 @@ from moto.scheduler.models import scheduler_backends
 from moto.sns.models import sns_backends
 from moto.sqs.models import sqs_backends
 
-from hippodrome.aws import AwsPlatform
+from hippodrome.control.aws import AwsPlatform
 from testing import aws_events
 from testing.aws_events import ACCOUNT, IMAGE
 from testing.botocore_sessions import botocore_session

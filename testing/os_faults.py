@@ -1,6 +1,6 @@
 """Faults of one machine at single system calls for files, processes, threads and sockets.
 
-Faults are injected *below* `local/`, in the functions of Python's library that make the system call. A call is
+Faults are injected *below* `hippodrome/local/`, in the functions of Python's library that make the system call. A call is
 identified by its operation and its kind of file (`OsCall`) and by its number among those: threads make calls in an
 order that changes from run to run, but the n-th call of one kind is nearly always the same.
 

@@ -6,7 +6,7 @@ import contextlib
 import logging
 from collections.abc import Iterator
 
-from hippodrome.log import logger
+from hippodrome.control.log import logger
 
 
 @contextlib.contextmanager

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hippodrome.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, StopUser, TaskChanged
-from hippodrome.model.server import Reason
-from hippodrome.ports import Platform
-from hippodrome.servers.causes import Cause
-from hippodrome.servers.dns import DnsRecords
-from hippodrome.servers.services import ServerServices
-from hippodrome.servers.start import Start
-from hippodrome.servers.stops import Stops
-from hippodrome.servers.termination import ENDED, Termination
-from hippodrome.storage.repository import Versioned
+from hippodrome.control.model.messages import DnsChanged, KeepWarm, StartServer, StopServer, StopUser, TaskChanged
+from hippodrome.control.model.server import Reason
+from hippodrome.control.ports import Platform
+from hippodrome.control.servers.causes import Cause
+from hippodrome.control.servers.dns import DnsRecords
+from hippodrome.control.servers.services import ServerServices
+from hippodrome.control.servers.start import Start
+from hippodrome.control.servers.stops import Stops
+from hippodrome.control.servers.termination import ENDED, Termination
+from hippodrome.control.storage.repository import Versioned
 
 
 class Servers:

@@ -21,14 +21,14 @@ from botocore.auth import S3SigV4QueryAuth
 from botocore.awsrequest import AWSRequest
 from botocore.credentials import ReadOnlyCredentials
 
-from hippodrome.aws.signer import S3Signer
-from hippodrome.model import server
-from hippodrome.model.records import to_json
-from hippodrome.model.server import Server
-from hippodrome.ports import Conflict
-from hippodrome.storage.secret import SecretCache
-from lambdas import installed, sign_requests
-from protocol import environment
+from hippodrome.control.aws.signer import S3Signer
+from hippodrome.control.model import server
+from hippodrome.control.model.records import to_json
+from hippodrome.control.model.server import Server
+from hippodrome.control.ports import Conflict
+from hippodrome.control.storage.secret import SecretCache
+from hippodrome.functions import installed, sign_requests
+from hippodrome.protocol import environment
 from testing import aws_events
 from testing import template as cfn
 from testing.fake_platform import FakePlatform

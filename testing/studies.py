@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 
-from hippodrome.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, Step, step_key
-from hippodrome.model.records import to_json
-from hippodrome.storage.secret import KEY, Secret
+from hippodrome.control.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.control.model.records import to_json
+from hippodrome.control.storage.secret import KEY, Secret
 from testing.fake_platform import FakePlatform
 
 INSTALLATION_SECRET = Secret("0" * 64)

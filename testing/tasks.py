@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from hippodrome.ports import TaskRequest
+from hippodrome.control.ports import TaskRequest
 from testing import aws_events
 
 

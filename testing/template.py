@@ -14,7 +14,7 @@ import yaml
 PATH = Path(__file__).resolve().parents[1] / "infra" / "template.yml"
 
 
-_Safe: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # as in deploy/code/template.py
+_Safe: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # as in hippodrome/deployment/code/template.py
 
 
 class _Loader(_Safe):  # type: ignore[misc]

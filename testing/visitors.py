@@ -1,6 +1,6 @@
 """Clients of `next_step` for tests, in the same process: they send a participant's requests and read the answers.
 
-`Browser` reads HTML and sends the form of a page, as `web/` makes it. `Program` reads and posts JSON, as a front end
+`Browser` reads HTML and sends the form of a page, as `hippodrome/web/` makes it. `Program` reads and posts JSON, as a front end
 does that a researcher has written. A real Chromium is in `testing/browser.py`.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
-from lambdas import installed, next_step
+from hippodrome.functions import installed, next_step
 from testing.aws_events import FORM, JSON, http_event
 from testing.fake_platform import FakePlatform
 

@@ -61,7 +61,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> int:
 @pytest.fixture
 def log() -> Iterator[io.StringIO]:
     """Everything the functions log during a test, as it would reach CloudWatch."""
-    from hippodrome.log import logger
+    from hippodrome.control.log import logger
 
     handler = logger.registered_handler
     text = io.StringIO()

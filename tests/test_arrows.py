@@ -11,22 +11,28 @@ import pytest
 from testing.imports import imported
 
 ROOT = Path(__file__).resolve().parent.parent
+PRODUCT = ROOT / "hippodrome"
 MAY: dict[str, set[str]] = {
     "protocol": set(),
     "console": set(),
-    "hippodrome": {"protocol"},
-    "lambdas": {"hippodrome"},
+    "control": {"places", "protocol"},
+    "functions": {"control"},
     "trial": {"protocol"},
-    "export": {"console", "hippodrome", "protocol"},
-    "bots": {"hippodrome", "protocol", "trial"},
-    "local": {"hippodrome", "lambdas", "protocol", "bots", "trial"},
-    "deploy": {"console", "export", "hippodrome", "lambdas", "protocol", "bots", "trial"},
-    "testing": {"deploy", "hippodrome", "lambdas", "local", "protocol", "trial"},
-    "bench": {"deploy", "hippodrome", "lambdas", "protocol", "testing", "trial"},
+    "export": {"console", "control", "protocol"},
+    "bots": {"control", "protocol", "trial"},
+    "local": {"places", "control", "functions", "protocol", "bots", "trial"},
+    "deployment": {"places", "console", "export", "control", "functions", "protocol", "bots", "trial"},
 }
-PRODUCT = set(MAY) - {"testing", "bench"}
+"""Which packages of `hippodrome` a package may import, and `places.py`."""
+AROUND = {
+    "lambdas": {"functions"},
+    "deploy": {"deployment"},
+    "testing": {"places", "deployment", "control", "functions", "local", "protocol", "trial"},
+    "bench": {"places", "deployment", "control", "functions", "protocol", "trial"},
+}
+"""The same for the packages beside it."""
 ROOMS = {
-    "hippodrome": (
+    "control": (
         *(
             "ports",
             "model",
@@ -55,21 +61,39 @@ ROOMS = {
         "check",
         "interactive_gym",
     ),
-    "deploy": ("aws", "core", "code", "cost", "stack", "study", "operate", "lifecycle"),
+    "deployment": ("aws", "core", "code", "cost", "stack", "study", "operate", "lifecycle"),
 }
 """Rooms and modules of a package: each imports only from itself and from those before it."""
 
 
-def packages(package: str) -> dict[str, str]:
-    """Return the packages of ours that this one imports, each with a file that does."""
-    files = (ROOT / package).rglob("*.py")
-    found = {name.partition(".")[0]: path.name for path in files for name in imported(path)}
-    return {name: file for name, file in found.items() if name in {*MAY, "tests"} - {package}}
+def packages(folder: Path) -> dict[str, str]:
+    """Return the packages of ours that those in the folder import, each with a file that does."""
+    found = {}
+    for path in folder.rglob("*.py"):
+        for name in imported(path):
+            top, _, rest = name.partition(".")
+            inner = rest.partition(".")[0]
+            if top == "hippodrome" and inner and folder != PRODUCT / inner:
+                found[inner] = path.name
+            elif top in {*AROUND, "tests"} - {folder.name}:
+                found[top] = path.name
+    return found
+
+
+def test_every_package_has_its_arrows() -> None:
+    assert {path.parent.name for path in PRODUCT.glob("*/__init__.py")} == set(MAY)
 
 
 @pytest.mark.parametrize("package", MAY)
 def test_nothing_imports_uphill(package: str) -> None:
-    assert {other: file for other, file in packages(package).items() if other not in MAY[package]} == {}
+    found = packages(PRODUCT / package)
+    assert {other: file for other, file in found.items() if other not in MAY[package]} == {}
+
+
+@pytest.mark.parametrize("package", AROUND)
+def test_packages_beside_the_product_use_only_these_of_it(package: str) -> None:
+    found = packages(ROOT / package)
+    assert {other: file for other, file in found.items() if other not in AROUND[package] | {"testing"}} == {}
 
 
 def test_only_tests_of_the_bench_import_it() -> None:
@@ -81,24 +105,24 @@ def test_only_tests_of_the_bench_import_it() -> None:
     assert importing == {"tests/bench/test_bench.py"}
 
 
-def test_every_folder_of_deploy_has_its_rank() -> None:
-    assert {path.parent.name for path in (ROOT / "deploy").glob("*/__init__.py")} == set(ROOMS["deploy"])
+def test_every_folder_of_deployment_has_its_rank() -> None:
+    assert {path.parent.name for path in (PRODUCT / "deployment").glob("*/__init__.py")} == set(ROOMS["deployment"])
 
 
 @pytest.mark.parametrize(("package", "room"), [(package, room) for package, rooms in ROOMS.items() for room in rooms])
-def test_no_folder_of_deploy_imports_from_one_above(package: str, room: str) -> None:
-    rooms, place = ROOMS[package], ROOT / package / room
+def test_no_folder_imports_from_one_above(package: str, room: str) -> None:
+    rooms, place = ROOMS[package], PRODUCT / package / room
     may = rooms[: rooms.index(room) + 1]
     wrong = {
         f"{path.relative_to(ROOT)} imports {name}"
         for path in (place.rglob("*.py") if place.is_dir() else [place.with_suffix(".py")])
         for name in imported(path)
-        if name.startswith(f"{package}.") and name.split(".")[1] not in may
+        if name.startswith(f"hippodrome.{package}.") and name.split(".")[2] not in may
     }
     assert wrong == set()
 
 
-@pytest.mark.parametrize("package", MAY)
+@pytest.mark.parametrize("package", ["hippodrome", *AROUND])
 def test_no_files_import_each_other_in_a_circle(package: str) -> None:
     """Imports for types count, too: who reads one file of a circle has to read all of them."""
     files = (ROOT / package).rglob("*.py")
@@ -123,12 +147,12 @@ def loaded(module: str) -> dict[str, str]:
         name, files = todo.pop(), [path / "__init__.py", path.with_suffix(".py")]
         for other in {each for file in files if file.is_file() for each in imported(file)} - set(found):
             found[other] = name
-            if other.partition(".")[0] in PRODUCT:
+            if other.partition(".")[0] == "hippodrome":
                 todo.append(other)
     return found
 
 
-@pytest.mark.parametrize("module", ["local.__main__", "local.check.__main__"])
+@pytest.mark.parametrize("module", ["hippodrome.local.__main__", "hippodrome.local.check.__main__"])
 def test_only_processes_of_servers_and_agents_load_numpy(module: str) -> None:
     """It takes a third as long to load as all the rest, and `make run` and `make check` need it only there."""
     assert loaded(module).get("numpy") is None
@@ -138,13 +162,15 @@ def test_the_picture_shows_the_packages_and_what_they_import() -> None:
     picture = ET.parse(ROOT / "docs" / "packages.svg").getroot()
     shown = {element.get("data-room", "") for element in picture.iter() if element.get("data-room")}
     inner = {
-        f"{one}/{path.parent.name}" for one in ("hippodrome", "deploy") for path in (ROOT / one).glob("*/__init__.py")
+        f"{one}/{path.parent.name}"
+        for one in ("control", "deployment")
+        for path in (PRODUCT / one).glob("*/__init__.py")
     }
-    assert shown == PRODUCT | inner
+    assert shown == MAY.keys() | inner
     arrows = {
         (element.get("data-from"), element.get("data-to")) for element in picture.iter() if element.get("data-from")
     }
-    leads = {package: set(packages(package)) for package in PRODUCT}
+    leads = {package: packages(PRODUCT / package).keys() & MAY.keys() for package in MAY}
     further = {
         a: {c for b in leads[a] for c in leads[b]} | {d for b in leads[a] for c in leads[b] for d in leads[c]}
         for a in leads

@@ -128,7 +128,7 @@ def test_a_recording_is_read_as_documented(tmp_path: Path) -> None:
 def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
     import numpy as np
 
-    from trial.recordings import recording
+    from hippodrome.trial.recordings import recording
 
     picture = np.arange(6, dtype=np.uint8).reshape(2, 3)
     line = {"kind": "step", "reward": 1.0, "terminated": False, "truncated": True, "info": {"lives": 3}}
@@ -145,8 +145,8 @@ def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
-    from trial.agent.agent import AgentAdapter
-    from trial.agent.starting import start
+    from hippodrome.trial.agent.agent import AgentAdapter
+    from hippodrome.trial.agent.starting import start
 
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
     names = ("noop", "up", "right", "down", "left")
@@ -168,10 +168,10 @@ def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None
 def test_the_agent_shown_with_several_players_keeps_the_contract(tmp_path: Path) -> None:
     import types
 
-    from trial.agent.agent import AgentAdapter
-    from trial.agent.joint import JointAdapter
-    from trial.agent.starting import start
-    from trial.policies.load import load
+    from hippodrome.trial.agent.agent import AgentAdapter
+    from hippodrome.trial.agent.joint import JointAdapter
+    from hippodrome.trial.agent.starting import start
+    from hippodrome.trial.policies.load import load
 
     agent, partner = code("docs/players.md", "python")
     (tmp_path / "agent.py").write_text(agent)
@@ -191,8 +191,8 @@ def test_the_agent_shown_with_several_players_keeps_the_contract(tmp_path: Path)
 
 
 def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_path: Path) -> None:
-    from hippodrome.config import read_project, remarks
-    from local.check.agent import try_agent
+    from hippodrome.control.config import read_project, remarks
+    from hippodrome.local.check.agent import try_agent
 
     trial = code("docs/agent.md", "yaml")[0]
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[1])

@@ -1,7 +1,7 @@
 """docs/first-hour.md promises nothing that no test has seen: who runs its commands, and where its failures come from.
 
 What its commands print is held against the page where they run: `tests/ministack/test_first_hour.py` (the real template and
-functions) and `tests/deploy/test_first_hour.py` (real servers, and bots that play on them).
+functions) and `tests/deployment/test_first_hour.py` (real servers, and bots that play on them).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from functools import cache
 import pytest
 
 from tests import first_hour
-from tests.deploy.test_first_hour import WITH_SERVERS
-from tests.deploy.test_first_hour_failures import GOES_ON, STOPS
+from tests.deployment.test_first_hour import WITH_SERVERS
+from tests.deployment.test_first_hour_failures import GOES_ON, STOPS
 from tests.ministack.test_first_hour import BEFORE, DRAINING, FAILURES, IN_THE_WAY, NOTHING_LIVE, OF_DNS, STANDING
 
 MENTIONED = {
     "make run": "tests/local",
-    "make logs ARGS=--errors": "tests/deploy/operate/test_logs.py",
+    "make logs ARGS=--errors": "tests/deployment/operate/test_logs.py",
     "make destroy ARGS=--data": "tests/ministack/test_installation.py",
     "make register ARGS=--live": "tests/ministack/test_first_hour.py",
-    'make deploy … ARGS="--site play"': "tests/deploy/stack/test_stack.py",
+    'make deploy … ARGS="--site play"': "tests/deployment/stack/test_stack.py",
 }
 """Commands in sentences that the story does not run, and who does."""
 
@@ -50,20 +50,20 @@ def test_commands_in_sentences_are_run_by_tests_too() -> None:
 
 
 ELSEWHERE = {
-    "AWS has not activated this account yet.": "deploy/operate/test_doctor.py",
-    "These credentials may not …": "deploy/operate/test_doctor.py",
-    "The AWS credentials have expired.": "deploy/operate/test_doctor.py",
-    "The profile … is of `aws login`, whose credentials cannot be read here.": "deploy/aws/test_account.py",
-    "This AWS account may not run another build now.": "deploy/study/test_codebuild.py",
-    "The installation stands, but has no certificate. …": "deploy/lifecycle/test_up.py",
+    "AWS has not activated this account yet.": "deployment/operate/test_doctor.py",
+    "These credentials may not …": "deployment/operate/test_doctor.py",
+    "The AWS credentials have expired.": "deployment/operate/test_doctor.py",
+    "The profile … is of `aws login`, whose credentials cannot be read here.": "deployment/aws/test_account.py",
+    "This AWS account may not run another build now.": "deployment/study/test_codebuild.py",
+    "The installation stands, but has no certificate. …": "deployment/lifecycle/test_up.py",
     "… wants no further orders …": "certificate/test_command.py",
     "Nothing is ordered until …": "certificate/test_command.py",
-    "The image could not be built": "deploy/study/test_codebuild.py",
-    "Interrupted. CloudFormation goes on with the stack …": "deploy/stack/test_stack.py",
-    "Interrupted. The same command goes on from here.": "deploy/study/test_register_refused.py",
-    "Something of that name is in another region: say …": "deploy/lifecycle/test_destroy_waits.py",
-    "This has to wait until …; then the rest is deleted.": "deploy/lifecycle/test_destroy_waits.py",
-    "After … ACM still says that the site's certificate is in use by …": "deploy/lifecycle/test_destroy_waits.py",
+    "The image could not be built": "deployment/study/test_codebuild.py",
+    "Interrupted. CloudFormation goes on with the stack …": "deployment/stack/test_stack.py",
+    "Interrupted. The same command goes on from here.": "deployment/study/test_register_refused.py",
+    "Something of that name is in another region: say …": "deployment/lifecycle/test_destroy_waits.py",
+    "This has to wait until …; then the rest is deleted.": "deployment/lifecycle/test_destroy_waits.py",
+    "After … ACM still says that the site's certificate is in use by …": "deployment/lifecycle/test_destroy_waits.py",
 }
 """Failures that other tests bring about, and where."""
 
@@ -98,7 +98,7 @@ def words() -> frozenset[str]:
 def sentences() -> list[str]:
     """Every text in the code of the commands but docstrings, with a hole where a value comes in."""
     found = []
-    for file in sorted((first_hour.ROOT / "deploy").rglob("*.py")):
+    for file in sorted((first_hour.ROOT / "hippodrome" / "deployment").rglob("*.py")):
         nodes = [*ast.walk(ast.parse(file.read_text()))]
         docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
         for node in nodes:
@@ -144,7 +144,7 @@ def test_the_words_of_a_failure_are_the_programs(message: str) -> None:
 
 @cache
 def sources() -> list[str]:
-    return [file.read_text() for file in (first_hour.ROOT / "deploy").rglob("*.py")]
+    return [file.read_text() for file in (first_hour.ROOT / "hippodrome" / "deployment").rglob("*.py")]
 
 
 def test_there_are_failures_and_words_that_the_program_does_not_say() -> None:

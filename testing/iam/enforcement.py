@@ -18,8 +18,8 @@ from unittest import mock
 
 import botocore.exceptions
 
-from hippodrome.aws import AwsPlatform
-from lambdas import installed
+from hippodrome.control.aws import AwsPlatform
+from hippodrome.functions import installed
 from testing import template as cfn
 from testing.aws_events import ACCOUNT
 from testing.botocore_sessions import botocore_session

@@ -32,12 +32,12 @@ EXECUTIONS = 10
 
 def certificates() -> None:
     """Put Pebble in the place of Let's Encrypt's authorities, and its DNS beside the zone."""
-    from hippodrome.certificates import rules as certificate
+    from hippodrome.control.certificates import rules as certificate
 
     # Changed here, before any module imports them.
     certificate.STAGING, certificate.PRODUCTION = SETTINGS["staging"], SETTINGS["production"]
-    from hippodrome.aws.challenges import Route53Challenges
-    from hippodrome.certificates import renewal
+    from hippodrome.control.aws.challenges import Route53Challenges
+    from hippodrome.control.certificates import renewal
 
     order, put = renewal.Renewal.obtain, Route53Challenges.put
 
@@ -59,7 +59,7 @@ def internet() -> None:
     """Put the tests' name server in the place of the Internet's DNS, and the emulator in that of the site."""
     import dns.resolver
 
-    from deploy.operate.doctor import addresses
+    from hippodrome.deployment.operate.doctor import addresses
 
     class Resolver(dns.resolver.Resolver):
         def __init__(self, *_: object, **__: object) -> None:
@@ -86,8 +86,8 @@ def account() -> None:
     import botocore.handlers
     from botocore.awsrequest import AWSResponse
 
-    from deploy.aws import quotas
-    from deploy.study.image import docker
+    from hippodrome.deployment.aws import quotas
+    from hippodrome.deployment.study.image import docker
 
     new = {quotas.SPOT: 6.0, quotas.ON_DEMAND: 6.0, quotas.BUILDS: 1.0, quotas.VPCS: 5.0}
     quotas.applied = lambda account, quota: new[quota]

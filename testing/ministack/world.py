@@ -39,7 +39,7 @@ T = TypeVar("T")
 FUNCTIONS = tuple(sorted(template.functions()))
 
 
-DATA = {"infra", "requirements", "steps", "web"}
+DATA = {"infra", "requirements", "steps"}
 """Folders that the commands need, and that are no packages."""
 
 

@@ -55,7 +55,7 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         "functions end after": ", ".join(f"{name} {seconds} s" for name, seconds in TIMEOUTS.items()),
         "functions at once": f"{CONCURRENCY:,} in the account (Lambda quotas; a new account may have 10)",
         "waiting page asks": f"every {POLLS['first']:g} s at first, every {POLLS['longest']:g} s later, every "
-        f"{POLLS['naming']:g} s while the server is being named (web/game/waiting.js)",
+        f"{POLLS['naming']:g} s while the server is being named (hippodrome/web/game/waiting.js)",
         "network interface goes": f"{_span(DEPROVISIONED)} after the container has ended ({OURS})",
         "sweep": f"every {SWEEP_EVERY:g} s (infra/template.yml)",
         "addresses": f"{ADDRESSES:,}: what the subnets of infra/template.yml hold",

@@ -14,7 +14,7 @@ from testing.port_faults import FaultAt, call_with_fault
 from testing.simulation.clock import GreenletClock
 
 T = TypeVar("T")
-ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.aws.platform sets it
+ATTEMPTS = 3  # of botocore's standard mode, as hippodrome.control.aws.platform sets it
 BACKOFF = 1.0  # seconds, doubled at each attempt; a call waits a random share of it
 
 

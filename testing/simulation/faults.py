@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from protocol.keys import answer_key
+from hippodrome.protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import session_checks
 from testing.simulation.conditions import Conditions

@@ -34,8 +34,8 @@ from typing import Any, NamedTuple
 
 import greenlet
 
-from hippodrome.ports import Platform
-from lambdas import installed
+from hippodrome.control.ports import Platform
+from hippodrome.functions import installed
 from testing import aws_events
 from testing.port_faults import Crash
 from testing.simulation.clock import GreenletClock
@@ -58,7 +58,7 @@ class Recursive(Exception):
 
 @dataclass
 class Container:
-    """An execution environment: the objects of `lambdas.installed` that a function keeps between its invocations."""
+    """An execution environment: the objects of `hippodrome.functions.installed` that a function keeps between its invocations."""
 
     platform: Platform
     made: dict[Any, Any] = field(default_factory=dict)
@@ -141,7 +141,7 @@ class SimulatedFunction:
 
 
 def enter(owner: object) -> None:
-    """Let `lambdas.installed` use the objects of this container; if the owner is no container, it gets no objects."""
+    """Let `hippodrome.functions.installed` use the objects of this container; if the owner is no container, it gets no objects."""
     if isinstance(owner, Container):
         installed._platform, installed._made = owner.platform, owner.made
     else:

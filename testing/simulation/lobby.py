@@ -6,11 +6,11 @@ import json
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 
-from hippodrome.lobby import decisions, entries
-from hippodrome.model.project import Project
-from protocol import session as sessions
-from protocol.keys import sessions_folder
-from protocol.session import SessionDocument
+from hippodrome.control.lobby import decisions, entries
+from hippodrome.control.model.project import Project
+from hippodrome.protocol import session as sessions
+from hippodrome.protocol.keys import sessions_folder
+from hippodrome.protocol.session import SessionDocument
 
 StoredDocuments = Mapping[str, tuple[bytes, str, datetime]]  # by key: a document's body, ETag and time
 

@@ -1,8 +1,8 @@
 """The simulated servers of a study with `matching: match` that have no members yet: they answer who plays with whom.
 
-They do what `trial/server/matching.py` does: each server reads the question every two seconds, calls `match`, and
+They do what `hippodrome/trial/server/matching.py` does: each server reads the question every two seconds, calls `match`, and
 creates the document of its answer; the first answer counts. Here a call of `match` takes up to a second (`TAKES`),
-while the trial allows it five (`trial/agent/match.py`); it groups the participants in the order of their ids.
+while the trial allows it five (`hippodrome/trial/agent/match.py`); it groups the participants in the order of their ids.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import json
 from functools import partial
 from typing import Any
 
-from hippodrome.ports import Conflict
-from protocol.keys import groups_key, waiting_key
+from hippodrome.control.ports import Conflict
+from hippodrome.protocol.keys import groups_key, waiting_key
+from hippodrome.trial.server.matching import LOOK_SECONDS
 from testing.simulation.ports import SimPlatform
 from testing.tasks import Life
-from trial.server.matching import LOOK_SECONDS
 
 TAKES = (0.05, 1.0)  # seconds from the call of `match` until its answer is stored
 

@@ -8,12 +8,12 @@ from datetime import datetime
 from typing import Any
 from urllib.parse import urlencode
 
-from hippodrome.model import ids
+from hippodrome.control.model import ids
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.trials import SimTrial, is_lost
 from testing.simulation.world import SECRET, SimulatedWorld
 
-POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two polls of the lobby's page, as in web/game/
+POLL, PROPOSED_POLL = 2.0, 0.5  # seconds between two polls of the lobby's page, as in hippodrome/web/game/
 GIVES_UP = 3900.0  # seconds in the lobby: `patience` is an hour at most
 
 

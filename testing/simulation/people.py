@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
 
-from hippodrome.ports import Conflict
-from protocol.keys import answer_key
+from hippodrome.control.ports import Conflict
+from hippodrome.protocol.keys import answer_key
 from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import SimulatedWorld
@@ -19,11 +19,16 @@ MAX_TRIES = 4  # requests of a page that does not come
 RETRY = 2.0  # seconds until people try again
 PATIENCE = 900.0  # seconds at the waiting page
 RELOADS = 75.0  # seconds at the waiting page after which people load it again
-POLLS = {"first": 1.0, "growth": 1.15, "longest": 4.0, "naming": 1.5}  # seconds, as in web/game/; a test compares them
+POLLS = {
+    "first": 1.0,
+    "growth": 1.15,
+    "longest": 4.0,
+    "naming": 1.5,
+}  # seconds, as in hippodrome/web/game/; a test compares them
 
 
 def poll_delay(state: Mapping[str, Any], polls: int) -> float:
-    """Return the seconds until the waiting page's next poll, after so many polls, as `pollDelay` of web/game/ does."""
+    """Return the seconds until the waiting page's next poll, after so many polls, as `pollDelay` of hippodrome/web/game/ does."""
     if state.get("state") in ("failed", "ended"):
         return POLLS["longest"]
     if state.get("state") == "naming":
@@ -32,7 +37,7 @@ def poll_delay(state: Mapping[str, Any], polls: int) -> float:
 
 
 def retry_delay(tries: int) -> float:
-    """Return the seconds until the waiting page repeats a poll without answer, as `pollUntilAnswered` of web/game/ does."""
+    """Return the seconds until the waiting page repeats a poll without answer, as `pollUntilAnswered` of hippodrome/web/game/ does."""
     return float(min(POLLS["longest"], POLLS["first"] * 2**tries))
 
 

@@ -10,10 +10,10 @@ from datetime import datetime
 from functools import partial
 from typing import TypeVar
 
-from hippodrome.aws.dns import BATCH
-from hippodrome.aws.retry import retry_while_busy
-from hippodrome.model import ids
-from hippodrome.ports import (
+from hippodrome.control.aws.dns import BATCH
+from hippodrome.control.aws.retry import retry_while_busy
+from hippodrome.control.model import ids
+from hippodrome.control.ports import (
     Conflict,
     DnsRecord,
     Document,
@@ -150,7 +150,7 @@ class SimDns:
         return self._in_sync[change]
 
     def _change(self, changes: Sequence[tuple[DnsRecord, bool]]) -> str:
-        """Make one batch of changes, and try again while the zone is busy, as `hippodrome.aws.dns` does."""
+        """Make one batch of changes, and try again while the zone is busy, as `hippodrome.control.aws.dns` does."""
         clock = self._cloud.clock
         add, remove = ([record for record, added in changes if added is kind] for kind in (True, False))
         return retry_while_busy(
@@ -236,7 +236,7 @@ class SimBus:
 
 
 class SimPlatform:
-    """Implements `hippodrome.ports.Platform` on the simulated account."""
+    """Implements `hippodrome.control.ports.Platform` on the simulated account."""
 
     def __init__(self, clock: GreenletClock, cloud: Cloud, settings: Settings, conditions: Conditions) -> None:
         self.clock, self.settings = clock, settings

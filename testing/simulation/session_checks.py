@@ -7,9 +7,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 
-from hippodrome.model import memberships
-from hippodrome.model.project import Project
-from protocol.keys import answer_key, membership_key
+from hippodrome.control.model import memberships
+from hippodrome.control.model.project import Project
+from hippodrome.protocol.keys import answer_key, membership_key
 from testing.simulation.lobby import StoredDocuments, formed
 from testing.simulation.members import SimulatedMember
 

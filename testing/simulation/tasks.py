@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hippodrome.ports import (
+from hippodrome.control.ports import (
     Address,
     NoCapacity,
     Refused,

@@ -1,6 +1,6 @@
 """The simulated trial servers of sessions: they let the members in, play, and write their answers.
 
-They behave like trial/server/ and trial/core/ with the defaults of config.yml. The game begins when all members are
+They behave like hippodrome/trial/server/ and hippodrome/trial/core/ with the defaults of config.yml. The game begins when all members are
 connected, pauses while one is away, and ends for all when one was away for more than `ABSENT` seconds. A server that
 replaces a lost one goes on where the recordings of the lost server end.
 """
@@ -13,10 +13,10 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 
-from hippodrome.ports import Conflict
-from protocol import session as sessions
-from protocol.keys import answer_key, session_key
-from protocol.session import SessionDocument, member_token
+from hippodrome.control.ports import Conflict
+from hippodrome.protocol import session as sessions
+from hippodrome.protocol.keys import answer_key, session_key
+from hippodrome.protocol.session import SessionDocument, member_token
 from testing.simulation.ports import SimPlatform
 from testing.simulation.tasks import TimedTask
 from testing.tasks import Life

@@ -9,19 +9,19 @@ from typing import Any
 
 import msgspec
 
-from hippodrome.limits.rules import SERVER_SLOTS
-from hippodrome.model import ids, server
-from hippodrome.model.messages import KeepWarm, to_message
-from hippodrome.model.project import MASTER_LIST, Events, MasterList, Project, Step
-from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Server
-from hippodrome.model.warm_pool import POOLS
-from hippodrome.ports import Message, Settings, Topic
-from hippodrome.servers.causes import Cause
-from hippodrome.storage.secret import KEY, Secret
-from lambdas import installed, next_step, start_server, stop_server, sweep, task_changed
-from protocol.keys import handover_key, handovers_folder, session_key
-from protocol.session import is_session_id
+from hippodrome.control.limits.rules import SERVER_SLOTS
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.messages import KeepWarm, to_message
+from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Project, Step
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import Server
+from hippodrome.control.model.warm_pool import POOLS
+from hippodrome.control.ports import Message, Settings, Topic
+from hippodrome.control.servers.causes import Cause
+from hippodrome.control.storage.secret import KEY, Secret
+from hippodrome.functions import installed, next_step, start_server, stop_server, sweep, task_changed
+from hippodrome.protocol.keys import handover_key, handovers_folder, session_key
+from hippodrome.protocol.session import is_session_id
 from testing import aws_events, template
 from testing.port_faults import Crash
 from testing.simulation import functions, lobby

@@ -15,7 +15,7 @@ import pytest
 from bench import __main__ as command
 from bench import table
 from bench.row import Row, row
-from deploy.cost import estimate
+from hippodrome.deployment.cost import estimate
 
 
 def test_goals_are_about_the_ratio_where_there_is_a_yardstick() -> None:

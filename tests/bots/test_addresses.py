@@ -10,8 +10,8 @@ from random import Random
 
 import pytest
 
-from bots.addresses import THIS_MACHINE, AddressRefused, AllowedAddresses, OneSite
-from bots.bot import Bot
+from hippodrome.bots.addresses import THIS_MACHINE, AddressRefused, AllowedAddresses, OneSite
+from hippodrome.bots.bot import Bot
 from testing.certificates import authority
 
 SITE = "study.example.org"

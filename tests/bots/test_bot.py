@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from bots.bot import Bot
-from bots.page import VisitedPage
-from hippodrome.config.project_keys import MAX_STEPS
+from hippodrome.bots.bot import Bot
+from hippodrome.bots.page import VisitedPage
+from hippodrome.control.config.project_keys import MAX_STEPS
 
 
 def test_a_request_that_is_not_answered_in_time_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,7 +18,7 @@ def test_a_request_that_is_not_answered_in_time_is_reported_with_its_reason(monk
     async def late(*_: object, **__: object) -> None:
         raise TimeoutError
 
-    monkeypatch.setattr("bots.bot.ask", late)
+    monkeypatch.setattr("hippodrome.bots.bot.ask", late)
     bot = Bot("http://127.0.0.1:8000/next?projectId=x", "ada", Random(0), patience=0.1)
     report = asyncio.run(bot.run())
     assert report.errors == ["no answer from 127.0.0.1:8000/next: TimeoutError"]

@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from bots import form_filling, forms
+from hippodrome.bots import form_filling, forms
 
 HIDDEN = [
     "<button hidden>Go</button>",

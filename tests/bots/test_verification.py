@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bots import verification
-from bots.verification import document, read_recording
+from hippodrome.bots import verification
+from hippodrome.bots.verification import document, read_recording
 
 GAME = [{"kind": "header", "step": "3"}, {"kind": "reset"}, {"kind": "step"}, {"kind": "step"}, {"kind": "end"}]
 

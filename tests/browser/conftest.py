@@ -14,13 +14,14 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from bots.links import with_user
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from hippodrome.bots.links import with_user
+from hippodrome.local.rehearsal.study_process import StudyProcess, copy_of
+from hippodrome.trial.recordings.recording import read
 from testing import exploration
 from testing.browser import ARGUMENTS, NoChromium, chromium_path, headless_path
 from testing.held_study import HeldStudy
+from testing.processes import ROOT
 from tests.browser.world import PATIENCE, SHOTS, world  # noqa: F401 - a fixture
-from trial.recordings.recording import read
 
 NO_CHROMIUM = "there is no Chromium; to run these tests: apt-get install chromium"
 HERE = Path(__file__).parent

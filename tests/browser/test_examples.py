@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from bots.links import with_user
+from hippodrome.bots.links import with_user
+from hippodrome.trial.recordings.recording import read
 from tests.browser.conftest import Hold
 from tests.browser.world import SHOTS
-from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hippodrome.trial.pictures.encoder import Encoder
+from hippodrome.trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 from testing.browser import game_page
 from tests.browser.world import OLD_BROWSERS, PATIENCE, World, play, wait_for_reconnection
 from tests.trial.conftest import launch
-from trial.pictures.encoder import Encoder
-from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Frame, header, jpeg
 
 __all__ = ["launch"]  # a fixture
 pytestmark = pytest.mark.browser

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.links import with_user
-from hippodrome.model.texts import ENGLISH, PLACE
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from hippodrome.bots.links import with_user
+from hippodrome.control.model.texts import ENGLISH, PLACE
+from hippodrome.local.rehearsal.study_process import StudyProcess, copy_of
 from testing.held_study import HeldStudy
+from testing.processes import ROOT
 from tests.browser.conftest import GamesToEnd
 from tests.browser.world import FLAWS, SHOTS
 

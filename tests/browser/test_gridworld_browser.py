@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from bots.links import with_user
-from local.rehearsal.study_process import StudyProcess
+from hippodrome.bots.links import with_user
+from hippodrome.local.rehearsal.study_process import StudyProcess
+from hippodrome.trial.recordings.recording import read
 from tests.browser.conftest import Hold
-from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 

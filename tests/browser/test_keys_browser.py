@@ -115,9 +115,7 @@ def test_labels_without_keys_are_the_texts_of_the_usual_buttons(world: World, ta
 
 # Pages beside the game
 
-BETWEEN = (
-    2_500  # ms for which the last picture is shown before the page between two games, as web/game/reading.js has it
-)
+BETWEEN = 2_500  # ms for which the last picture is shown before the page between two games, as hippodrome/web/game/reading.js has it
 RULES = "<h1>The rules</h1><p>Jump over the stones.</p>"
 PAUSE = "<h2>Have a rest</h2><p>Look out of the window.</p>"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model.texts import ENGLISH, is_right_to_left
+from hippodrome.control.model.texts import ENGLISH, is_right_to_left
 from tests.browser.test_together_browser import LOBBY
 from tests.browser.world import FLAWS, World, play, shot, tell
 

@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from hippodrome.model.texts import IN_ENGLISH
-from hippodrome.participants import frame, game_modules
-from hippodrome.participants.texts import in_script
+from hippodrome.control.model.texts import IN_ENGLISH
+from hippodrome.control.participants import frame, game_modules
+from hippodrome.control.participants.texts import in_script
 from tests.browser.conftest import hold_timers
 from tests.browser.world import (
     FLAWS,

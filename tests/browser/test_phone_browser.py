@@ -268,7 +268,7 @@ def test_a_message_of_the_server_clears_the_sentence_about_the_connection(world:
     assert stopped_clock_tab.inner_text("#trouble") == ""
 
 
-MESSAGE = 8_000  # ms for which the page shows one, as web/game/overlay.js has it
+MESSAGE = 8_000  # ms for which the page shows one, as hippodrome/web/game/overlay.js has it
 COVERED = """() => {
     const box = (each) => each.getBoundingClientRect(), words = box(document.getElementById("trouble"));
     return [...document.getElementById("overlay").children].filter((each) => {

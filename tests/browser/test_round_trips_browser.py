@@ -1,4 +1,4 @@
-"""The assumption of `trial/wire/round_trips.py`: a browser answers pings by itself, even while its page is busy."""
+"""The assumption of `hippodrome/trial/wire/round_trips.py`: a browser answers pings by itself, even while its page is busy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
+from hippodrome.trial.wire import round_trips
 from tests.browser.world import PATIENCE
-from trial.wire import round_trips
 
 WANTED = 10  # round trips while the page is busy
 

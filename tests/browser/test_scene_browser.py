@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from local.rehearsal.study_process import ROOT
+from testing.processes import ROOT
 from tests.browser.world import FLAWS, OLD_BROWSERS, PATIENCE, RED, World, deflated_zeros, pack, shot
 from tests.browser.world import play as open_game
 from tests.trial.conftest import Running
@@ -288,10 +288,12 @@ SIZE_OF = """async (bytes) => {
 def test_the_page_reads_the_size_of_an_image_without_decoding_it(tab: Any, form: str, options: dict[str, Any]) -> None:
     out = io.BytesIO()
     Image.new("RGB", (300, 77), "red").save(out, form, **options)
-    sizes = (ROOT / "web/game/sprites.js").read_text()
+    sizes = (ROOT / "hippodrome/web/game/sprites.js").read_text()
     function = re.search(r"^function sizeOf\(view\).*?^}", sizes, re.DOTALL | re.MULTILINE)
     jpeg = re.search(
-        r"^export (function jpegSize.*?^})", (ROOT / "web/game/frames.js").read_text(), re.DOTALL | re.MULTILINE
+        r"^export (function jpegSize.*?^})",
+        (ROOT / "hippodrome/web/game/frames.js").read_text(),
+        re.DOTALL | re.MULTILINE,
     )
     assert function is not None
     assert jpeg is not None

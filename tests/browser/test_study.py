@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from local.rehearsal.study_process import servers_of, wait_until_gone
+from hippodrome.local.rehearsal.study_process import servers_of, wait_until_gone
 from tests.browser.world import PATIENCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]

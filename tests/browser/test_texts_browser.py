@@ -13,12 +13,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hippodrome.model.project import Project
-from hippodrome.model.texts import ENGLISH, LANGUAGE, PLACE, Texts, is_language, places
-from hippodrome.participants import pages
-from hippodrome.participants.frame import message_page
-from hippodrome.participants.texts import in_script
-from tests.hippodrome.participants.test_pages import LOBBY, PROJECT, game, step_view
+from hippodrome.control.model.project import Project
+from hippodrome.control.model.texts import ENGLISH, LANGUAGE, PLACE, Texts, is_language, places
+from hippodrome.control.participants import pages
+from hippodrome.control.participants.frame import message_page
+from hippodrome.control.participants.texts import in_script
+from tests.control.participants.test_pages import LOBBY, PROJECT, game, step_view
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 

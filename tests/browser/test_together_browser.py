@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from hippodrome.trial.core.session import PARTNER_MISSING, PING
 from testing.browser import ARGUMENTS, chromium_path, html_page
 from testing.waiting import until
 from tests.browser.conftest import hold_timers, note_texts, wait_for_noted
 from tests.browser.world import FLAWS, LAST_PICTURE, PATIENCE, World, shot, tell
-from trial.core.session import PARTNER_MISSING, PING
 
 pytestmark = pytest.mark.browser
 SIZES = [(360, 740), (1280, 800)]
@@ -481,7 +481,7 @@ def test_words_over_a_low_picture_are_seen_whole(group: World, tab: Any, width: 
     assert tab.evaluate(SEEN_WHOLE, "trouble")
 
 
-MESSAGE = 8_000  # ms for which the page shows one, as web/game/overlay.js has it
+MESSAGE = 8_000  # ms for which the page shows one, as hippodrome/web/game/overlay.js has it
 SEEN_WHOLE = """id => {
     const found = document.getElementById(id), box = found.getBoundingClientRect(), x = (box.left + box.right) / 2;
     found.style.pointerEvents = "auto";

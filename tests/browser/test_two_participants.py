@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from bots.links import with_user
-from local.rehearsal.study_process import StudyProcess
+from hippodrome.bots.links import with_user
+from hippodrome.local.rehearsal.study_process import StudyProcess
+from hippodrome.trial.recordings.recording import read
+from hippodrome.trial.settings import STALLED_SECONDS
 from tests.browser.conftest import Hold
 from tests.browser.test_together_browser import asleep, players_shown, wait_for_text
 from tests.browser.world import FLAWS, shot
-from trial.recordings.recording import read
-from trial.settings import STALLED_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
 CHANGES = {

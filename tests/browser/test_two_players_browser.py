@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from bots.links import with_user
-from local.rehearsal.study_process import ROOT, StudyProcess, copy_of
+from hippodrome.bots.links import with_user
+from hippodrome.local.rehearsal.study_process import StudyProcess, copy_of
+from hippodrome.trial.recordings.recording import read
 from testing.held_study import HeldStudy
+from testing.processes import ROOT
 from tests.browser.conftest import GamesToEnd, Hold, note_texts, replace_lines, wait_for_noted
 from tests.browser.world import PATIENCE, SHOTS
-from trial.recordings.recording import read
 
 pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300)]
 

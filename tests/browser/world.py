@@ -20,9 +20,9 @@ import pytest
 from websockets.sync.server import serve
 from websockets.typing import Subprotocol
 
-from hippodrome.model.project import Project, Step
-from hippodrome.participants import frame, pages
-from local.rehearsal.study_process import ROOT
+from hippodrome.control.model.project import Project, Step
+from hippodrome.control.participants import frame, pages
+from testing.processes import ROOT
 from testing.waiting import until
 
 SHOTS = ROOT / "shots"
@@ -47,7 +47,7 @@ OLD_BROWSERS = {
         }""",
 }
 """What makes Chromium lack what these browsers lack, as scripts."""
-LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as web/game/overlay.js has it
+LAST_PICTURE = 4_000  # ms for which the page shows it at the end, as hippodrome/web/game/overlay.js has it
 
 
 def pack(frame_id: int, pixels: bytes, last: bytes | None = None) -> bytes:

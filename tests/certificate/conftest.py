@@ -12,11 +12,11 @@ from types import SimpleNamespace
 import acme.client
 import pytest
 
-from hippodrome.certificates import rules as certificate
-from hippodrome.certificates.renewal import Renewal, RenewalOutcome, RenewalRequest
-from hippodrome.certificates.rules import ACCOUNT, CertificateRecord, OrderStage
-from hippodrome.ports import Documents
-from local.backend.documents import FolderDocuments
+from hippodrome.control.certificates import rules as certificate
+from hippodrome.control.certificates.renewal import Renewal, RenewalOutcome, RenewalRequest
+from hippodrome.control.certificates.rules import ACCOUNT, CertificateRecord, OrderStage
+from hippodrome.control.ports import Documents
+from hippodrome.local.backend.documents import FolderDocuments
 from testing.moto_world import moto_world  # noqa: F401 - a fixture
 from tests.certificate.pebble import MISSING, Pebble, TestChallenges, installed, running
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.aws.challenges import Route53Challenges
+from hippodrome.control.aws.challenges import Route53Challenges
 from testing.certificates import authority
 
 MISSING = "pebble and pebble-challtestsrv are not installed (Debian packages of these names)"

@@ -5,8 +5,8 @@ import pytest
 from botocore.exceptions import ClientError
 from botocore.stub import Stubber
 
-from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificates.rules import FailureReason, OrderFailed
+from hippodrome.control.aws.challenges import Route53Challenges
+from hippodrome.control.certificates.rules import FailureReason, OrderFailed
 
 NAME = "_acme-challenge.example.org"
 VALUE = "19MF_VkGpxclfMNKZvHf2MT88F4ajEaYxJiNGapvGpI"

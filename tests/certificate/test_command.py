@@ -9,16 +9,16 @@ import pytest
 from cryptography import x509
 from moto.route53.models import HostedZoneIdentifier
 
-from deploy.stack import certificate
-from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificates import rules
-from hippodrome.certificates.renewal import Renewal
-from hippodrome.certificates.rules import PRODUCTION, STAGING, CertificateRecord, FailedOrder, FailureReason
-from hippodrome.model.records import from_json, to_json
+from hippodrome.control.aws.challenges import Route53Challenges
+from hippodrome.control.certificates import rules
+from hippodrome.control.certificates.renewal import Renewal
+from hippodrome.control.certificates.rules import PRODUCTION, STAGING, CertificateRecord, FailedOrder, FailureReason
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.deployment.stack import certificate
 from tests.certificate.conftest import FULLCHAIN, PRIVKEY, STATE
 from tests.certificate.nameserver import answering, ask_only
 from tests.certificate.pebble import answer_as_route_53, make_ca
-from tests.deploy.installation import Installed
+from tests.deployment.installation import Installed
 
 DOMAIN = "example.org"
 
@@ -51,12 +51,12 @@ def internet(monkeypatch):
         stack.append(context)
         ask_only(monkeypatch, context.__enter__())
         # This server answers each question, but on a busy machine it may need more than the 0.2 s of the deaf one below.
-        monkeypatch.setattr("deploy.aws.hosted_zone.DNS_TIMEOUT", 60.0)
+        monkeypatch.setattr("hippodrome.deployment.aws.hosted_zone.DNS_TIMEOUT", 60.0)
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         ask_only(monkeypatch, deaf.getsockname()[1])
-        monkeypatch.setattr("deploy.aws.hosted_zone.DNS_TIMEOUT", 0.2)
+        monkeypatch.setattr("hippodrome.deployment.aws.hosted_zone.DNS_TIMEOUT", 0.2)
         yield say
     for context in stack:
         context.__exit__(None, None, None)
@@ -355,7 +355,7 @@ def test_wrong_options_are_refused(world, capsys, arguments, said):
 
 
 def test_every_reason_of_a_failure_has_a_sentence_and_advice():
-    from hippodrome.certificates.renewal import RenewalRequest
+    from hippodrome.control.certificates.renewal import RenewalRequest
 
     for trouble in FailureReason:
         for directory in (STAGING, PRODUCTION, "https://ca.example/dir", "https:"):
@@ -366,7 +366,7 @@ def test_every_reason_of_a_failure_has_a_sentence_and_advice():
 
 
 def test_other_commands_can_obtain_a_certificate(world, own, pebble):
-    from deploy.aws.account import find_installation, open_account
+    from hippodrome.deployment.aws.account import find_installation, open_account
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):

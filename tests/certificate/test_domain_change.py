@@ -4,14 +4,14 @@
 
 import pytest
 
-from console.problem import Problem
-from deploy.stack import domain_change
-from hippodrome.aws.challenges import Route53Challenges
-from hippodrome.certificates.order import read_stored
-from hippodrome.certificates.rules import FailureReason, OrderFailed, location
+from hippodrome.console.problem import Problem
+from hippodrome.control.aws.challenges import Route53Challenges
+from hippodrome.control.certificates.order import read_stored
+from hippodrome.control.certificates.rules import FailureReason, OrderFailed, location
+from hippodrome.deployment.stack import domain_change
 from tests.certificate.test_command import own
-from tests.deploy.installation import access_keys
-from tests.deploy.stack.test_domain_change import prepared, world
+from tests.deployment.installation import access_keys
+from tests.deployment.stack.test_domain_change import prepared, world
 
 OLD, NEW = location("games.example.org"), location("servers.example.org")
 

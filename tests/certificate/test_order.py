@@ -21,16 +21,24 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from hippodrome.certificates.order import chain_of
-from hippodrome.certificates.renewal import Renewal, RenewalRequest, renew
-from hippodrome.certificates.rules import ACCOUNT, CLAIM, FailureReason, OrderFailed, OrderStage, Verdict, renew_at
-from hippodrome.ports import Conflict
-from local.backend.documents import FolderDocuments
+from hippodrome.control.certificates.order import chain_of
+from hippodrome.control.certificates.renewal import Renewal, RenewalRequest, renew
+from hippodrome.control.certificates.rules import (
+    ACCOUNT,
+    CLAIM,
+    FailureReason,
+    OrderFailed,
+    OrderStage,
+    Verdict,
+    renew_at,
+)
+from hippodrome.control.ports import Conflict
+from hippodrome.local.backend.documents import FolderDocuments
+from hippodrome.trial.recordings.store import FolderStore
+from hippodrome.trial.server.certificate import Certificate
+from hippodrome.trial.settings import TrialSettings
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca
-from trial.recordings.store import FolderStore
-from trial.server.certificate import Certificate
-from trial.settings import TrialSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -309,9 +317,9 @@ def test_a_process_killed_while_it_waits_leaves_a_claim_that_lapses(place, tmp_p
 import os, signal, sys
 from datetime import UTC, datetime
 from pathlib import Path
-from hippodrome.certificates.rules import location
-from hippodrome.certificates.renewal import Renewal, RenewalRequest
-from local.backend.documents import FolderDocuments
+from hippodrome.control.certificates.rules import location
+from hippodrome.control.certificates.renewal import Renewal, RenewalRequest
+from hippodrome.local.backend.documents import FolderDocuments
 class Nowhere:
     def put(self, *_): os.kill(os.getpid(), signal.SIGKILL)
     def remove(self, *_): pass

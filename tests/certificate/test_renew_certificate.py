@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from hippodrome.certificates.rules import ACCOUNT, OrderFailed
-from hippodrome.ports import Settings
-from lambdas import installed
-from lambdas.renew_certificate import MARGIN, handler
+from hippodrome.control.certificates.rules import ACCOUNT, OrderFailed
+from hippodrome.control.ports import Settings
+from hippodrome.functions import installed
+from hippodrome.functions.renew_certificate import MARGIN, handler
 from tests.certificate.conftest import DOMAIN, PLACE, PRIVKEY
 from tests.certificate.pebble import answer_as_route_53
 
@@ -88,7 +88,7 @@ def test_a_certificate_that_was_put_there_by_hand_is_not_renewed(function, place
 
 def test_the_functions_role_allows_its_calls_and_no_other_role_allows_its_writes(moto_world, pebble, monkeypatch):
     """Route 53 and S3 on moto; the roles in infra/template.yml must allow each call (see testing/iam/enforcement.py)."""
-    from hippodrome.certificates.renewal import Renewal, RenewalRequest
+    from hippodrome.control.certificates.renewal import Renewal, RenewalRequest
     from testing.iam.actions import asks
 
     if moto_world.iam is None:

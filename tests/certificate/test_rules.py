@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.certificates import rules
-from hippodrome.certificates.rules import (
+from hippodrome.control.certificates import rules
+from hippodrome.control.certificates.rules import (
     CLAIM,
     STAGING,
     CertificateRecord,
@@ -18,7 +18,7 @@ from hippodrome.certificates.rules import (
     StoredCertificate,
     Verdict,
 )
-from hippodrome.model.records import from_json, to_json
+from hippodrome.control.model.records import from_json, to_json
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 NAMES = ("*.example.org",)

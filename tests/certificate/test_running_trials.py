@@ -18,7 +18,7 @@ from testing.waiting import until
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PRIVKEY
 
 ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = "import sys, trial.server.listener; trial.server.listener.RELOAD_SECONDS = 0.1; from trial.__main__ import main; sys.exit(main())"
+PROGRAM = "import sys, hippodrome.trial.server.listener; hippodrome.trial.server.listener.RELOAD_SECONDS = 0.1; from hippodrome.trial.__main__ import main; sys.exit(main())"
 AGENT = """
 class Agent:
     def start(self, game): pass

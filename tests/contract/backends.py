@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import pytest
 
-from hippodrome.model import ids
-from hippodrome.ports import Platform, TaskRequest
-from local.backend.platform import LocalPlatform
-from local.backend.processes import end_everything
+from hippodrome.control.model import ids
+from hippodrome.control.ports import Platform, TaskRequest
+from hippodrome.local.backend.platform import LocalPlatform
+from hippodrome.local.backend.processes import end_everything
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
 
@@ -50,7 +50,7 @@ class Backend(Protocol):
 
 
 class MotoBackend(Backend):
-    """`hippodrome.aws` on moto; `testing/moto_world.py` adds, and notes, what moto lacks."""
+    """`hippodrome.control.aws` on moto; `testing/moto_world.py` adds, and notes, what moto lacks."""
 
     def __init__(self, world: MotoWorld) -> None:
         self.world = world

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.ports import Platform
+from hippodrome.control.ports import Platform
 from testing.moto_world import MotoWorld
 from tests.contract.backends import Backend, MemoryBackend, MotoBackend, local_backend
 

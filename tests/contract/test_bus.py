@@ -1,8 +1,8 @@
-"""The contract of `hippodrome.ports.Bus`."""
+"""The contract of `hippodrome.control.ports.Bus`."""
 
 from __future__ import annotations
 
-from hippodrome.ports import Topic
+from hippodrome.control.ports import Topic
 from tests.contract.backends import Backend
 
 MESSAGE = {

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.ports.Dns`."""
+"""The contract of `hippodrome.control.ports.Dns`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from hippodrome.ports import Dns, DnsRecord, Platform
+from hippodrome.control.ports import Dns, DnsRecord, Platform
 from tests.contract.backends import name
 
 RECORDS = [DnsRecord(f"{name(n)}.servers.example.org", f"203.0.113.{n}") for n in range(1, 5)]

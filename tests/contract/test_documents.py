@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.ports.Documents`."""
+"""The contract of `hippodrome.control.ports.Documents`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from hippodrome.ports import Conflict, Documents, Platform
+from hippodrome.control.ports import Conflict, Documents, Platform
 from tests.contract.backends import concurrent
 
 KEY = "study/users/P_1-a/participant.json"

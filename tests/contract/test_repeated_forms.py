@@ -10,13 +10,13 @@ from urllib.parse import urlencode
 
 import pytest
 
-from hippodrome.http import Request
-from hippodrome.model import ids
-from hippodrome.model.project import MASTER_LIST, Events, MasterList, Step, step_key
-from hippodrome.model.records import to_json
-from hippodrome.participants.journey import Journey
-from hippodrome.ports import Platform
-from hippodrome.storage.secret import KEY
+from hippodrome.control.http import Request
+from hippodrome.control.model import ids
+from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Step, step_key
+from hippodrome.control.model.records import to_json
+from hippodrome.control.participants.journey import Journey
+from hippodrome.control.ports import Platform
+from hippodrome.control.storage.secret import KEY
 from testing.studies import INSTALLATION_SECRET, SECRET, study
 from tests.contract.backends import concurrent
 

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.ports.Tasks`."""
+"""The contract of `hippodrome.control.ports.Tasks`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from hippodrome.ports import Platform, Tasks
+from hippodrome.control.ports import Platform, Tasks
 from tests.contract.backends import Backend, concurrent, name
 
 CLUSTER = "hippodrome"

@@ -1,4 +1,4 @@
-"""The contract of `hippodrome.ports.Timers`."""
+"""The contract of `hippodrome.control.ports.Timers`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from datetime import timedelta
 
 import pytest
 
-from hippodrome.ports import Platform, Timers
+from hippodrome.control.ports import Platform, Timers
 from tests.contract.backends import Backend, name
 
 STOP = {"projectId": "study", "userId": "P1", "attempt": 1, "reason": "deadline"}

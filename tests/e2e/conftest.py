@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from local.rehearsal.study_process import StudyProcess
+from hippodrome.local.rehearsal.study_process import StudyProcess
 from testing import ports
 from testing.held_study import HeldStudy
 

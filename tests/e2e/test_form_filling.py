@@ -13,7 +13,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bots import form_filling, forms
+from hippodrome.bots import form_filling, forms
 
 SEEDS = st.integers(0, 2**32)
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1, max_size=12)

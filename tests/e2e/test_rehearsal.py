@@ -20,21 +20,22 @@ from typing import Any
 import psutil
 import pytest
 
-from bots.addresses import THIS_MACHINE, AddressRefused
-from bots.bot import Bot
-from bots.game import RandomKeys
-from bots.links import with_project, with_user
-from local.new import LEFT_OUT
-from local.rehearsal.study_process import ROOT, copy_of, servers_of
+from hippodrome.bots.addresses import THIS_MACHINE, AddressRefused
+from hippodrome.bots.bot import Bot
+from hippodrome.bots.game import RandomKeys
+from hippodrome.bots.links import with_project, with_user
+from hippodrome.local.new import LEFT_OUT
+from hippodrome.local.rehearsal.study_process import copy_of, servers_of
+from hippodrome.trial.recordings.recording import read
 from testing import processes
+from testing.processes import ROOT
 from testing.waiting import until
-from trial.recordings.recording import read
 
 TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the system call that names a thread
 Process = subprocess.Popen[str]
 
 
-def rehearsal(*arguments: str | Path, module: str = "local.rehearsal", **env: str) -> Process:
+def rehearsal(*arguments: str | Path, module: str = "hippodrome.local.rehearsal", **env: str) -> Process:
     return processes.start(
         module,
         [*map(str, arguments)],
@@ -54,7 +55,9 @@ def said(process: Process, seconds: float = 120) -> str:
 
 
 def test_bots_walk_through_the_example_project(tmp_path: Path) -> None:
-    process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="local.rehearsal")
+    process = rehearsal(
+        ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="hippodrome.local.rehearsal"
+    )
     text = said(process)
     assert process.returncode == 0, text
     for line in ("ui.stop", "2 of 2: a bot plays 2 s (`--play 0`: to the end)", "6 of 6", "of 30 set", "none"):
@@ -224,7 +227,7 @@ def test_an_agent_that_fails_late_and_goes_on_is_an_error_with_its_line_and_trac
 
 
 def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    from deploy.__main__ import main
+    from hippodrome.deployment.__main__ import main
 
     folder = project(length=30)
     process = rehearsal(folder, "--bots", "2", "--play", "1")

@@ -1,4 +1,4 @@
-"""Whole studies over HTTP and WebSocket: `python -m local` in a process of its own, and bots for participants."""
+"""Whole studies over HTTP and WebSocket: `python -m hippodrome.local` in a process of its own, and bots for participants."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 import psutil
 import pytest
 
-from bots.bot import Bot
-from bots.http import ask
-from bots.links import with_user
-from bots.report import BotReport
-from local.rehearsal.logs import Verification, verify
-from local.rehearsal.study_process import StudyNotStarted, StudyProcess, servers_of, wait_until_gone
+from hippodrome.bots.bot import Bot
+from hippodrome.bots.http import ask
+from hippodrome.bots.links import with_user
+from hippodrome.bots.report import BotReport
+from hippodrome.local.rehearsal.logs import Verification, verify
+from hippodrome.local.rehearsal.study_process import StudyNotStarted, StudyProcess, servers_of, wait_until_gone
 from testing.waiting import until_async
 
 
@@ -199,7 +199,7 @@ def test_the_same_page_twice_and_a_reload_change_nothing(project: Any, hold: Any
 
 
 def _hidden(page: Any) -> list[tuple[str, str]]:
-    from bots.forms import hidden
+    from hippodrome.bots.forms import hidden
 
     return list(hidden(page.form))
 

@@ -16,12 +16,13 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.bot import Bot
-from local.new import LEFT_OUT
-from local.rehearsal.logs import verify
-from local.rehearsal.study_process import ROOT, wait_until_gone
+from hippodrome.bots.bot import Bot
+from hippodrome.local.new import LEFT_OUT
+from hippodrome.local.rehearsal.logs import verify
+from hippodrome.local.rehearsal.study_process import wait_until_gone
+from hippodrome.trial.recordings.recording import read
 from testing.held_study import HeldStudy
-from trial.recordings.recording import read
+from testing.processes import ROOT
 
 EXAMPLES = ROOT / "examples"
 PATIENCE = 120.0  # seconds within which a bot must finish the study

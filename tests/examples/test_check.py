@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from local.rehearsal.study_process import ROOT
 from testing import processes
+from testing.processes import ROOT
 
 EXAMPLES = sorted(path.parent.name for path in (ROOT / "examples").glob("*/config.yml"))
 
@@ -17,7 +17,7 @@ EXAMPLES = sorted(path.parent.name for path in (ROOT / "examples").glob("*/confi
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_make_check_finds_neither_mistakes_nor_remarks(example: str, tmp_path: Path) -> None:
     process = processes.start(
-        "local.check",
+        "hippodrome.local.check",
         [str(ROOT / "examples" / example)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},

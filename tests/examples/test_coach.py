@@ -172,7 +172,7 @@ def test_the_seed_repeats_an_episode(load_module: Any) -> None:
 
 
 def test_every_scene_can_be_drawn(load_module: Any) -> None:
-    from trial.pictures.scene import as_scene
+    from hippodrome.trial.pictures.scene import as_scene
 
     agent = load_module("coach", "agent").Agent()
     agent.start("garden")

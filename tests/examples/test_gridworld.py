@@ -126,8 +126,8 @@ def test_a_game_ends_when_all_acorns_are_collected_or_the_turns_are_over(modules
 
 
 def test_every_scene_can_be_drawn(modules: Any) -> None:
-    from trial.pictures.assets import load
-    from trial.pictures.scene import as_scene, images_of
+    from hippodrome.trial.pictures.assets import load
+    from hippodrome.trial.pictures.scene import as_scene, images_of
 
     _, _, module = modules
     agent = module.Agent()

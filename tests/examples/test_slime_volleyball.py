@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hippodrome.trial.pictures.scene import as_scene, images_of
 from testing import onnx_files
-from trial.pictures.scene import as_scene, images_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "slime-volleyball"
 LEFT, RIGHT = "agent_left", "agent_right"

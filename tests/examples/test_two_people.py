@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.bot import Bot
-from local.new import LEFT_OUT
-from local.rehearsal.logs import verify
-from local.rehearsal.study_process import ROOT
+from hippodrome.bots.bot import Bot
+from hippodrome.local.new import LEFT_OUT
+from hippodrome.local.rehearsal.logs import verify
+from hippodrome.trial.recordings.recording import read
 from testing.held_study import HeldStudy
-from trial.recordings.recording import read
+from testing.processes import ROOT
 
 SHORT = {"maxEpisodes": 1, "resetFreeze": 0, "countdown": 1, "absent": 10}
 PATIENCE = 150.0  # seconds within which both bots must finish the study

@@ -13,17 +13,18 @@ from typing import Any
 import pytest
 import yaml
 
-from bots.bot import Bot
-from bots.page import VisitedPage
-from bots.report import BotReport
-from bots.verification import document
-from local.new import LEFT_OUT
-from local.rehearsal.logs import verify
-from local.rehearsal.study_process import ROOT, servers_of, sessions_not_open, sessions_of, wait_until_gone
+from hippodrome.bots.bot import Bot
+from hippodrome.bots.page import VisitedPage
+from hippodrome.bots.report import BotReport
+from hippodrome.bots.verification import document
+from hippodrome.local.new import LEFT_OUT
+from hippodrome.local.rehearsal.logs import verify
+from hippodrome.local.rehearsal.study_process import servers_of, sessions_not_open, sessions_of, wait_until_gone
+from hippodrome.trial.recordings.recording import read
 from testing import ports
 from testing.held_study import HeldStudy
+from testing.processes import ROOT
 from testing.waiting import until_async
-from trial.recordings.recording import read
 
 EXAMPLE = ROOT / "examples" / "two-players"
 PROJECT = "two-players"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.deploy.installation import Installed, installed
+from tests.deployment.installation import Installed, installed
 from tests.export.place import Place
 
 __all__ = ["installed"]

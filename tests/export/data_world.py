@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from hippodrome.model import ids
-from hippodrome.model.project import MASTER_LIST, MasterList
-from hippodrome.model.records import to_json
+from hippodrome.control.model import ids
+from hippodrome.control.model.project import MASTER_LIST, MasterList
+from hippodrome.control.model.records import to_json
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.recording import Recording
 from testing.studies import study
-from trial.recordings import recording
-from trial.recordings.recording import Recording
 
 PROJECT = study()
 Put = Callable[[str, bytes], None]

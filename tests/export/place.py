@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from console.problem import Exit
-from deploy.__main__ import main
-from tests.deploy.installation import CommandResult
+from hippodrome.console.problem import Exit
+from hippodrome.deployment.__main__ import main
+from tests.deployment.installation import CommandResult
 from tests.export.data_world import into_folder
 
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from hippodrome.model import ids
-from hippodrome.model.memberships import Membership
-from hippodrome.model.records import to_json
-from protocol.keys import membership_key, session_key, session_recordings_folder
-from protocol.session import Member, SessionDocument
+from hippodrome.control.model import ids
+from hippodrome.control.model.memberships import Membership
+from hippodrome.control.model.records import to_json
+from hippodrome.protocol.keys import membership_key, session_key, session_recordings_folder
+from hippodrome.protocol.session import Member, SessionDocument
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.recording import Recording
 from tests.export.data_world import GAME, PROJECT, TIME, Put, arrive, register
-from trial.recordings import recording
-from trial.recordings.recording import Recording
 
 SID = "s.0123456789abcdef0123"
 OTHER = "s.fedcba98765432100000"

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from console.problem import Exit
-from export import fetch
-from export.source import Bucket, FileGone
+from hippodrome.console.problem import Exit
+from hippodrome.export import fetch
+from hippodrome.export.source import Bucket, FileGone
 from testing.aws_events import ACCOUNT
 from testing.studies import study
-from tests.deploy.installation import Installed, environment, process
+from tests.deployment.installation import Installed, environment, process
 from tests.export import data_world as made_of
 from tests.export.data_world import GAME, crowd, into_folder, key
 from tests.export.place import rows
@@ -72,7 +72,7 @@ def test_a_bucket_and_a_folder_give_the_same_tables(world: Installed, tmp_path: 
 def test_a_body_that_breaks_off_is_fetched_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     from botocore.exceptions import IncompleteReadError
 
-    monkeypatch.setattr("export.source.time.sleep", lambda _: None)
+    monkeypatch.setattr("hippodrome.export.source.time.sleep", lambda _: None)
     body = os.urandom(300_000)
     world.put("maze/users/a/participant.json", body)
     s3 = world.client("s3")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from export.interruption import interruption
+from hippodrome.export.interruption import interruption
 
 
 @pytest.fixture(autouse=True)

@@ -19,16 +19,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from console.problem import Exit
-from deploy.__main__ import main
-from export import recording as converted
-from export import recording_columns
-from export.scrub import Scrub
+from hippodrome.console.problem import Exit
+from hippodrome.deployment.__main__ import main
+from hippodrome.export import recording as converted
+from hippodrome.export import recording_columns
+from hippodrome.export.scrub import Scrub
+from hippodrome.trial.recordings import recording
 from testing.exploration import examples
 from tests.export import data_world as made_of
 from tests.export.data_world import PROJECT, arrive, crowd, into_folder, key, record, recording_key, server
 from tests.export.place import rows
-from trial.recordings import recording
 
 WHO = {"participant": "p1", "studyStep": "3", "attempt": 1}
 

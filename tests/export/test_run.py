@@ -15,18 +15,18 @@ import msgspec
 import pyarrow.parquet as pq
 import pytest
 
-from console.problem import Exit
-from deploy.__main__ import main
-from export import fetch, manifest
-from export import run as export_run
-from export.fetch import Fetcher
-from export.page_fields import fields_of
-from export.source import FileGone, Folder
-from hippodrome.model import warm_pool
-from hippodrome.model.project import MASTER_LIST, MasterList
-from hippodrome.model.records import to_json
-from protocol.handover import Handover
-from protocol.keys import handover_key
+from hippodrome.console.problem import Exit
+from hippodrome.control.model import warm_pool
+from hippodrome.control.model.project import MASTER_LIST, MasterList
+from hippodrome.control.model.records import to_json
+from hippodrome.deployment.__main__ import main
+from hippodrome.export import fetch, manifest
+from hippodrome.export import run as export_run
+from hippodrome.export.fetch import Fetcher
+from hippodrome.export.page_fields import fields_of
+from hippodrome.export.source import FileGone, Folder
+from hippodrome.protocol.handover import Handover
+from hippodrome.protocol.keys import handover_key
 from testing.studies import study
 from tests.export import data_world as made_of
 from tests.export.data_world import GAME, PROJECT, answer, arrive, crowd, key, record, recording_key, server
@@ -471,7 +471,7 @@ def test_tables_are_whole_after_an_interruption(place: Place, monkeypatch: Any, 
     before = {name: (place.out / name).read_bytes() for name in ("answers.csv", "answers.parquet", "manifest.json")}
     arrive(place.put, users[2], {"3": GAME})
     with pytest.MonkeyPatch.context() as patch:
-        from export import table_files, tables
+        from hippodrome.export import table_files, tables
 
         def stop(*args: Any) -> Any:
             raise KeyboardInterrupt
@@ -487,7 +487,7 @@ def test_tables_are_whole_after_an_interruption(place: Place, monkeypatch: Any, 
 
 
 def test_a_second_run_in_the_same_folder_is_refused(place: Place) -> None:
-    from export import run
+    from hippodrome.export import run
 
     crowd(place.put, place.tmp, 2)
     place.done()
@@ -586,7 +586,7 @@ def test_a_file_deleted_while_it_is_fetched_is_skipped(place: Place, monkeypatch
 
 
 def test_folders_of_participants_are_distinct_on_every_machine(place: Place) -> None:
-    from export.state import ExportState
+    from hippodrome.export.state import ExportState
 
     state = ExportState(None)
     folders = [state.find_or_add(user, False).folder for user in ("Ann", "ann", "ANN", "x")]

@@ -10,10 +10,10 @@ import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
 
-from console.problem import Exit
-from deploy.__main__ import main
-from export.source import Folder
-from protocol.keys import membership_key, session_key, sessions_folder
+from hippodrome.console.problem import Exit
+from hippodrome.deployment.__main__ import main
+from hippodrome.export.source import Folder
+from hippodrome.protocol.keys import membership_key, session_key, sessions_folder
 from tests.export.data_world import PROJECT, crowd, into_folder, key, register
 from tests.export.place import Place, rows
 from tests.export.session_world import (

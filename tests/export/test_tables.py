@@ -16,14 +16,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from export import table_files, tables
-from export.answers import MAX_LINK, StudyAnswers
-from export.keys import KeyKind, Listed, read
-from export.scrub import Scrub, clean, identities
-from export.state import ExportedParticipant, ExportState, SourceFile
+from hippodrome.export import table_files, tables
+from hippodrome.export.answers import MAX_LINK, StudyAnswers
+from hippodrome.export.keys import KeyKind, Listed, read
+from hippodrome.export.scrub import Scrub, clean, identities
+from hippodrome.export.state import ExportedParticipant, ExportState, SourceFile
+from hippodrome.trial.recordings.recording import line
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
-from trial.recordings.recording import line
 
 TEXT = st.text(st.characters(), max_size=20)  # half characters, NUL, newlines and all
 HOSTILE = [
@@ -207,8 +207,8 @@ def test_only_tables_for_spreadsheets_escape_formulas(tmp_path: Path) -> None:
 
 
 def test_the_number_of_columns_is_limited(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("export.answers.MAX_FIELDS", 10)
-    monkeypatch.setattr("export.answers._MAX_COUNTED", 60)
+    monkeypatch.setattr("hippodrome.export.answers.MAX_FIELDS", 10)
+    monkeypatch.setattr("hippodrome.export.answers._MAX_COUNTED", 60)
     people = {f"u{n}": {"2": {"age": "3", "pet": "cat"}} for n in range(5)}
     people |= {f"x{n}": {"2": {f"junk-{n}-{m}": "x" for m in range(50)} | {"age": "9"}} for n in range(5)}
     link = {f"l{n}": "v" for n in range(80)}

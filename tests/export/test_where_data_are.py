@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from console.problem import Exit
-from deploy.__main__ import main
-from tests.deploy.installation import CommandResult, Installed
+from hippodrome.console.problem import Exit
+from hippodrome.deployment.__main__ import main
+from tests.deployment.installation import CommandResult, Installed
 from tests.export.data_world import crowd, into_folder
 from tests.export.place import Place, rows
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from export.without_member import rewrite
+from hippodrome.export.without_member import rewrite
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.resume import add_lines
 from testing.exploration import examples
 from tests.export.session_world import ANN, BOB, lines, packed, round_trip, said
-from trial.core.unfinished import RecordedTrial
-from trial.recordings import recording
-from trial.recordings.resume import add_lines
 
 
 def without(folder: Path, body: bytes, seat: int = 0, user: str = ANN) -> tuple[bytes, bool]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lambdas import installed
+from hippodrome.functions import installed
 from testing.iam.judge import MISSING, evaluator
 from testing.moto_world import MotoWorld
 

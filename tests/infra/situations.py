@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from deploy.aws import regions
-from deploy.stack import settings
+from hippodrome.deployment.aws import regions
+from hippodrome.deployment.stack import settings
 from testing import template as cfn
 
 ACCOUNT = "123456789012"
 STACK = "Hippodrome-of-thirty-letters-x"
-"""As long as `deploy.aws.account.STACK_NAME` allows, with all the characters that it allows."""
+"""As long as `hippodrome.deployment.aws.account.STACK_NAME` allows, with all the characters that it allows."""
 REGION = max(regions.SUPPORTED, key=len)
 _HEX = "0123456789abcdef0"
 

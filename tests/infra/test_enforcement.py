@@ -19,10 +19,10 @@ from urllib.parse import urlencode, urlsplit
 
 import pytest
 
-from hippodrome.lobby import matcher
-from hippodrome.model import ids, server
-from hippodrome.storage.project_cache import ProjectCache
-from lambdas import (
+from hippodrome.control.lobby import matcher
+from hippodrome.control.model import ids, server
+from hippodrome.control.storage.project_cache import ProjectCache
+from hippodrome.functions import (
     installed,
     send_start_server_message,
     send_stop_server_message,
@@ -31,7 +31,7 @@ from lambdas import (
     stop_server,
     sweep,
 )
-from protocol.keys import groups_key, waiting_key
+from hippodrome.protocol.keys import groups_key, waiting_key
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
@@ -39,7 +39,7 @@ from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, ApiCall, IamEnforcemen
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.moto_study import GAME, PAIRS, PROJECT, MotoMember, Person, StudyOnMoto, come, meet
 from testing.moto_world import MotoWorld
-from tests.hippodrome.test_moto_journey import run
+from tests.control.test_moto_journey import run
 
 BUCKET = "arn:aws:s3:::the-bucket"
 TEXTS = {"RootDomain": "example.org", "HostedZoneId": "Z1"}

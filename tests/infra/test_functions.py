@@ -8,22 +8,25 @@ from pathlib import Path
 
 import pytest
 
-from local.backend.platform import HANDLERS as QUEUES_AND_TIMERS
-from local.study import FUNCTIONS
+from hippodrome.local.backend.platform import HANDLERS as QUEUES_AND_TIMERS
+from hippodrome.local.study import FUNCTIONS
 from testing import template as cfn
 from testing.iam.enforcement import WHO_MAY
 
 ROOT = Path(__file__).resolve().parents[2]
-SHARED = {"__init__", "installed", "queue", "web"}  # modules of lambdas/ that are no functions
+SHARED = {"__init__"}
 AWS_ONLY = {  # and why `make run` has none
     "sign_requests": "servers of one machine write into the data folder",
     "renew_certificate": "browsers connect to 127.0.0.1 without TLS",
-    "update_project_master_list": "`local/publish.py` registers the study itself",
+    "update_project_master_list": "`hippodrome/local/publish.py` registers the study itself",
 }
 HANDLERS = sorted(path.stem for path in (ROOT / "lambdas").glob("*.py") if path.stem not in SHARED)
 
 
-ON_ONE_MACHINE = {*FUNCTIONS, *(handler.__module__.removeprefix("lambdas.") for handler in QUEUES_AND_TIMERS.values())}
+ON_ONE_MACHINE = {
+    *FUNCTIONS,
+    *(handler.__module__.removeprefix("hippodrome.functions.") for handler in QUEUES_AND_TIMERS.values()),
+}
 
 
 def rows(page: str) -> set[str]:
@@ -56,10 +59,12 @@ def test_a_function(name: str) -> None:
     assert cfn.functions()[name] in watched, "no alarm watches its errors"
     if calls(one["Role"]["Fn::GetAtt"][0]):
         assert any(name in may for may in WHO_MAY.values()), "testing/iam/enforcement.py: no call is allowed to it"
-    assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), "local/ has no such function, and AWS_ONLY does not say why"
+    assert (name in ON_ONE_MACHINE) != (name in AWS_ONLY), (
+        "hippodrome/local/ has no such function, and AWS_ONLY does not say why"
+    )
     assert name in rows("functions.md"), "docs/functions.md has no row for it"
     assert name in rows("permissions.md"), "docs/permissions.md has no row for it: python -m tests.infra.table"
-    written = ast.parse((ROOT / "lambdas" / f"{name}.py").read_text(encoding="utf-8"))
+    written = ast.parse((ROOT / "hippodrome" / "functions" / f"{name}.py").read_text(encoding="utf-8"))
     handler = next(one for one in written.body if isinstance(one, ast.FunctionDef) and one.name == "handler")
     assert ast.get_docstring(handler), "its handler does not say what goes in and what comes out"
 

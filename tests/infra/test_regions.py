@@ -8,8 +8,8 @@ from pathlib import Path
 import boto3
 import pytest
 
-from console.problem import Problem
-from deploy.aws import regions
+from hippodrome.console.problem import Problem
+from hippodrome.deployment.aws import regions
 from testing import template as cfn
 from tests.infra import schemas
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model import ids
-from hippodrome.storage.secret import KEY
-from lambdas import update_project_master_list
+from hippodrome.control.model import ids
+from hippodrome.control.storage.secret import KEY
+from hippodrome.functions import update_project_master_list
 from testing import derived
 from testing import template as cfn
 from testing.iam.actions import Ask

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from hippodrome.aws.bus import TOPICS
-from hippodrome.model import sessions
-from hippodrome.model.project import Project
-from hippodrome.ports import PORTS, Settings
-from local.web.gateway import ROUTES
+from hippodrome.control.aws.bus import TOPICS
+from hippodrome.control.model import sessions
+from hippodrome.control.model.project import Project
+from hippodrome.control.ports import PORTS, Settings
+from hippodrome.local.web.gateway import ROUTES
 from testing import template as cfn
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,4 +1,4 @@
-"""A real `python -m local` in a folder of its own, with a study whose game is quick."""
+"""A real `python -m hippodrome.local` in a folder of its own, with a study whose game is quick."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from local.backend.processes import end_everything, marked
+from hippodrome.local.backend.processes import end_everything, marked
 from testing import processes
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,4 +1,4 @@
-"""Stands for `python -m trial`: listens, answers /healthz, and ends as its environment says."""
+"""Stands for `python -m hippodrome.trial`: listens, answers /healthz, and ends as its environment says."""
 
 from __future__ import annotations
 

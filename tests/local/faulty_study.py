@@ -19,17 +19,17 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlencode
 
-from hippodrome.model import ids
-from hippodrome.model.project import MASTER_LIST
-from hippodrome.ports import Topic
-from hippodrome.servers import dns
-from hippodrome.storage.secret import KEY
-from lambdas import installed, next_step, send_start_server_message, sweep
-from local.backend import bus, platform, retry, task_process, timers
-from local.backend.bus import Handler
-from local.backend.platform import LocalPlatform
-from local.backend.processes import end_everything, marked
-from local.publish import publish
+from hippodrome.control.model import ids
+from hippodrome.control.model.project import MASTER_LIST
+from hippodrome.control.ports import Topic
+from hippodrome.control.servers import dns
+from hippodrome.control.storage.secret import KEY
+from hippodrome.functions import installed, next_step, send_start_server_message, sweep
+from hippodrome.local.backend import bus, platform, retry, task_process, timers
+from hippodrome.local.backend.bus import Handler
+from hippodrome.local.backend.platform import LocalPlatform
+from hippodrome.local.backend.processes import end_everything, marked
+from hippodrome.local.publish import publish
 from testing import aws_events, derived
 from testing.os_faults import Killed, OsFault, OsFaultInjector
 from testing.visitors import hidden

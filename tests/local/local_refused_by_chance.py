@@ -1,4 +1,4 @@
-"""`python -m local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
+"""`python -m hippodrome.local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
 
 One of the first calls is refused in any case, so that each run has a refusal. Each refusal is a line `refused: …` on stderr.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import typer
 
-from local.__main__ import main
+from hippodrome.local.__main__ import main
 from testing.os_faults import ERRORS, OsCall, OsFaultInjector
 
 

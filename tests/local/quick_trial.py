@@ -1,4 +1,4 @@
-"""Stands for `python -m trial` where many are started: it imports little, plays when it is told to, and keeps the store.
+"""Stands for `python -m hippodrome.trial` where many are started: it imports little, plays when it is told to, and keeps the store.
 
 `GET /play` records a game and writes its answer, as the trial does, and ends; `GET /begin` only begins a recording.
 On SIGTERM what was begun is stored, as the trial does.

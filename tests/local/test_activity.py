@@ -9,12 +9,12 @@ from typing import cast
 import pytest
 from rich.console import Console
 
-from local.activity.log import ActivityLog
-from local.activity.server_logs import WatchedServer
-from local.backend.task_record import TaskRecord, folder_of
-from local.backend.tasks import ProcessTasks
-from protocol.keys import answer_key, session_key
-from protocol.session import Member, SessionDocument
+from hippodrome.local.activity.log import ActivityLog
+from hippodrome.local.activity.server_logs import WatchedServer
+from hippodrome.local.backend.task_record import TaskRecord, folder_of
+from hippodrome.local.backend.tasks import ProcessTasks
+from hippodrome.protocol.keys import answer_key, session_key
+from hippodrome.protocol.session import Member, SessionDocument
 
 SID = "s.0123456789abcdef0123"
 

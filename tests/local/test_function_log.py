@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from hippodrome.log import failure
-from hippodrome.storage.errors import RetryLater
-from local.activity.function_log import function_log
-from local.activity.log import ActivityLog
+from hippodrome.control.log import failure
+from hippodrome.control.storage.errors import RetryLater
+from hippodrome.local.activity.function_log import function_log
+from hippodrome.local.activity.log import ActivityLog
 
 
 @pytest.mark.parametrize(("error", "shown"), [(RetryLater("soon"), False), (KeyError("broken"), True)])

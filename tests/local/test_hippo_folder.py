@@ -11,10 +11,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hippodrome.config import read_project
-from local.backend.processes import end_everything
-from local.check.__main__ import main as check
-from local.rehearsal.study_process import copy_of
+from hippodrome.control.config import read_project
+from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.check.__main__ import main as check
+from hippodrome.local.rehearsal.study_process import copy_of
 from testing.files import write_files
 from tests.local.conftest import AGENT, ROOT, Local
 from tests.local.walk import Walker
@@ -114,7 +114,7 @@ def test_bots_walk_through_a_template_that_is_blank_with_an_agent_that_imports_g
     clone = write_clone(tmp_path / "clone", config)
     (clone / "App/agent.py").write_text(WITH_GYM)
     ran = subprocess.run(
-        [sys.executable, "-m", "local.rehearsal", str(clone), "--bots", "1", "--play", "1"],
+        [sys.executable, "-m", "hippodrome.local.rehearsal", str(clone), "--bots", "1", "--play", "1"],
         check=False,
         cwd=ROOT,
         capture_output=True,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import read_project
-from local import new
+from hippodrome.control.config import read_project
+from hippodrome.local import new
 
 ROOT = Path(__file__).resolve().parents[2]
 TOP = "ms-pacman"

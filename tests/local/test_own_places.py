@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hippodrome.model import ids
-from local.own_places import advice, user_ids
+from hippodrome.control.model import ids
+from hippodrome.local.own_places import advice, user_ids
 
 
 def groups_of(matching: str, players: int, groups: int, run: int) -> list[int]:

@@ -14,13 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.ports import Conflict, Topic
-from local.backend.bus import FolderBus
-from local.backend.documents import FolderDocuments
-from local.backend.timers import FolderTimers
+from hippodrome.control.ports import Conflict, Topic
+from hippodrome.local.backend.bus import FolderBus
+from hippodrome.local.backend.documents import FolderDocuments
+from hippodrome.local.backend.timers import FolderTimers
+from hippodrome.trial.recordings.recording import Recording
+from hippodrome.trial.recordings.store import FolderStore
 from testing.power_cut import Disk
-from trial.recordings.recording import Recording
-from trial.recordings.store import FolderStore
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the paths of handles are read from /proc")
 
@@ -131,7 +131,7 @@ def test_without_a_sync_the_model_finds_a_broken_promise(
     lazy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same without one of the syncs breaks promises."""
-    from protocol import disk
+    from hippodrome.protocol import disk
 
     without: dict[str, Callable[..., Any]] = {
         "sync_folder": lambda folder: None,

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from hippodrome.storage.project_cache import ProjectCache
-from hippodrome.storage.secret import SecretCache
-from lambdas import installed
-from local import publish
-from local.activity.log import ActivityLog
-from local.backend.platform import LocalPlatform
+from hippodrome.control.storage.project_cache import ProjectCache
+from hippodrome.control.storage.secret import SecretCache
+from hippodrome.functions import installed
+from hippodrome.local import publish
+from hippodrome.local.activity.log import ActivityLog
+from hippodrome.local.backend.platform import LocalPlatform
 from testing.waiting import until
 from tests.local.conftest import write_study
 

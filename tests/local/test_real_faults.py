@@ -1,4 +1,4 @@
-"""A real `python -m local` to which the system really refuses something: another file system, no more files, no room."""
+"""A real `python -m hippodrome.local` to which the system really refuses something: another file system, no more files, no room."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from typing import Any
 import httpx
 import pytest
 
-from local.backend.processes import end_everything
-from local.rehearsal.study_process import servers_of
+from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.rehearsal.study_process import servers_of
+from hippodrome.trial.recordings import recording
 from testing import exploration
 from testing.waiting import until
 from tests.local.conftest import ROOT, Local
 from tests.local.test_run import _gone, _walk_whatever_happens
 from tests.local.walk import Walker, at_the_game
-from trial.recordings import recording
 
 Make = Callable[..., Local]
 OTHER = next(
@@ -173,7 +173,7 @@ def test_a_server_lost_while_nothing_can_be_written_is_replaced(local: Make, res
 @linux
 def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: Make) -> None:
     here = local()
-    command = f"ulimit -f 0; exec {sys.executable} -m local {here.folder} --port 0"
+    command = f"ulimit -f 0; exec {sys.executable} -m hippodrome.local {here.folder} --port 0"
     made = subprocess.run(
         ["/bin/sh", "-c", command],
         cwd=here.place,

@@ -15,19 +15,19 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import DnsRecord, Topic
-from local import watch as watch_module
-from local.backend import bus as bus_module
-from local.backend import platform as platform_module
-from local.backend import retry as retry_module
-from local.backend import timers as timers_module
-from local.backend.bus import FolderBus
-from local.backend.dns import FileDns
-from local.backend.platform import LocalPlatform
-from local.backend.retry import Retry
-from local.backend.timers import FolderTimers
-from local.publish import publish
-from local.watch import Watch
+from hippodrome.control.ports import DnsRecord, Topic
+from hippodrome.local import watch as watch_module
+from hippodrome.local.backend import bus as bus_module
+from hippodrome.local.backend import platform as platform_module
+from hippodrome.local.backend import retry as retry_module
+from hippodrome.local.backend import timers as timers_module
+from hippodrome.local.backend.bus import FolderBus
+from hippodrome.local.backend.dns import FileDns
+from hippodrome.local.backend.platform import LocalPlatform
+from hippodrome.local.backend.retry import Retry
+from hippodrome.local.backend.timers import FolderTimers
+from hippodrome.local.publish import publish
+from hippodrome.local.watch import Watch
 from testing.os_faults import OsCall, OsFault, OsFaultInjector, OsReach
 from testing.waiting import until
 from tests.local.backend.test_tasks import FAKE, NAME, Here, here, request  # noqa: F401 - a fixture

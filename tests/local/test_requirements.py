@@ -48,7 +48,7 @@ def installing(study: Path) -> str:
         [
             sys.executable,
             "-m",
-            "local.requirements",
+            "hippodrome.local.requirements",
             study,
             "--constraints",
             place / "image.txt",
@@ -103,8 +103,8 @@ def test_the_commands_for_one_machine_install(study: Path) -> None:
         said = subprocess.run(
             ["make", "-n", command, f"PROJECT={study}"], cwd=ROOT, capture_output=True, text=True, check=True
         ).stdout
-        first, second = (line for line in said.splitlines() if "-m local" in line)
-        assert f'-m local.requirements "{study}" --constraints requirements/trial.txt' in first
+        first, second = (line for line in said.splitlines() if "-m hippodrome.local" in line)
+        assert f'-m hippodrome.local.requirements "{study}" --constraints requirements/trial.txt' in first
         assert f'"{study}"' in second
 
 

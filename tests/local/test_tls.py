@@ -17,10 +17,10 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from local.backend import authority
-from local.backend.authority import Authority
-from local.web import connections
-from local.web.names import Names
+from hippodrome.local.backend import authority
+from hippodrome.local.backend.authority import Authority
+from hippodrome.local.web import connections
+from hippodrome.local.web.names import Names
 from testing.waiting import until
 from tests.local.conftest import Local
 from tests.trial.hippo_page import HippoPage, hippo_page, new_user_id

@@ -1,4 +1,4 @@
-"""Warm servers for participants, in a real `python -m local`."""
+"""Warm servers for participants, in a real `python -m hippodrome.local`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Callable
 import pytest
 from websockets.exceptions import ConnectionClosedError
 
-from local.rehearsal.study_process import servers_of
+from hippodrome.local.rehearsal.study_process import servers_of
 from testing.waiting import PATIENCE, until
 from tests.local.conftest import Local
 from tests.local.walk import Walker, at_the_game

@@ -1,7 +1,7 @@
 """docs/first-hour.md, walked on ministack: the real Makefile, commands, template and functions; two Pebbles for Let's Encrypt.
 
 It has an account and an emulator of its own, which are empty before and after. Its commands are typed into a shell as the page
-has them, in its order; those for which servers have to run are in `tests/deploy/test_first_hour.py`.
+has them, in its order; those for which servers have to run are in `tests/deployment/test_first_hour.py`.
 """
 
 from __future__ import annotations

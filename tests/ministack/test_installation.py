@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model import ids, server
-from hippodrome.storage.project_cache import FRESH
-from hippodrome.storage.secret import KEY
-from protocol.session import member_token
+from hippodrome.control.model import ids, server
+from hippodrome.control.storage.project_cache import FRESH
+from hippodrome.control.storage.secret import KEY
+from hippodrome.protocol.session import member_token
 from testing import derived
 from testing.ministack.world import (
     ACCOUNT,

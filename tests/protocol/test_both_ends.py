@@ -14,30 +14,30 @@ from typing import Any
 
 import pytest
 
-from hippodrome.aws.tasks import EcsTasks
-from hippodrome.config import ConfigErrors, parse_registration
-from hippodrome.model import ids, server
-from hippodrome.model.messages import StartServer
-from hippodrome.model.participant import Progress
-from hippodrome.model.records import from_json
-from hippodrome.model.server import Server
-from hippodrome.participants.answers import Answers
-from hippodrome.ports import TaskRequest
-from hippodrome.servers.signing import DocumentRequest, Method, ServerAccess
-from hippodrome.storage.repository import Repository
-from hippodrome.storage.secret import SecretCache
-from protocol import environment
-from protocol.answer import Answer, to_json
-from protocol.handover import Handover, parse
-from protocol.keys import answer_key, handover_key, recordings_folder
+from hippodrome.control.aws.tasks import EcsTasks
+from hippodrome.control.config import ConfigErrors, parse_registration
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.messages import StartServer
+from hippodrome.control.model.participant import Progress
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import Server
+from hippodrome.control.participants.answers import Answers
+from hippodrome.control.ports import TaskRequest
+from hippodrome.control.servers.signing import DocumentRequest, Method, ServerAccess
+from hippodrome.control.storage.repository import Repository
+from hippodrome.control.storage.secret import SecretCache
+from hippodrome.protocol import environment
+from hippodrome.protocol.answer import Answer, to_json
+from hippodrome.protocol.handover import Handover, parse
+from hippodrome.protocol.keys import answer_key, handover_key, recordings_folder
+from hippodrome.trial.recordings.recorder import Recorder
+from hippodrome.trial.recordings.spool import Spool
+from hippodrome.trial.recordings.store import FolderStore
+from hippodrome.trial.server import assignment
+from hippodrome.trial.settings import SettingsError, TrialSettings, trial_section
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
-from trial.recordings.recorder import Recorder
-from trial.recordings.spool import Spool
-from trial.recordings.store import FolderStore
-from trial.server import assignment
-from trial.settings import SettingsError, TrialSettings, trial_section
 
 ROOT = Path(__file__).parents[2]
 VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}

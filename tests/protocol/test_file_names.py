@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.file_names import composed, on_disk
+from hippodrome.protocol.file_names import composed, on_disk
 
 COMPOSED, DECOMPOSED = (unicodedata.normalize(form, "Übungé") for form in ("NFC", "NFD"))
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import key_maps, keyboard, trial, trial_check
+from hippodrome.protocol import key_maps, keyboard, trial, trial_check
 
 
 def accepted(**section: Any) -> trial.TrialSection:

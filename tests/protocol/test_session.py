@@ -10,8 +10,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from protocol.keys import NAME
-from protocol.session import (
+from hippodrome.protocol.keys import NAME
+from hippodrome.protocol.session import (
     MAX_PLAYERS,
     BadSession,
     Member,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from protocol.similar import SIMILAR_FILES, did_you_mean, nearest
+from hippodrome.protocol.similar import SIMILAR_FILES, did_you_mean, nearest
 
 
 @pytest.mark.parametrize(

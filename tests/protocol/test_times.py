@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from protocol.times import time_text
+from hippodrome.protocol.times import time_text
 
 
 @pytest.mark.parametrize(

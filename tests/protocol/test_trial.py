@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from protocol.trial import MAX_OWN_CONTROLS, SESSION_KEYS, TrialSection
-from protocol.trial_check import check
-from protocol.values import path_text
+from hippodrome.protocol.trial import MAX_OWN_CONTROLS, SESSION_KEYS, TrialSection
+from hippodrome.protocol.trial_check import check
+from hippodrome.protocol.values import path_text
 
 PLAYERS = {"red": "human", "blue": "policies/blue.onnx", "green": "human"}
 BY_GROUP = {"1": {"red": "human", "blue": "sample:policies/a.onnx"}, "2": {"red": "random", "blue": "human"}}

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from protocol import values
-from protocol.values import Check, Plain
+from hippodrome.protocol import values
+from hippodrome.protocol.values import Check, Plain
 
 NAME, YES, ONE = Plain(1, "01"), Plain(True, "yes"), Plain(1.0, "1.0")
 

@@ -9,8 +9,8 @@ import re
 from html.parser import HTMLParser
 from typing import Any
 
-from hippodrome.model import ids
-from hippodrome.model.project import Project, Step
+from hippodrome.control.model import ids
+from hippodrome.control.model.project import Project, Step
 from testing import studies
 from testing.fake_platform import FakePlatform
 

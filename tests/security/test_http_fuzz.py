@@ -21,13 +21,20 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from hippodrome.log import logger
-from hippodrome.model import ids, participant, server
-from hippodrome.model.records import to_json
-from hippodrome.ports import Topic
-from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, stop_server
-from local.web.app import App
-from local.web.server import WebServer, listen
+from hippodrome.control.log import logger
+from hippodrome.control.model import ids, participant, server
+from hippodrome.control.model.records import to_json
+from hippodrome.control.ports import Topic
+from hippodrome.functions import (
+    installed,
+    next_step,
+    send_start_server_message,
+    send_stop_server_message,
+    start_server,
+    stop_server,
+)
+from hippodrome.local.web.app import App
+from hippodrome.local.web.server import WebServer, listen
 from testing import aws_events, exploration
 from testing.fake_platform import FakePlatform
 from tests.security import hostile

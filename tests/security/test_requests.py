@@ -11,13 +11,20 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model import ids, server
-from hippodrome.model.records import from_json
-from hippodrome.model.server import Server
-from hippodrome.participants.forms import MAX_DEPTH
-from hippodrome.ports import Topic
-from hippodrome.storage.secret import SecretCache
-from lambdas import installed, next_step, send_start_server_message, send_stop_server_message, start_server, sweep
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import Server
+from hippodrome.control.participants.forms import MAX_DEPTH
+from hippodrome.control.ports import Topic
+from hippodrome.control.storage.secret import SecretCache
+from hippodrome.functions import (
+    installed,
+    next_step,
+    send_start_server_message,
+    send_stop_server_message,
+    start_server,
+    sweep,
+)
 from testing import aws_events
 from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform
@@ -321,7 +328,7 @@ def test_an_internal_error_shows_no_id_no_answer_and_no_path(platform: FakePlatf
             event = http_event("POST", LINK, "q=xss-answer", headers={"accept": accept, "content-type": FORM})
             answer = handler(event, None)
             assert answer["statusCode"] == 500
-            for private in (MINE, "xss-answer", "Traceback", "hippodrome/", "RuntimeError"):
+            for private in (MINE, "xss-answer", "Traceback", "hippodrome/control/", "RuntimeError"):
                 assert private not in json.dumps(answer)
     assert "RuntimeError" in log.getvalue()
     assert MINE not in log.getvalue()

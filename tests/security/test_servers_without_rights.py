@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from hippodrome.model import ids, server
-from hippodrome.model.server import Server
-from hippodrome.storage.secret import KEY, SecretCache
-from protocol.keys import handover_key
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.server import Server
+from hippodrome.control.storage.secret import KEY, SecretCache
+from hippodrome.protocol.keys import handover_key
 from testing.strict_s3 import BUCKET, StrictS3
 from testing.studies import study
 
@@ -47,7 +47,7 @@ def own():
     """The server's own credential: from what the process was started with, or from its memory."""
     started = dict(line.split("=", 1) for line in Path("/proc/self/environ").read_text().split("\0") if "=" in line)
     GOT["environment"] = sorted(set(os.environ) & {"TOKEN", "CREDENTIAL", "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI"})
-    from trial.recordings.presigned import PresignedStore
+    from hippodrome.trial.recordings.presigned import PresignedStore
     stores = [found for found in gc.get_objects() if isinstance(found, PresignedStore)]
     return stores[0]._url, stores[0]._server, stores[0]._credential, started.get("TOKEN", "")
 
@@ -174,7 +174,7 @@ def got(site: Site, tmp_path: Path) -> dict[str, Any]:
     }  # fmt: skip
     inherited = {key: value for key, value in os.environ.items() if not key.startswith(("AWS_", "ECS_"))}
     done = subprocess.run(
-        [sys.executable, "-m", "trial"], cwd=tmp_path, env={**inherited, **told}, capture_output=True, text=True, timeout=170, check=False,
+        [sys.executable, "-m", "hippodrome.trial"], cwd=tmp_path, env={**inherited, **told}, capture_output=True, text=True, timeout=170, check=False,
     )  # fmt: skip
     assert (tmp_path / "got.json").exists(), done.stderr
     found: dict[str, Any] = json.loads((tmp_path / "got.json").read_text())

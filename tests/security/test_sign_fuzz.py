@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lambdas import installed, sign_requests
+from hippodrome.functions import installed, sign_requests
 from testing import aws_events, exploration
 from tests.security.hostile import TEXTS
 from tests.security.test_servers_without_rights import MALLORY, Site

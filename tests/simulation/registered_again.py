@@ -14,23 +14,25 @@ from datetime import datetime, timedelta
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
-from hippodrome.http import Request, Response
-from hippodrome.model import messages
-from hippodrome.model.project import MASTER_LIST, MasterList, Project
-from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import RECORDS, Server, ServerState
-from hippodrome.participants.journey import Journey
-from hippodrome.ports import Message, Topic
-from hippodrome.servers.sweep import Sweep
-from hippodrome.storage.repository import Repository
-from protocol.keys import answer_key, sessions_folder
+from hippodrome.control.http import Request, Response
+from hippodrome.control.model import messages
+from hippodrome.control.model.project import MASTER_LIST, MasterList, Project
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import RECORDS, Server, ServerState
+from hippodrome.control.participants.journey import Journey
+from hippodrome.control.ports import Message, Topic
+from hippodrome.control.servers.sweep import Sweep
+from hippodrome.control.storage.repository import Repository
+from hippodrome.protocol.keys import answer_key, sessions_folder
 from testing.aws_events import FORM, JSON, http_event
 from testing.servers import Servers
 from testing.studies import installed, study
 from testing.visitors import hidden
-from tests.hippodrome.servers.delivery import events
+from tests.control.servers.delivery import events
 
-RELOADED_AFTER = timedelta(seconds=240)  # a waiting page is loaded again after this time, as in web/game/main.js
+RELOADED_AFTER = timedelta(
+    seconds=240
+)  # a waiting page is loaded again after this time, as in hippodrome/web/game/main.js
 NOT_PLAYED = timedelta(minutes=10)  # a server without players ends by itself after this time
 ABSENT = timedelta(minutes=2)  # a game waits for other members for this time
 
@@ -246,7 +248,7 @@ class Participant:
             self._polls.append(urlsplit(self.data["poll"]).query)
 
     def _poll(self) -> None:
-        """Poll as `web/game/main.js` and `lobby.js` do."""
+        """Poll as `hippodrome/web/game/main.js` and `lobby.js` do."""
         told = self._ask(urlsplit(self.data["poll"]).query)
         was, self.state, first = self.state, told["state"], self.data["state"]
         is_over = self.state in ("ended", "failed")

@@ -8,9 +8,9 @@ from datetime import timedelta
 
 import pytest
 
-from hippodrome.aws.dns import BATCH as BATCH_OF_NAMES
-from hippodrome.ports import Conflict, DnsRecord, TaskRequest
-from lambdas import installed
+from hippodrome.control.aws.dns import BATCH as BATCH_OF_NAMES
+from hippodrome.control.ports import Conflict, DnsRecord, TaskRequest
+from hippodrome.functions import installed
 from testing.clock import EPOCH
 from testing.simulation.assumptions import assumptions
 from testing.simulation.aws_bound import aws_alone, aws_alone_together

@@ -14,11 +14,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from hippodrome.lobby import decisions
-from hippodrome.model.project import MASTER_LIST
-from protocol.keys import answer_key, membership_key, session_key
-from protocol.session import Member as Seated
-from protocol.session import SessionDocument
+from hippodrome.control.lobby import decisions
+from hippodrome.control.model.project import MASTER_LIST
+from hippodrome.protocol.keys import answer_key, membership_key, session_key
+from hippodrome.protocol.session import Member as Seated
+from hippodrome.protocol.session import SessionDocument
 from testing.simulation import faults, lobby, session_checks
 from testing.simulation.conditions import Conditions
 from testing.simulation.members import POLL, PROPOSED_POLL, Habits, SimulatedMember
@@ -172,7 +172,7 @@ def test_a_participant_in_the_lobby_sees_that_the_study_is_closed():
 
 
 def test_the_simulated_lobby_page_asks_as_often_as_the_real_one():
-    script = (Path(__file__).parents[2] / "web" / "game" / "lobby.js").read_text(encoding="utf-8")
+    script = (Path(__file__).parents[2] / "hippodrome" / "web" / "game" / "lobby.js").read_text(encoding="utf-8")
     told = dict(re.findall(r"const (ASK_EVERY|CONFIRM_AFTER) = ([\d_]+);", script))
     milliseconds = {name: float(value.replace("_", "")) for name, value in told.items()}
     assert milliseconds == {"ASK_EVERY": 1000 * POLL, "CONFIRM_AFTER": 1000 * PROPOSED_POLL}

@@ -7,9 +7,9 @@ import json
 import msgspec
 import pytest
 
-from hippodrome.ports import TaskRequest
-from protocol.keys import answer_key, session_key
-from protocol.session import Member, SessionDocument, member_token
+from hippodrome.control.ports import TaskRequest
+from hippodrome.protocol.keys import answer_key, session_key
+from hippodrome.protocol.session import Member, SessionDocument, member_token
 from testing.clock import EPOCH
 from testing.simulation.conditions import Conditions
 from testing.simulation.trials import ABSENT, COUNTDOWN

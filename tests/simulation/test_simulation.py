@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.aws.concurrency import starts
-from hippodrome.participants import scripts
+from hippodrome.control.participants import scripts
+from hippodrome.deployment.aws.concurrency import starts
 from testing import template
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import faults
@@ -222,7 +222,7 @@ def test_queues_feed_the_functions_as_the_template_says():
 
 
 def test_the_simulated_waiting_page_asks_as_often_as_the_real_one():
-    script = scripts.join(Path(__file__).parents[2] / "web" / "game" / "main.js")
+    script = scripts.join(Path(__file__).parents[2] / "hippodrome" / "web" / "game" / "main.js")
     (found,) = re.findall(r"const POLLS = \{(.*?)\};", script)
     told = {name: float(value.replace("_", "")) for name, value in re.findall(r"(\w+): ([\d_.]+)", found)}
     assert told == {name: value if name == "growth" else 1000 * value for name, value in POLLS.items()}

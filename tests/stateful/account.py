@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, TypeVar
 
-from hippodrome.ports import Address, Message, NoCapacity, Refused, RunningTask, TaskRequest, Topic
+from hippodrome.control.ports import Address, Message, NoCapacity, Refused, RunningTask, TaskRequest, Topic
 from testing.fake_platform import FakeDns, FakePlatform
 from testing.port_faults import Unreachable
 from testing.tasks import Life, Task

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from datetime import timedelta
 
-from hippodrome.limits.rules import ServerSlots, server_slots_key
-from hippodrome.model import ids
-from hippodrome.model.messages import STOP_REASON_PREFIX
-from hippodrome.model.records import from_json
-from hippodrome.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, ServerState
+from hippodrome.control.limits.rules import ServerSlots, server_slots_key
+from hippodrome.control.model import ids
+from hippodrome.control.model.messages import STOP_REASON_PREFIX
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import AUTOMATIC_ATTEMPTS, MAX_ATTEMPTS, Server, ServerState
 from tests.stateful.account import Task
 from tests.stateful.world import RECEIVES, STRANGER, VISIBILITY, World
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hippodrome.model import ids
+from hippodrome.control.model import ids
 from testing.quiet_log import quiet
 from tests.stateful.sessions import numbered_id
 

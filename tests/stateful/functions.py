@@ -1,6 +1,6 @@
 """Lambda functions that may wait at a call while others run: each invocation is a greenlet.
 
-Containers keep between invocations what `lambdas.installed` makes, as on AWS, and are lost in a crash.
+Containers keep between invocations what `hippodrome.functions.installed` makes, as on AWS, and are lost in a crash.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import greenlet
 
-from lambdas import installed
+from hippodrome.functions import installed
 from testing import port_faults
 from testing.port_faults import Crash, FaultAt, PortFault
 

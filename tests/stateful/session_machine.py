@@ -90,7 +90,7 @@ class SessionMachine(Machine):
 
     @rule(user=st.just(""))
     def somebody_is_erased(self, user: str) -> None:  # type: ignore[override]
-        """`erase` has tests of its own (tests/deploy/operate/test_erase_sessions.py)."""
+        """`erase` has tests of its own (tests/deployment/operate/test_erase_sessions.py)."""
 
     @invariant()
     def all_is_as_it_should_be(self) -> None:

@@ -13,15 +13,15 @@ from collections.abc import Sequence
 from datetime import timedelta
 from typing import Any
 
-from hippodrome.lobby.decisions import Decisions
-from hippodrome.lobby.decisions import key as lobby_key
-from hippodrome.model import ids
-from hippodrome.model.memberships import Membership
-from hippodrome.model.project import Project
-from hippodrome.model.records import from_json
-from hippodrome.model.server import MAX_ATTEMPTS, Server
-from protocol.keys import answer_key, membership_key, sessions_folder
-from protocol.session import SessionDocument, member_token, parse
+from hippodrome.control.lobby.decisions import Decisions
+from hippodrome.control.lobby.decisions import key as lobby_key
+from hippodrome.control.model import ids
+from hippodrome.control.model.memberships import Membership
+from hippodrome.control.model.project import Project
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import MAX_ATTEMPTS, Server
+from hippodrome.protocol.keys import answer_key, membership_key, sessions_folder
+from hippodrome.protocol.session import SessionDocument, member_token, parse
 from testing.port_faults import FaultAt
 from testing.studies import study
 from testing.tasks import Task

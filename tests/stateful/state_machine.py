@@ -8,7 +8,7 @@ from hypothesis import event, note
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from hippodrome.model.project import Project
+from hippodrome.control.model.project import Project
 from testing.port_faults import FaultAt, PortFault
 from testing.studies import study
 from tests.stateful import checks

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from hippodrome.servers.sweep import Sweep, SweepResult
+from hippodrome.control.servers.sweep import Sweep, SweepResult
 from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
 from tests.stateful.mutations import Mutation, assert_noticed, written_unread

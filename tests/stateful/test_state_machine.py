@@ -10,14 +10,14 @@ import pytest
 from hypothesis import Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from hippodrome.limits.rules import ServerSlots, server_slots_key
-from hippodrome.model.records import from_json
-from hippodrome.model.server import ServerState
-from hippodrome.servers import leftovers
-from hippodrome.servers.leftovers import LeftoverReason
-from hippodrome.servers.sweep import Sweep, SweepResult
-from hippodrome.servers.termination import Termination
-from hippodrome.servers.warm.handover import Handovers
+from hippodrome.control.limits.rules import ServerSlots, server_slots_key
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import ServerState
+from hippodrome.control.servers import leftovers
+from hippodrome.control.servers.leftovers import LeftoverReason
+from hippodrome.control.servers.sweep import Sweep, SweepResult
+from hippodrome.control.servers.termination import Termination
+from hippodrome.control.servers.warm.handover import Handovers
 from testing.exploration import examples
 from testing.fake_platform import FakeDocuments
 from testing.port_faults import FaultAt, PortFault

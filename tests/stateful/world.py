@@ -12,16 +12,16 @@ from typing import Any
 
 import msgspec
 
-from hippodrome.limits.slots import Slots
-from hippodrome.model import ids, messages, server
-from hippodrome.model.messages import KeepWarm, StopServer, to_message
-from hippodrome.model.project import MASTER_LIST, MasterList, Project, step_key
-from hippodrome.model.records import from_json, to_json
-from hippodrome.model.server import Reason, Server, ServerState
-from hippodrome.model.warm_pool import Pool, pool_key
-from hippodrome.ports import DnsRecord, TaskRequest
-from hippodrome.storage.secret import KEY, Secret
-from lambdas import (
+from hippodrome.control.limits.slots import Slots
+from hippodrome.control.model import ids, messages, server
+from hippodrome.control.model.messages import KeepWarm, StopServer, to_message
+from hippodrome.control.model.project import MASTER_LIST, MasterList, Project, step_key
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import Reason, Server, ServerState
+from hippodrome.control.model.warm_pool import Pool, pool_key
+from hippodrome.control.ports import DnsRecord, TaskRequest
+from hippodrome.control.storage.secret import KEY, Secret
+from hippodrome.functions import (
     installed,
     next_step,
     send_start_server_message,
@@ -31,9 +31,9 @@ from lambdas import (
     sweep,
     task_changed,
 )
-from protocol import handover
-from protocol.handover import Handover
-from protocol.keys import answer_key, handover_key, handovers_folder, participant_folder
+from hippodrome.protocol import handover
+from hippodrome.protocol.handover import Handover
+from hippodrome.protocol.keys import answer_key, handover_key, handovers_folder, participant_folder
 from testing import aws_events
 from testing.port_faults import Crash, FaultAt
 from testing.servers import Servers

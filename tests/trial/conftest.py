@@ -16,13 +16,13 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
+from hippodrome.trial.pictures.frames import Decoder, Frame
+from hippodrome.trial.pictures.scene_encoder import ASSET, ASSET_HEADER, PACKED_SCENE, SCENE, SceneDecoder
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.wire.connection import SUBPROTOCOL
 from testing import processes
 from testing.async_tests import pytest_pyfunc_call  # noqa: F401 - a hook
 from tests.trial.client_messages import TakesMessages
-from trial.pictures.frames import Decoder, Frame
-from trial.pictures.scene_encoder import ASSET, ASSET_HEADER, PACKED_SCENE, SCENE, SceneDecoder
-from trial.recordings import recording
-from trial.wire.connection import SUBPROTOCOL
 
 ROOT = Path(__file__).parents[2]
 

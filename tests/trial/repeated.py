@@ -13,22 +13,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from protocol.trial import TrialSection as Section
-from trial.agent.agent import AgentAdapter
-from trial.agent.joint import JointAdapter
-from trial.agent.joint_calls import JointCalls
-from trial.agent.starting import start
-from trial.core import messages
-from trial.core.effects import Call, OpenRecording, RecordLine, ResetPolicy, SaveAnswer, WriteLine
-from trial.core.players import Player, who_plays
-from trial.core.policies import AskPolicy
-from trial.core.trial import Trial
-from trial.core.unfinished import RecordedTrial
-from trial.policies.places import load_policies
-from trial.recordings.recorder import rules
-from trial.recordings.recording import read_observation, text_of_line
-from trial.recordings.resume import add_lines
-from trial.settings import TrialSettings
+from hippodrome.protocol.trial import TrialSection as Section
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.joint import JointAdapter
+from hippodrome.trial.agent.joint_calls import JointCalls
+from hippodrome.trial.agent.starting import start
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.effects import Call, OpenRecording, RecordLine, ResetPolicy, SaveAnswer, WriteLine
+from hippodrome.trial.core.players import Player, who_plays
+from hippodrome.trial.core.policies import AskPolicy
+from hippodrome.trial.core.trial import Trial
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.policies.places import load_policies
+from hippodrome.trial.recordings.recorder import rules
+from hippodrome.trial.recordings.recording import read_observation, text_of_line
+from hippodrome.trial.recordings.resume import add_lines
+from hippodrome.trial.settings import TrialSettings
 
 AGENT = '''
 import random

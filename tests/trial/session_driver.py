@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from protocol.session import Member
-from trial.core import messages
-from trial.core.effects import (
+from hippodrome.protocol.session import Member
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.effects import (
     Begun,
     Call,
     OpenRecording,
@@ -26,10 +26,10 @@ from trial.core.effects import (
     StepCall,
     StepTaken,
 )
-from trial.core.flow_control import Window
-from trial.core.players import Player, View
-from trial.core.trial import Trial
-from trial.settings import TrialSettings
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.players import Player, View
+from hippodrome.trial.core.trial import Trial
+from hippodrome.trial.settings import TrialSettings
 
 SPACE = ("noop", "up", "right")
 UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right"), True)

@@ -11,12 +11,12 @@ from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 
-from protocol.keys import session_key
-from protocol.session import Member, SessionDocument, member_token
+from hippodrome.protocol.keys import session_key
+from hippodrome.protocol.session import Member, SessionDocument, member_token
+from hippodrome.trial.recordings import recording
 from tests.trial.conftest import Client, client_of
 from tests.trial.two_players import TRIAL as ONE_HUMAN
 from tests.trial.two_players import two_players
-from trial.recordings import recording
 
 SID = "s.0123456789abcdef0123"
 TOKEN = "the-secret-token"  # of every server that conftest.py starts

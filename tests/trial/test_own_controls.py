@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from protocol import trial, trial_check
-from trial.core import messages
-from trial.core.message_log import MessageLog, Word
-from trial.core.messages import BadMessage
-from trial.core.unfinished import RecordedTrial
-from trial.recordings.resume import add_lines
-from trial.settings import trial_section
-from trial.wire import plain
+from hippodrome.protocol import trial, trial_check
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.message_log import MessageLog, Word
+from hippodrome.trial.core.messages import BadMessage
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings.resume import add_lines
+from hippodrome.trial.settings import trial_section
+from hippodrome.trial.wire import plain
 
 UI = {"start": True, "left": True, "reallyGood": True, "fire": True, "leftUp": True, "brightness": False}
 

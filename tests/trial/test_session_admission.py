@@ -8,7 +8,10 @@ from hypothesis import given as for_all
 from hypothesis import strategies as st
 from websockets.asyncio.client import connect
 
-from protocol.session import member_token
+from hippodrome.protocol.session import member_token
+from hippodrome.trial.core.messages import Hello
+from hippodrome.trial.server import assignment, handshake
+from hippodrome.trial.settings import TrialSettings
 from tests.trial.sessions import (
     ENV,
     MEMBERS,
@@ -26,9 +29,6 @@ from tests.trial.sessions import (
     refused,
     wait_for_pictures,
 )
-from trial.core.messages import Hello
-from trial.server import assignment, handshake
-from trial.settings import TrialSettings
 
 
 async def test_each_member_plays_the_player_of_their_seat(launch):

@@ -5,7 +5,13 @@ import json
 
 import pytest
 
-from protocol.session import Member, SessionDocument
+from hippodrome.protocol.session import Member, SessionDocument
+from hippodrome.trial.core.session import PARTNER_STOPPED
+from hippodrome.trial.recordings.recorder import Recorder
+from hippodrome.trial.recordings.spool import Spool
+from hippodrome.trial.recordings.store import FolderStore
+from hippodrome.trial.server import assignment
+from hippodrome.trial.settings import TrialSettings
 from testing.waiting import until
 from tests.trial.sessions import (
     ENV,
@@ -26,12 +32,6 @@ from tests.trial.sessions import (
     wait_for_pictures,
 )
 from tests.trial.two_players import two_players
-from trial.core.session import PARTNER_STOPPED
-from trial.recordings.recorder import Recorder
-from trial.recordings.spool import Spool
-from trial.recordings.store import FolderStore
-from trial.server import assignment
-from trial.settings import TrialSettings
 
 # ---- two game steps
 

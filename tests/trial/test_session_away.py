@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from hippodrome.trial.settings import STALLED_SECONDS
 from tests.trial.sessions import answer, launch_formed, member, recordings
-from trial.settings import STALLED_SECONDS
 
 AS_PLAYED = str(STALLED_SECONDS)
 pytestmark = pytest.mark.timeout(90)

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from console.problem import Exit
-from deploy.__main__ import main
-from hippodrome.model.memberships import Membership
-from hippodrome.model.records import to_json
-from protocol.keys import membership_key
+from hippodrome.console.problem import Exit
+from hippodrome.control.model.memberships import Membership
+from hippodrome.control.model.records import to_json
+from hippodrome.deployment.__main__ import main
+from hippodrome.protocol.keys import membership_key
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings.resume import add_lines
 from tests.trial.sessions import SID, form, launch_session, member, put, recordings
 from tests.trial.two_players import two_players
-from trial.core.unfinished import RecordedTrial
-from trial.recordings.resume import add_lines
 
 FEEDBACK = {"ui": {"up": True, "down": True, "start": True, "stop": True, "good": True, "bad": True}}
 

@@ -8,9 +8,12 @@ import time
 import pytest
 from websockets.asyncio.client import connect
 
-from protocol.handover import Handover
-from protocol.keys import handover_key
-from protocol.session import SessionDocument
+from hippodrome.protocol.handover import Handover
+from hippodrome.protocol.keys import handover_key
+from hippodrome.protocol.session import SessionDocument
+from hippodrome.trial.server import assignment, handshake
+from hippodrome.trial.server.server import TrialServer
+from hippodrome.trial.settings import SettingsError, TrialSettings
 from testing.waiting import until
 from tests.trial.sessions import (
     ENV,
@@ -31,9 +34,6 @@ from tests.trial.sessions import (
     refused,
 )
 from tests.trial.two_players import two_players
-from trial.server import assignment, handshake
-from trial.server.server import TrialServer
-from trial.settings import SettingsError, TrialSettings
 
 WARM = {"SESSION": "", "WARM_SERVER": "on", "SERVER": "warm-1"}
 
@@ -89,9 +89,11 @@ async def test_a_member_who_comes_while_the_server_reads_old_recordings_is_not_s
         return []
 
     monkeypatch.setattr(server, "_leftovers", slowly)
-    monkeypatch.setattr("trial.server.server.set_environment", lambda *told: None)  # it would be that of the tests
+    monkeypatch.setattr(
+        "hippodrome.trial.server.server.set_environment", lambda *told: None
+    )  # it would be that of the tests
 
-    monkeypatch.setattr("trial.server.server.exit_hard_after", lambda seconds: None)
+    monkeypatch.setattr("hippodrome.trial.server.server.exit_hard_after", lambda seconds: None)
     serving = asyncio.create_task(server.run())
     while not (said := capsys.readouterr().out):
         await asyncio.sleep(0.01)

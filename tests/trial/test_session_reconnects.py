@@ -6,8 +6,8 @@ import time
 
 from websockets.exceptions import ConnectionClosed
 
+from hippodrome.trial.wire.reconnects import AT_ONCE, SECONDS_EACH
 from tests.trial.sessions import hello_of, launch_formed, member, recordings
-from trial.wire.reconnects import AT_ONCE, SECONDS_EACH
 
 ON = {"afterAbsent": "policy", "substitute": "random"}
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from trial.settings import SettingsError, TrialSettings, trial_section
+from hippodrome.trial.settings import SettingsError, TrialSettings, trial_section
 
 ENV = {
     "PROJECT_ID": "p",

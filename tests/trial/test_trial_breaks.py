@@ -5,13 +5,13 @@ from itertools import groupby
 
 import pytest
 
-from trial.core.ended import Break, Episode
-from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState, TrialProgress
-from trial.core.unfinished import RecordedTrial
-from trial.recordings import recording
-from trial.recordings.resume import add_lines
-from trial.settings import trial_section
+from hippodrome.trial.core.ended import Break, Episode
+from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.progress import PlayState, TrialProgress
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.resume import add_lines
+from hippodrome.trial.settings import trial_section
 
 SPACE = ("noop", "up", "right", "left", "down", "upright")
 UI = dict.fromkeys(("left", "right", "up", "start", "pause", "reset", "stop", "good"), True)

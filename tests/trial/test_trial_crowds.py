@@ -8,8 +8,8 @@ import ssl
 import struct
 from pathlib import Path
 
+from hippodrome.trial.server.listener import MAX_UNAUTHENTICATED_WEBSOCKETS, PINGS_A_SECOND
 from tests.trial.test_trial_tls import KEYS, put
-from trial.server.listener import MAX_UNAUTHENTICATED_WEBSOCKETS, PINGS_A_SECOND
 
 SILENT = b""
 SLOW = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: "  # the rest is never sent

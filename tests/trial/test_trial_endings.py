@@ -3,8 +3,8 @@
 import asyncio
 import time
 
+from hippodrome.trial.recordings import recording
 from tests.trial.client_messages import play_to_the_end
-from trial.recordings import recording
 
 UI = {"stop": True}
 
@@ -179,7 +179,7 @@ def test_wrong_settings_are_named(tmp_path):
     root = Path(__file__).parents[2]
     env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root), "PROJECT_ID": "x", "USER_ID": "a/b"}
     done = subprocess.run(
-        [sys.executable, "-m", "trial"],
+        [sys.executable, "-m", "hippodrome.trial"],
         check=False,
         cwd=tmp_path,
         env={**env, "GAME_STEPS": "3"},

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from protocol.exits import LATE_AGENT, NO_AGENT
-from trial.agent.agent import Agent, AgentAdapter
-from trial.core.trial import TRIAL_FAILED
+from hippodrome.protocol.exits import LATE_AGENT, NO_AGENT
+from hippodrome.trial.agent.agent import Agent, AgentAdapter
+from hippodrome.trial.core.trial import TRIAL_FAILED
 
 BASE = """
 import time
@@ -197,7 +197,7 @@ async def test_a_step_that_never_returns_ends_the_trial(launch, open_client):
     assert (answers["outcome"], answers["frames"]) == ("failed", 5)
     lines = server.recordings()["3-episode-0001.jsonl.gz"]
     assert [line["kind"] for line in lines] == ["header", "reset"] + ["step"] * 5 + ["error", "end"]
-    assert lines[-2]["error"] == "trial.core.effects.AgentTimeout: no answer within 1 s"
+    assert lines[-2]["error"] == "hippodrome.trial.core.effects.AgentTimeout: no answer within 1 s"
 
 
 async def test_the_log_names_the_line_in_which_a_step_never_returns(launch, open_client, tmp_path):

@@ -5,10 +5,10 @@ import json
 
 import pytest
 
-from trial.core.message_log import Word
-from trial.core.unfinished import RecordedTrial
-from trial.recordings import recording
-from trial.recordings.resume import add_lines
+from hippodrome.trial.core.message_log import Word
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.resume import add_lines
 
 HISTORY = '''
 """Each reward depends on everything that happened in the episode before it, feedback included."""

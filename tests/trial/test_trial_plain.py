@@ -13,14 +13,14 @@ from PIL import Image
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.message_log import MessageLog
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
+from hippodrome.trial.settings import TrialSettings
+from hippodrome.trial.wire import plain
 from testing.exploration import examples
 from tests.trial.hippo_page import hippo_page
-from trial.core import messages
-from trial.core.message_log import MessageLog
-from trial.recordings import recording
-from trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
-from trial.settings import TrialSettings
-from trial.wire import plain
 
 HERE = "https://play.example.org"
 UI = {

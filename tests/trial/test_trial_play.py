@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from protocol.trial_keys import keys
-from protocol.trial_sections import Ui
+from hippodrome.protocol.trial_keys import keys
+from hippodrome.protocol.trial_sections import Ui
+from hippodrome.trial.settings import STALLED_SECONDS
 from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end
-from trial.settings import STALLED_SECONDS
 
 EXAMPLE = Path(__file__).parents[2] / "agent.py"
 
@@ -100,7 +100,7 @@ async def test_the_recording_says_what_happened(launch, open_client, grid, tmp_p
     assert end["kind"] == "end"
     assert end["why"] == "reset"
     assert end["steps"] == len(steps)
-    from trial.recordings.recording import read_observation
+    from hippodrome.trial.recordings.recording import read_observation
 
     assert read_observation(left[0]["observation"]).tolist() == [left[0]["step"], 3]
     assert server.answer()["answers"]["outcome"] == "stopped"

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from deploy.aws.account import Installation
-from deploy.study.definition import definition
-from protocol import exits
+from hippodrome.deployment.aws.account import Installation
+from hippodrome.deployment.study.definition import definition
+from hippodrome.protocol import exits
 from tests.trial.conftest import ROOT, grid_agent
 
 # The program runs beside a client that asks for /healthz until it is answered, and then ends the program.
@@ -81,7 +81,7 @@ def run(folder: Path, said: dict[str, Any]) -> list[str]:
     script = " && ".join(["ip link set lo up", *sets, 'exec "$@"'])
     command = [*OUTER, "sh", "-c", script, "sh", sys.executable, "-c", CLIENT, str(port)]
     done = subprocess.run(
-        [*command, *dropped, sys.executable, "-m", "trial"],
+        [*command, *dropped, sys.executable, "-m", "hippodrome.trial"],
         cwd=folder,
         env={**os.environ, **settings},
         capture_output=True,

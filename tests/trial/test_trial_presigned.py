@@ -12,17 +12,17 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from cryptography import x509
 
-from hippodrome.certificates.rules import location
-from hippodrome.model import ids, server
-from hippodrome.model.server import Reason
-from protocol.handover import Handover
-from protocol.keys import handover_key, waiting_key
+from hippodrome.control.certificates.rules import location
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.server import Reason
+from hippodrome.protocol.handover import Handover
+from hippodrome.protocol.keys import handover_key, waiting_key
+from hippodrome.trial.recordings import presigned, recording
+from hippodrome.trial.recordings.presigned import PresignedStore, StoreError
+from hippodrome.trial.recordings.spool import store_file
 from testing.strict_s3 import StrictS3
 from testing.studies import study
 from tests.trial.test_trial_tls import certificate
-from trial.recordings import presigned, recording
-from trial.recordings.presigned import PresignedStore, StoreError
-from trial.recordings.spool import store_file
 
 USER = "P1"
 UI = {"stop": True, "start": True}

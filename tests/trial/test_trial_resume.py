@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.core.message_log import Word
-from trial.core.unfinished import RecordedTrial
-from trial.recordings import recording
-from trial.recordings.resume import add_lines, load_recorded
-from trial.recordings.store import FolderStore
+from hippodrome.trial.core.message_log import Word
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.resume import add_lines, load_recorded
+from hippodrome.trial.recordings.store import FolderStore
 
 DICE = (
     "\n_step = Grid.step\ndef _lucky(self, action):\n    import random\n    seen, _, *rest = _step(self, action)\n"

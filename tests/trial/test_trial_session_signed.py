@@ -5,11 +5,11 @@ import json
 
 import pytest
 
-from hippodrome.model.server import Reason
-from protocol.keys import answer_key, session_key
+from hippodrome.control.model.server import Reason
+from hippodrome.protocol.keys import answer_key, session_key
+from hippodrome.trial.recordings import recording
 from tests.trial.sessions import MEMBERS, SID, document, hello_of, launch_session
 from tests.trial.test_trial_presigned import Town
-from trial.recordings import recording
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from trial.recordings.store import FolderStore
-from trial.server.certificate import Certificate
-from trial.settings import TrialSettings
+from hippodrome.trial.recordings.store import FolderStore
+from hippodrome.trial.server.certificate import Certificate
+from hippodrome.trial.settings import TrialSettings
 
 
 def certificate(serial):

@@ -4,10 +4,10 @@ import asyncio
 import time
 from pathlib import Path
 
+from hippodrome.trial.recordings import recording
 from tests.trial.conftest import client_of
 from tests.trial.far_away import far_away
 from tests.trial.sessions import MEMBERS, SID, TRIAL, answer, launch_formed, member, recordings
-from trial.recordings import recording
 
 SECONDS = "RECORDINGS_FIRST_SECONDS"
 

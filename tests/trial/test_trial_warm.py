@@ -13,14 +13,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosedError
 
-from protocol import handover
-from protocol.exits import NO_AGENT
-from protocol.handover import BadHandover, Handover
-from protocol.keys import handover_key
+from hippodrome.protocol import handover
+from hippodrome.protocol.exits import NO_AGENT
+from hippodrome.protocol.handover import BadHandover, Handover
+from hippodrome.protocol.keys import handover_key
+from hippodrome.trial.server import assignment
+from hippodrome.trial.server.watchdog import Watchdog
+from hippodrome.trial.settings import SettingsError, TrialSettings
 from testing.waiting import PATIENCE, until_async
-from trial.server import assignment
-from trial.server.watchdog import Watchdog
-from trial.settings import SettingsError, TrialSettings
 
 WARM_SERVER, OWN = "sparesparesparespare-1", "a-1"
 UI = {"stop": True, "start": True}

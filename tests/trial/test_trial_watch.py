@@ -11,9 +11,9 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from hippodrome.trial.recordings import resume
+from hippodrome.trial.server.watch import MAX_PROGRAMS, Watchers
 from tests.trial.two_players import TRIAL, two_players
-from trial.recordings import resume
-from trial.server.watch import MAX_PROGRAMS, Watchers
 
 PROOF = "?token=the-secret-token"
 ANSWER_SECONDS = 60

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 
-from deploy.stack.settings import SITE_LENGTH
+from hippodrome.deployment.stack.settings import SITE_LENGTH
 from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
 from tests.infra.situations import Installation, Resource
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import Topic
-from local.backend import bus as bus_module
-from local.backend.bus import FolderBus
+from hippodrome.control.ports import Topic
+from hippodrome.local.backend import bus as bus_module
+from hippodrome.local.backend.bus import FolderBus
 from tests.local.conftest import ROOT
 
 Event = dict[str, Any]
@@ -215,8 +215,8 @@ def test_an_unhandled_message_is_delivered_again_by_the_next_process(tmp_path: P
 DIE = """
 import os, signal, sys, time
 from pathlib import Path
-from hippodrome.ports import Topic
-from local.backend.bus import FolderBus
+from hippodrome.control.ports import Topic
+from hippodrome.local.backend.bus import FolderBus
 
 def handler(event, context):
     with open(sys.argv[2], "a") as seen:

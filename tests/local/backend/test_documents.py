@@ -14,16 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.ports import Conflict
-from local.backend.documents import FolderDocuments
+from hippodrome.control.ports import Conflict
+from hippodrome.local.backend.documents import FolderDocuments
+from hippodrome.trial.recordings.store import FolderStore
 from tests.local.conftest import ROOT
-from trial.recordings.store import FolderStore
 
 COUNT_UP = """
 import sys
 from pathlib import Path
-from hippodrome.ports import Conflict
-from local.backend.documents import FolderDocuments
+from hippodrome.control.ports import Conflict
+from hippodrome.local.backend.documents import FolderDocuments
 documents = FolderDocuments(Path(sys.argv[1]), Path(sys.argv[2]))
 for _ in range(int(sys.argv[3])):
     while True:
@@ -37,7 +37,7 @@ for _ in range(int(sys.argv[3])):
 WRITE_FOR_EVER = """
 import sys
 from pathlib import Path
-from local.backend.documents import FolderDocuments
+from hippodrome.local.backend.documents import FolderDocuments
 documents = FolderDocuments(Path(sys.argv[1]), Path(sys.argv[2]))
 found, n = documents.get("big.json"), 0
 etag = found.etag

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import TaskRequest, Topic
-from lambdas import installed
-from local.backend import platform as platform_module
-from local.backend.platform import LocalPlatform
+from hippodrome.control.ports import TaskRequest, Topic
+from hippodrome.functions import installed
+from hippodrome.local.backend import platform as platform_module
+from hippodrome.local.backend.platform import LocalPlatform
 from testing.waiting import until
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))

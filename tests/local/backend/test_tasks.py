@@ -17,18 +17,18 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
-from hippodrome.model import messages
-from hippodrome.ports import Address, Refused, TaskRequest
-from local.backend import task_process
-from local.backend import tasks as tasks_module
-from local.backend.processes import end_everything, marked
-from local.backend.task_record import TaskFolder, TaskRecord
-from local.backend.tasks import ProcessTasks
-from protocol.handover import Handover
+from hippodrome.control.model import messages
+from hippodrome.control.ports import Address, Refused, TaskRequest
+from hippodrome.local.backend import task_process
+from hippodrome.local.backend import tasks as tasks_module
+from hippodrome.local.backend.processes import end_everything, marked
+from hippodrome.local.backend.task_record import TaskFolder, TaskRecord
+from hippodrome.local.backend.tasks import ProcessTasks
+from hippodrome.protocol.handover import Handover
+from hippodrome.trial.gym import linux
+from hippodrome.trial.recordings import recording
 from testing.waiting import until
 from tests.local.conftest import ROOT
-from trial.gym import linux
-from trial.recordings import recording
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
@@ -232,10 +232,10 @@ def test_the_next_process_takes_over_running_servers(here: Here) -> None:
 BEGIN = """
 import os, signal, sys
 from pathlib import Path
-from local.backend.task_process import TaskProcess
-from local.backend.tasks import ProcessTasks
+from hippodrome.local.backend.task_process import TaskProcess
+from hippodrome.local.backend.tasks import ProcessTasks
 from tests.local.backend.test_tasks import FAKE, request
-from protocol.handover import Handover
+from hippodrome.protocol.handover import Handover
 state, data, project, moment, seconds = sys.argv[1:]
 
 def die():

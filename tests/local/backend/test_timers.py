@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from hippodrome.ports import DnsRecord
-from local.backend.dns import FileDns
-from local.backend.timers import FolderTimers
+from hippodrome.control.ports import DnsRecord
+from hippodrome.local.backend.dns import FileDns
+from hippodrome.local.backend.timers import FolderTimers
 from testing.waiting import until
 
 Make = Callable[..., FolderTimers]

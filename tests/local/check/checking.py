@@ -6,9 +6,9 @@ import os
 import subprocess
 from pathlib import Path
 
-from hippodrome.config import read_project
-from local.check import agent as agent_check
-from local.check.project import check_project
+from hippodrome.control.config import read_project
+from hippodrome.local.check import agent as agent_check
+from hippodrome.local.check.project import check_project
 from testing import processes
 from tests.local.conftest import ROOT
 
@@ -47,7 +47,7 @@ def run(folder: Path) -> tuple[int, list[str]]:
     said = folder.parent / "said.log"
     with said.open("w") as errors:
         done = processes.start(
-            "local.check",
+            "hippodrome.local.check",
             [str(folder)],
             cwd=folder.parent,
             env={**os.environ, "PYTHONPATH": str(ROOT)},

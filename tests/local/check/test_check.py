@@ -1,4 +1,4 @@
-"""`python -m local.check`: it reports every mistake and remark, and nothing else."""
+"""`python -m hippodrome.local.check`: it reports every mistake and remark, and nothing else."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from local.backend.platform import LocalPlatform
-from local.check import agent_progress
-from local.check.agent_report import last_line
-from local.check.outside import Outside
-from local.publish import publish
-from local.watch import Watch
+from hippodrome.local.backend.platform import LocalPlatform
+from hippodrome.local.check import agent_progress
+from hippodrome.local.check.agent_report import last_line
+from hippodrome.local.check.outside import Outside
+from hippodrome.local.publish import publish
+from hippodrome.local.watch import Watch
 from tests.local.check.checking import agent, config, looked, page, run, tried
 from tests.local.conftest import ROOT, Local
 
@@ -87,7 +87,7 @@ def test_check_reports_a_missing_folder(tmp_path: Path) -> None:
 
 
 def test_a_running_study_reports_mistakes_in_changed_files(folder: Path, tmp_path: Path) -> None:
-    from lambdas import installed
+    from hippodrome.functions import installed
 
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers={})
     installed.use(platform)

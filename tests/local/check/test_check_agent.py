@@ -1,4 +1,4 @@
-"""`python -m local.check` on agent.py: each failure with its line."""
+"""`python -m hippodrome.local.check` on agent.py: each failure with its line."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from typing import Any
 
 import pytest
 
-from hippodrome.config import read_project
-from local.check import agent as agent_check
-from local.check import waiting
-from local.check.agent_report import AgentReport, slowness
-from local.check.pace import Pace
+from hippodrome.control.config import read_project
+from hippodrome.local.check import agent as agent_check
+from hippodrome.local.check import waiting
+from hippodrome.local.check.agent_report import AgentReport, slowness
+from hippodrome.local.check.pace import Pace
 from testing.exploration import sample
 from testing.processes import interruptible
 from testing.waiting import until
@@ -473,7 +473,7 @@ def test_ctrl_c_names_the_call_and_its_line(folder: Path, terminal: bool) -> Non
     agent(folder, "self.n += 1", "import time; time.sleep(1000)")
     keyboard, screen = pty.openpty() if terminal else os.pipe()
     check = subprocess.Popen(
-        [sys.executable, "-m", "local.check", str(folder)],
+        [sys.executable, "-m", "hippodrome.local.check", str(folder)],
         cwd=ROOT,
         stdout=screen,
         stderr=subprocess.DEVNULL,
@@ -666,9 +666,8 @@ def test_words_that_reach_no_method_of_the_agent_are_remarked(folder: Path, cont
 @pytest.mark.parametrize(
     ("file", "whose"),
     [
-        ("console.py", "Hippodrome"), ("protocol.py", "Hippodrome"), ("export/__init__.py", "Hippodrome"),
-        ("local/maze.py", "Hippodrome"), ("random.py", "Python"), ("test.py", "Python"), ("yaml.py", "the installed package PyYAML"),
-        ("maze.py", None),
+        ("hippodrome.py", "Hippodrome"), ("hippodrome/maze.py", "Hippodrome"), ("random.py", "Python"), ("test.py", "Python"), ("yaml.py", "the installed package PyYAML"),
+        ("maze.py", None), ("console.py", None), ("export/__init__.py", None), ("trial.py", None),
     ],
 )  # fmt: skip
 def test_a_file_that_an_import_does_not_get_is_named(folder: Path, file: str, whose: str | None) -> None:

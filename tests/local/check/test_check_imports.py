@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import agent_imports, read_project
-from protocol.players import ONNXRUNTIME
+from hippodrome.control.config import agent_imports, read_project
+from hippodrome.protocol.players import ONNXRUNTIME
 from tests.local.check.checking import config, run
 from tests.local.conftest import ROOT, write_study
 
@@ -92,7 +92,7 @@ def test_the_packages_of_the_image_are_known_beside_requirements_that_are_not_in
 
 
 def test_parts_of_hippodrome_are_missing_whatever_the_requirements(folder: Path) -> None:
-    begin(folder, "import hippodrome.model.ids")
+    begin(folder, "import hippodrome.control.model.ids")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
     (line,) = found(folder)
     assert line.startswith("agent.py:1: hippodrome is not in the servers' image")
@@ -124,11 +124,11 @@ def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
 
 
 def test_of_our_own_code_the_image_holds_only_the_trials(folder: Path) -> None:
-    begin(folder, "import trial.agent, protocol\nimport hippodrome.model.ids")
+    begin(folder, "import hippodrome.trial.agent, hippodrome.protocol\nimport hippodrome.control.model.ids")
     (line,) = found(folder)
     assert (
         line
-        == "agent.py:2: hippodrome is not in the servers' image; it is a part of Hippodrome that servers do not have"
+        == "agent.py:2: hippodrome.control.model.ids is not in the servers' image; it is a part of Hippodrome that servers do not have"
     )
 
 

@@ -1,4 +1,4 @@
-"""`python -m local.check` on pages: Jinja, HTML, questions, and the code that recruiters ask for."""
+"""`python -m hippodrome.local.check` on pages: Jinja, HTML, questions, and the code that recruiters ask for."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import read_project
-from local.check.pages import check_pages
+from hippodrome.control.config import read_project
+from hippodrome.local.check.pages import check_pages
 from tests.local.check.checking import config, looked, page
 
 # --- Jinja -------------------------------------------------------------------------------------------

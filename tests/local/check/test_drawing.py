@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from hippodrome.config import read_project
-from local.check import agent as agent_check
+from hippodrome.control.config import read_project
+from hippodrome.local.check import agent as agent_check
 from tests.local.conftest import ROOT, write_study
 
 DOCS = (ROOT / "docs" / "objects.md").read_text()

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hippodrome.config import read_project
-from local.check import agent as agent_check
+from hippodrome.control.config import read_project
+from hippodrome.local.check import agent as agent_check
 from testing import onnx_files
 from tests.local.conftest import write_study
 

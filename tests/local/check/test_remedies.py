@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from local.check.remedies import remedy
+from hippodrome.local.check.remedies import remedy
 
-OLD_GYM = Path(__file__).resolve().parents[3] / "trial/agent/old_gym"
+OLD_GYM = Path(__file__).resolve().parents[3] / "hippodrome/trial/agent/old_gym"
 STAND_IN = "; what stands in for Gym here has no {}: use Gymnasium's, or leave it out (docs/hippo.md#agents)"
 PACKAGE = "; name its package in a requirements.txt beside agent.py: {}"
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.config import read_project
-from local.check import agent as agent_check
-from local.check.project import check_project
+from hippodrome.control.config import read_project
+from hippodrome.local.check import agent as agent_check
+from hippodrome.local.check.project import check_project
+from hippodrome.trial.agent.match import SECONDS
 from tests.local.check.test_players import AGENT
 from tests.local.conftest import write_study
-from trial.agent.match import SECONDS
 
 TRIAL = """
 trial:

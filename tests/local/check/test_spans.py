@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from local.check import spans, structure, tags
+from hippodrome.local.check import spans, structure, tags
 
 PIECES = ["{{", "}}", "{%", "%}", "{#", "#}", "{", "}", "%", "x", "\n", " ", "raw ", "endraw", "-"]
 

@@ -14,9 +14,9 @@ from typing import Any
 import httpx
 import pytest
 
-from hippodrome.http import Request
-from local.web import access, connections, server
-from local.web import app as web_app
+from hippodrome.control.http import Request
+from hippodrome.local.web import access, connections, server
+from hippodrome.local.web import app as web_app
 
 Event = dict[str, Any]
 

@@ -10,15 +10,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from protocol import exits
+from hippodrome.protocol import exits
+from hippodrome.trial.agent import callbacks as callbacks_module
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.callback_names import NAMES
+from hippodrome.trial.agent.callbacks import MAX_VALUES, Callbacks, Session, TrialFacts, listening
+from hippodrome.trial.agent.starting import start
+from hippodrome.trial.recordings import recording
 from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end
-from trial.agent import callbacks as callbacks_module
-from trial.agent.agent import AgentAdapter
-from trial.agent.callback_names import NAMES
-from trial.agent.callbacks import MAX_VALUES, Callbacks, Session, TrialFacts, listening
-from trial.agent.starting import start
-from trial.recordings import recording
 
 FACTS = TrialFacts("trial-1", "3", 1)
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.agent.agent import AgentAdapter, AgentError
-from trial.agent.joint import Joint, JointAdapter
-from trial.agent.joint_calls import snapshot
-from trial.agent.starting import start
+from hippodrome.trial.agent.agent import AgentAdapter, AgentError
+from hippodrome.trial.agent.joint import Joint, JointAdapter
+from hippodrome.trial.agent.joint_calls import snapshot
+from hippodrome.trial.agent.starting import start
 
 PONG = "pettingzoo.butterfly.cooperative_pong_v6"
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
@@ -522,7 +522,7 @@ def test_whatever_step_returns_is_read_or_refused_with_a_sentence(results: list[
     agent = Returning()
     adapter = AgentAdapter(Path("/nowhere"), "none", ("left", "right"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("trial.agent.agent.load", lambda _folder: agent)
+        patch.setattr("hippodrome.trial.agent.agent.load", lambda _folder: agent)
         found = start(adapter)
     assert isinstance(found, JointAdapter)
     now, _ = found.reset(1)

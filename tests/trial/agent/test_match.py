@@ -13,13 +13,13 @@ from typing import Any, cast
 
 import pytest
 
-from protocol.keys import groups_key, waiting_key
-from trial.agent import match
-from trial.agent.match import BadGroups
-from trial.recordings.store import FolderStore
-from trial.server import matching
-from trial.server.matching import Matching
-from trial.settings import TrialSettings
+from hippodrome.protocol.keys import groups_key, waiting_key
+from hippodrome.trial.agent import match
+from hippodrome.trial.agent.match import BadGroups
+from hippodrome.trial.recordings.store import FolderStore
+from hippodrome.trial.server import matching
+from hippodrome.trial.server.matching import Matching
+from hippodrome.trial.settings import TrialSettings
 
 QUESTION = {"id": "0" * 20, "players": 2, "waiting": [{"id": name, "answers": {"skill": name}} for name in "abcd"]}
 

@@ -1,4 +1,4 @@
-"""`import gym` where Gym is not installed: its old interface over Gymnasium (trial/agent/old_gym)."""
+"""`import gym` where Gym is not installed: its old interface over Gymnasium (hippodrome/trial/agent/old_gym)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from trial.agent.agent import AgentAdapter
-from trial.agent.starting import start
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.starting import start
 
-OLD_GYM = Path(__file__).parents[3] / "trial/agent/old_gym"
+OLD_GYM = Path(__file__).parents[3] / "hippodrome/trial/agent/old_gym"
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +268,7 @@ def test_an_installed_gym_is_imported_instead(tmp_path: Path) -> None:
     )
     code = f"""
 import sys; sys.path[:0] = [{str(OLD_GYM.parents[2])!r}, {str(tmp_path / "site")!r}]
-from pathlib import Path; from trial.agent.agent import load
+from pathlib import Path; from hippodrome.trial.agent.agent import load
 load(Path({str(tmp_path / "agent")!r}))
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

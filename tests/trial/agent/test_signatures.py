@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trial.agent import signatures
-from trial.agent.agent import AgentAdapter, AgentError, read_step_result
-from trial.agent.calls import AgentCalls
-from trial.agent.starting import start
-from trial.core.actions import Action
-from trial.core.effects import StepCall
-from trial.core.players import PLAYER
-from trial.recordings import recording
-from trial.recordings.recording import text_of_line
+from hippodrome.trial.agent import signatures
+from hippodrome.trial.agent.agent import AgentAdapter, AgentError, read_step_result
+from hippodrome.trial.agent.calls import AgentCalls
+from hippodrome.trial.agent.starting import start
+from hippodrome.trial.core.actions import Action
+from hippodrome.trial.core.effects import StepCall
+from hippodrome.trial.core.players import PLAYER
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.recording import text_of_line
 
 AGENT = """
 import numpy

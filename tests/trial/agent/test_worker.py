@@ -1,4 +1,4 @@
-"""The agent's thread (trial/agent/worker.py)."""
+"""The agent's thread (hippodrome/trial/agent/worker.py)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from hippodrome.trial.agent.worker import Worker
+from hippodrome.trial.core.effects import AgentTimeout
 from testing.waiting import PATIENCE, until_async
-from trial.agent.worker import Worker
-from trial.core.effects import AgentTimeout
 
 Heard = list[tuple[str, Any]]
 

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.core.controls import Controls
+from hippodrome.trial.core.controls import Controls
 
 SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
 

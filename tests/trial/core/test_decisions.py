@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from testing.imports import imported
-from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, UI, Driver, recorded, sent
-from trial.core.effects import (
+from hippodrome.trial.core.effects import (
     Begun,
     Call,
     Close,
@@ -25,18 +23,23 @@ from trial.core.effects import (
     WriteLine,
     WriteLog,
 )
-from trial.core.flow_control import Window
-from trial.core.message_log import Word
-from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState
-from trial.core.trial import TRIAL_FAILED, Phase
-from trial.settings import STALLED_SECONDS
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.message_log import Word
+from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.progress import PlayState
+from hippodrome.trial.core.trial import TRIAL_FAILED, Phase
+from hippodrome.trial.settings import STALLED_SECONDS
+from testing.imports import imported
+from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, UI, Driver, recorded, sent
 
 ROOT = Path(__file__).parents[3]
 
 CORE = [
-    *sorted((ROOT / "trial/core").glob("*.py")),
-    *(ROOT / f"trial/{name}.py" for name in ("pictures/encoder", "pictures/frames", "server/watchdog", "wire/inbound")),
+    *sorted((ROOT / "hippodrome/trial/core").glob("*.py")),
+    *(
+        ROOT / f"hippodrome/trial/{name}.py"
+        for name in ("pictures/encoder", "pictures/frames", "server/watchdog", "wire/inbound")
+    ),
 ]
 
 
@@ -367,7 +370,7 @@ def test_feedback_goes_to_the_agent_with_the_next_step_once():
 
 
 def test_too_many_messages_between_two_steps_are_counted_and_not_kept(monkeypatch):
-    monkeypatch.setattr("trial.core.message_log.MESSAGES_KEPT", 3)
+    monkeypatch.setattr("hippodrome.trial.core.message_log.MESSAGES_KEPT", 3)
     driver = Driver().playing()
     driver.step()
     for _ in range(5):

@@ -2,8 +2,7 @@
 
 import pytest
 
-from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, Driver, recorded, sent
-from trial.core.effects import (
+from hippodrome.trial.core.effects import (
     AgentTimeout,
     Call,
     CloseRecording,
@@ -23,11 +22,12 @@ from trial.core.effects import (
     WriteLine,
     WriteLog,
 )
-from trial.core.ended import Break, Episode
-from trial.core.message_log import Word
-from trial.core.players import PLAYER, alone
-from trial.core.trial import TRIAL_FAILED, Phase
-from trial.core.unfinished import RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.core.ended import Break, Episode
+from hippodrome.trial.core.message_log import Word
+from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.trial import TRIAL_FAILED, Phase
+from hippodrome.trial.core.unfinished import RecordedTrial, UnfinishedEpisode
+from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, Driver, recorded, sent
 
 # ---- episodes and the end
 

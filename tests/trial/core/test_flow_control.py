@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.core.clients import Client
-from trial.core.flow_control import Window
-from trial.settings import STALLED_SECONDS
+from hippodrome.trial.core.clients import Client
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.settings import STALLED_SECONDS
 
 
 def test_more_frames_may_be_under_way_if_the_round_trip_is_longer():

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.controls import KEY, Controls
+from hippodrome.trial.core.effects import RecordLine, SendMessage, SendState, StepCall
+from hippodrome.trial.core.ended import Episode
+from hippodrome.trial.core.episode_time import EpisodeTime
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.recordings.resume import add_lines
 from tests.trial.core.trial_driver import Driver
-from trial.core import messages
-from trial.core.controls import KEY, Controls
-from trial.core.effects import RecordLine, SendMessage, SendState, StepCall
-from trial.core.ended import Episode
-from trial.core.episode_time import EpisodeTime
-from trial.core.unfinished import RecordedTrial
-from trial.recordings.resume import add_lines
 
 SPACE = ("noop", "left", "up", "leftup", "jump")
 KEYS = {"ArrowLeft": "left", "a": "left", "ArrowUp+ArrowLeft": "leftup", " ": "jump", "x": "nowhere"}

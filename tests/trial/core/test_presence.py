@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from trial.core.presence import Presence, Rules
+from hippodrome.trial.core.presence import Presence, Rules
 
 
 def comes_and_is_measured(presence: Presence, now: float) -> None:

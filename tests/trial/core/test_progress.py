@@ -2,14 +2,14 @@
 
 import pytest
 
-from trial.core.actions import Action
-from trial.core.controls import Controls
-from trial.core.ended import Break, Episode
-from trial.core.messages import CommandRefused
-from trial.core.players import PLAYER, Player, alone
-from trial.core.progress import PlayState, TrialProgress
-from trial.core.timing import Pacer
-from trial.settings import trial_section
+from hippodrome.trial.core.actions import Action
+from hippodrome.trial.core.controls import Controls
+from hippodrome.trial.core.ended import Break, Episode
+from hippodrome.trial.core.messages import CommandRefused
+from hippodrome.trial.core.players import PLAYER, Player, alone
+from hippodrome.trial.core.progress import PlayState, TrialProgress
+from hippodrome.trial.core.timing import Pacer
+from hippodrome.trial.settings import trial_section
 
 SPACE = ("noop", "up", "left")
 

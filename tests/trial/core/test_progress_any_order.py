@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.core.ended import Break, Episode
-from trial.core.messages import CommandRefused
-from trial.core.players import PLAYER, alone
-from trial.core.progress import PlayState, TrialProgress
-from trial.core.timing import Pacer
-from trial.settings import trial_section
+from hippodrome.trial.core.ended import Break, Episode
+from hippodrome.trial.core.messages import CommandRefused
+from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.progress import PlayState, TrialProgress
+from hippodrome.trial.core.timing import Pacer
+from hippodrome.trial.settings import trial_section
 
 SPACE = ("noop", "up", "right", "left", "down", "upright", "upleft")
 

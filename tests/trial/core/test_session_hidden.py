@@ -6,9 +6,9 @@ import json
 
 import pytest
 
+from hippodrome.trial.core.effects import SendMessage
 from tests.trial.core.trial_driver import Driver
 from tests.trial.session_driver import SessionDriver
-from trial.core.effects import SendMessage
 
 ON = {"afterAbsent": "policy", "substitute": "random"}
 

@@ -12,9 +12,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
+from hippodrome.trial.core.effects import AskPolicy, StepCall
 from testing.exploration import examples
 from tests.trial.session_driver import SessionDriver
-from trial.core.effects import AskPolicy, StepCall
 
 ABSENT, COUNTDOWN, NEARLY = 30.0, 3.0, 1e-6
 TIMES = st.sampled_from([0.05, 0.35, 1.0, 2.0, COUNTDOWN, 10.0, 29.95, ABSENT])

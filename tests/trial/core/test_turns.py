@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from testing.exploration import examples
-from tests.trial.core.trial_driver import FRAME, Driver, sent
-from trial.core import messages
-from trial.core.effects import (
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.effects import (
     Begun,
     Call,
     FeedbackCall,
@@ -31,14 +29,16 @@ from trial.core.effects import (
     StepTaken,
     WriteLog,
 )
-from trial.core.flow_control import Window
-from trial.core.messages import CommandRefused
-from trial.core.players import PLAYER, Player, PlayersError, View, alone, who_plays
-from trial.core.policies import AskPolicy, Observed
-from trial.core.seeds import policy_seed
-from trial.core.trial import Phase, Trial
-from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.settings import TrialSettings, trial_section
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.messages import CommandRefused
+from hippodrome.trial.core.players import PLAYER, Player, PlayersError, View, alone, who_plays
+from hippodrome.trial.core.policies import AskPolicy, Observed
+from hippodrome.trial.core.seeds import policy_seed
+from hippodrome.trial.core.trial import Phase, Trial
+from hippodrome.trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.settings import TrialSettings, trial_section
+from testing.exploration import examples
+from tests.trial.core.trial_driver import FRAME, Driver, sent
 
 SPACE = ("noop", "up", "right")
 PLAYS = {"me": "human", "it": "agent:Partner"}

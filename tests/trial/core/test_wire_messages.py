@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trial.core import commands, messages
-from trial.core.controls import Controls
-from trial.pictures import frames
-from trial.server.watchdog import Watchdog
-from trial.settings import trial_section
+from hippodrome.trial.core import commands, messages
+from hippodrome.trial.core.controls import Controls
+from hippodrome.trial.pictures import frames
+from hippodrome.trial.server.watchdog import Watchdog
+from hippodrome.trial.settings import trial_section
 
 # ---- what a client says
 

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from trial.core import messages
-from trial.core.effects import (
+from hippodrome.trial.core import messages
+from hippodrome.trial.core.effects import (
     Begun,
     Call,
     OpenRecording,
@@ -15,12 +15,12 @@ from trial.core.effects import (
     StepCall,
     StepTaken,
 )
-from trial.core.ended import Episode
-from trial.core.flow_control import Window
-from trial.core.players import PLAYER, alone
-from trial.core.trial import Trial
-from trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.settings import TrialSettings
+from hippodrome.trial.core.ended import Episode
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.trial import Trial
+from hippodrome.trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.settings import TrialSettings
 
 SPACE = ("noop", "up", "right")
 UI = dict.fromkeys(("start", "pause", "stop", "reset", "good", "bad", "up", "right", "fpsUp"), True)

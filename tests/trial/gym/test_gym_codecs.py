@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from hippodrome.trial.gym import exact, values
+from hippodrome.trial.gym.spaces import CodecError, build, describe
 from tests.trial.gym.comparing import same
 from tests.trial.gym.remote_environments import EVERYTHING
-from trial.gym import exact, values
-from trial.gym.spaces import CodecError, build, describe
 
 SPACES: list[spaces.Space[Any]] = [
     *EVERYTHING.values(),

@@ -13,16 +13,16 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
+from hippodrome.trial.gym import override
+from hippodrome.trial.gym.__main__ import main
+from hippodrome.trial.gym.settings import Limits
 from testing.gym_server import ROOT, GymServerProcess, TextClient, gym_server
-from trial.gym import override
-from trial.gym.__main__ import main
-from trial.gym.settings import Limits
 
 PROGRAM = '''
 import gymnasium
-from trial import gym as gymie
-from trial.gym import EnvironmentNotFound, override
-from trial.gym.settings import Limits
+from hippodrome.trial import gym as gymie
+from hippodrome.trial.gym import EnvironmentNotFound, override
+from hippodrome.trial.gym.settings import Limits
 
 
 @override("get_env")
@@ -110,10 +110,10 @@ def test_the_documentation_has_every_limit_with_its_default() -> None:
 @pytest.mark.parametrize(
     ("arguments", "command"),
     [
-        ([], "-m trial.gym --port 5000"),
-        (["PORT=5001"], "-m trial.gym --port 5001"),
-        (["HOST=0.0.0.0"], '-m trial.gym --port 5000 --host "0.0.0.0"'),
-        (["ARGS=--seconds 10"], "-m trial.gym --port 5000 --seconds 10"),
+        ([], "-m hippodrome.trial.gym --port 5000"),
+        (["PORT=5001"], "-m hippodrome.trial.gym --port 5001"),
+        (["HOST=0.0.0.0"], '-m hippodrome.trial.gym --port 5000 --host "0.0.0.0"'),
+        (["ARGS=--seconds 10"], "-m hippodrome.trial.gym --port 5000 --seconds 10"),
     ],
 )
 def test_make_gym_starts_a_server(arguments: list[str], command: str) -> None:
@@ -128,7 +128,7 @@ def test_only_two_functions_can_be_replaced() -> None:
 
 def test_a_port_that_is_taken_is_reported(program: GymServerProcess) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "trial.gym", "--port", str(program.port)],
+        [sys.executable, "-m", "hippodrome.trial.gym", "--port", str(program.port)],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 1
@@ -166,7 +166,7 @@ def test_a_host_that_does_not_exist_is_reported(host: str, capsys: pytest.Captur
 def test_a_start_outside_of_the_main_thread_is_refused(tmp_path: Path) -> None:
     program = """
 import threading
-from trial import gym as gymie
+from hippodrome.trial import gym as gymie
 
 thread = threading.Thread(target=gymie.start, args=("127.0.0.1", 0))
 thread.start()
@@ -183,7 +183,7 @@ thread.join()
 def test_a_module_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("raise RuntimeError('no')")
     done = subprocess.run(
-        [sys.executable, "-m", "trial.gym", "--port", "0", "--import", "broken"],
+        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", "--import", "broken"],
         cwd=tmp_path, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"}, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (1, "broken cannot be imported: RuntimeError: no\n")
@@ -193,7 +193,7 @@ def test_a_module_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize("recorded", [False, True])
 def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int, recorded: bool) -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "trial.gym", "--port", "0", *(["--record", str(tmp_path)] if recorded else [])],
+        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", *(["--record", str(tmp_path)] if recorded else [])],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None
@@ -224,7 +224,7 @@ def test_other_processes_of_the_program_stay(tmp_path: Path) -> None:
 
 def test_a_host_that_others_can_reach_gets_a_warning() -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "trial.gym", "--port", "0", "--host", "0.0.0.0"],
+        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", "--host", "0.0.0.0"],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stderr is not None

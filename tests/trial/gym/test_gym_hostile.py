@@ -16,9 +16,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
+from hippodrome.trial.gym.server import REFUSING
 from testing.gym_server import GymServerProcess, TextClient, gym_server
 from testing.waiting import until
-from trial.gym.server import REFUSING
 
 WITHIN = 15.0
 HERE = Path(__file__).parent

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from hippodrome.trial.gym import RemoteEnv, RemoteError, ids
 from testing.gym_server import gym_server
-from trial.gym import RemoteEnv, RemoteError, ids
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ import numpy as np
 import psutil
 import pytest
 
-from console.problem import Exit
-from deploy.__main__ import main
+from hippodrome.console.problem import Exit
+from hippodrome.deployment.__main__ import main
+from hippodrome.trial.gym.recordings import ConnectionRecorder
+from hippodrome.trial.recordings import recording
 from testing.gym_server import ROOT, TextClient, gym_server
 from testing.waiting import until
-from trial.gym.recordings import ConnectionRecorder
-from trial.recordings import recording
 
 HERE = Path(__file__).parent
 ODD = ("--import", "odd_environments")

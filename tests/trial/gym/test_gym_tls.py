@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from hippodrome.trial.gym import ConnectionLost, RemoteEnv
 from testing.gym_server import gym_server
 from tests.trial.test_trial_tls import put
-from trial.gym import ConnectionLost, RemoteEnv
 
 
 @contextlib.contextmanager

@@ -11,9 +11,9 @@ import pytest
 from gymnasium import spaces
 from websockets.sync.server import ServerConnection, serve
 
-from trial.gym import ConnectionLost, RemoteEnv, RemoteError, exact
-from trial.gym.forms import SUBPROTOCOL
-from trial.gym.spaces import describe
+from hippodrome.trial.gym import ConnectionLost, RemoteEnv, RemoteError, exact
+from hippodrome.trial.gym.forms import SUBPROTOCOL
+from hippodrome.trial.gym.spaces import describe
 
 MADE: dict[str, Any] = {
     "instance_id": "a",

@@ -146,9 +146,9 @@ def environment() -> dict[str, str]:
 
 
 def run_experiment(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run `python -m trial.interactive_gym --no-run ARGUMENTS` in this folder, by default for `experiment.py`."""
+    """Run `python -m hippodrome.trial.interactive_gym --no-run ARGUMENTS` in this folder, by default for `experiment.py`."""
     return subprocess.run(
-        [sys.executable, "-m", "trial.interactive_gym", "--no-run", *(arguments or ["experiment.py"])],
+        [sys.executable, "-m", "hippodrome.trial.interactive_gym", "--no-run", *(arguments or ["experiment.py"])],
         cwd=folder,
         env=environment(),
         stdin=subprocess.DEVNULL,

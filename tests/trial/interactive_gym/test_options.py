@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from trial.interactive_gym import objects, options
-from trial.interactive_gym.options import RemoteConfig
-from trial.pictures.scene import as_scene
+from hippodrome.trial.interactive_gym import objects, options
+from hippodrome.trial.interactive_gym.options import RemoteConfig
+from hippodrome.trial.pictures.scene import as_scene
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 import yaml
 
+from hippodrome.trial.interactive_gym import playing
+from hippodrome.trial.interactive_gym.game import RemoteGame
+from hippodrome.trial.interactive_gym.options import RemoteConfig, Unplayable
 from tests.trial.client_messages import play_to_the_end
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, run_experiment
 from tests.trial.sessions import SID, answer, form, member, recordings
-from trial.interactive_gym import playing
-from trial.interactive_gym.game import RemoteGame
-from trial.interactive_gym.options import RemoteConfig, Unplayable
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -152,7 +152,7 @@ def test_running_the_experiments_file_runs_its_study_until_ctrl_c(tmp_path: Path
     (folder / "experiment.py").write_text(ALONE + RUN)
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     running = subprocess.Popen(
-        [sys.executable, "-m", "trial.interactive_gym", "experiment.py"],
+        [sys.executable, "-m", "hippodrome.trial.interactive_gym", "experiment.py"],
         cwd=folder,
         env=env,
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""`python -m trial.interactive_gym`: the project that it makes, its remarks, and the experiments that it refuses."""
+"""`python -m hippodrome.trial.interactive_gym`: the project that it makes, its remarks, and the experiments that it refuses."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 import yaml
 from jinja2 import Environment
 
-from hippodrome.config import read_project
-from protocol.players import ONNXRUNTIME
+from hippodrome.control.config import read_project
+from hippodrome.protocol.players import ONNXRUNTIME
 from testing import onnx_files
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, environment, run_experiment
 
@@ -218,7 +218,7 @@ def test_modules_from_a_folder_of_pythonpath_belong_to_it(tmp_path: Path) -> Non
     (tmp_path / "sitecustomize.py").write_text("")  # Python imports it as it starts
     env = {**environment(), "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     done = subprocess.run(
-        [sys.executable, "-m", "trial.interactive_gym", "--no-run", "experiment.py"],
+        [sys.executable, "-m", "hippodrome.trial.interactive_gym", "--no-run", "experiment.py"],
         cwd=package,
         env=env,
         capture_output=True,
@@ -453,7 +453,7 @@ def test_an_experiment_with_two_humans_is_a_study_for_two_participants(tmp_path:
     assert [config["trial"][key] for key in ("maxPing", "pingSamples")] == [250, 5]
     assert "has no effect" not in said
     assert "Remark: game_page_html_fn is called for 0 alone: all participants read the same instructions" in said
-    done = run_python(tmp_path, "-m", "local.check", str(project))
+    done = run_python(tmp_path, "-m", "hippodrome.local.check", str(project))
     assert done.returncode == 0, done.stdout
     assert "is the game (fields) for 2 participants together" in done.stdout
 
@@ -499,8 +499,6 @@ def test_an_onnx_file_is_a_policy_with_interactive_gyms_functions_and_without(tm
 
 def test_only_a_process_that_loads_an_experiment_knows_interactive_gyms_names(tmp_path: Path) -> None:
     project, _ = project_of(tmp_path)
-    asks = (
-        "import importlib.util, sys, trial.server\n{}\nprint(importlib.util.find_spec('interactive_gym') is not None)"
-    )
+    asks = "import importlib.util, sys, hippodrome.trial.server\n{}\nprint(importlib.util.find_spec('interactive_gym') is not None)"
     for first, known in (("", "False"), ("import agent", "True")):
         assert run_python(project, "-c", asks.format(first)).stdout == f"{known}\n"

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from protocol.trial_sections import SceneSection
-from trial.pictures import assets
-from trial.pictures.assets import Assets
-from trial.pictures.raster import Raster
-from trial.pictures.scene import as_scene
+from hippodrome.protocol.trial_sections import SceneSection
+from hippodrome.trial.pictures import assets
+from hippodrome.trial.pictures.assets import Assets
+from hippodrome.trial.pictures.raster import Raster
+from hippodrome.trial.pictures.scene import as_scene
 
 
 def image(width: int = 4, height: int = 2, color: str = "red", form: str = "PNG") -> bytes:

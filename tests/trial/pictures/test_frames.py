@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from hippodrome.trial.pictures import frames
+from hippodrome.trial.pictures.encoder import Encoder
+from hippodrome.trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
+from hippodrome.trial.wire import connection as connections
+from hippodrome.trial.wire.connection import SUBPROTOCOL, Connection
 from testing.exploration import examples
 from testing.waiting import PATIENCE
-from trial.pictures import frames
-from trial.pictures.encoder import Encoder
-from trial.pictures.frames import DIFFERENCE, JPEG, KEY, ROWS, Decoder, Frame, jpeg_message
-from trial.wire import connection as connections
-from trial.wire.connection import SUBPROTOCOL, Connection
 
 EXACT = {KEY, DIFFERENCE}
 

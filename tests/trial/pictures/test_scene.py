@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trial.pictures.frames import FrameError
-from trial.pictures.picture import as_picture
-from trial.pictures.scene import MAX_OBJECTS, MAX_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
-from trial.pictures.scene_object import MAX_POINTS
+from hippodrome.trial.pictures.frames import FrameError
+from hippodrome.trial.pictures.picture import as_picture
+from hippodrome.trial.pictures.scene import MAX_OBJECTS, MAX_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
+from hippodrome.trial.pictures.scene_object import MAX_POINTS
 
 BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}
 

@@ -10,13 +10,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.trial_sections import SceneSection
+from hippodrome.protocol.trial_sections import SceneSection
+from hippodrome.trial.pictures.assets import Assets
+from hippodrome.trial.pictures.raster import Raster
+from hippodrome.trial.pictures.scene import Scene, SceneError, as_scene, images_of
+from hippodrome.trial.pictures.scene_encoder import SceneDecoder, SceneEncoder
+from hippodrome.trial.pictures.scene_object import TYPES
 from testing.exploration import examples
-from trial.pictures.assets import Assets
-from trial.pictures.raster import Raster
-from trial.pictures.scene import Scene, SceneError, as_scene, images_of
-from trial.pictures.scene_encoder import SceneDecoder, SceneEncoder
-from trial.pictures.scene_object import TYPES
 
 RASTER = Raster(SceneSection(width=40, height=30), Assets())
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from protocol.trial_sections import SceneSection
-from trial.agent.agent import AgentAdapter
-from trial.agent.joint import JointAdapter
-from trial.agent.starting import start
-from trial.pictures.reader import PictureReader
-from trial.pictures.scene import Scene
+from hippodrome.protocol.trial_sections import SceneSection
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.joint import JointAdapter
+from hippodrome.trial.agent.starting import start
+from hippodrome.trial.pictures.reader import PictureReader
+from hippodrome.trial.pictures.scene import Scene
 
 AGENT = """
 class Agent:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.pictures import scene_encoder
-from trial.pictures.scene import Scene, as_scene
-from trial.pictures.scene_encoder import HEADER, PACKED_SCENE, SCENE, SceneDecoder, SceneEncoder, changes
+from hippodrome.trial.pictures import scene_encoder
+from hippodrome.trial.pictures.scene import Scene, as_scene
+from hippodrome.trial.pictures.scene_encoder import HEADER, PACKED_SCENE, SCENE, SceneDecoder, SceneEncoder, changes
 
 BALL = {"id": "ball", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10, "color": "#ff0000"}
 WALL = {"id": "wall", "type": "rectangle", "x": 0, "y": 0, "width": 5, "height": 400}

@@ -17,14 +17,14 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from onnx import TensorProto, helper, save
 
-from protocol.players import ONNXRUNTIME
+from hippodrome.protocol.players import ONNXRUNTIME
+from hippodrome.trial.core.policies import Observed
+from hippodrome.trial.core.seeds import policy_seed
+from hippodrome.trial.policies.load import load
+from hippodrome.trial.policies.policy import PolicyError
+from hippodrome.trial.policies.thread import PolicyThread
 from testing import onnx_files
 from testing.waiting import PATIENCE, until_async
-from trial.core.policies import Observed
-from trial.core.seeds import policy_seed
-from trial.policies.load import load
-from trial.policies.policy import PolicyError
-from trial.policies.thread import PolicyThread
 
 TWO = Box(-1, 1, (2,), np.float32)
 ROOT = Path(__file__).resolve().parents[3]

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import disk
-from trial.recordings import recording
-from trial.recordings.recording import Recording, line
-from trial.recordings.spool import Spool
-from trial.recordings.store import FolderStore
+from hippodrome.protocol import disk
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.recording import Recording, line
+from hippodrome.trial.recordings.spool import Spool
+from hippodrome.trial.recordings.store import FolderStore
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -64,8 +64,8 @@ def _until_it_works(act: Any) -> None:
 def test_only_their_owner_may_read_the_files_of_a_trial(tmp_path: Path) -> None:
     """`main` sets the permissions first. They also hold for files that the agent's own programs write."""
     program = (
-        "import os, subprocess, sys; from trial.__main__ import main; code = main()\n"
-        "from trial.recordings.store import FolderStore; FolderStore(__import__('pathlib').Path(sys.argv[1])).create('a/b', b'')\n"
+        "import os, subprocess, sys; from hippodrome.trial.__main__ import main; code = main()\n"
+        "from hippodrome.trial.recordings.store import FolderStore; FolderStore(__import__('pathlib').Path(sys.argv[1])).create('a/b', b'')\n"
         "subprocess.run(['touch', sys.argv[1] + '/touched'], check=True); sys.exit(code)"
     )
     before = os.umask(0o022)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.unfinished import RecordedTrial
 from testing.exploration import examples
 from tests.trial import repeated
 from tests.trial.repeated import repeat
-from trial.core.flow_control import Window
-from trial.core.unfinished import RecordedTrial
 
 
 class Game(repeated.Game):

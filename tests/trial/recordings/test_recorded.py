@@ -16,11 +16,11 @@ import attrs
 import numpy as np
 import pytest
 
-from trial.core.ended import Episode
-from trial.core.message_log import Word
-from trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
-from trial.recordings import recording
-from trial.recordings.resume import add_lines, load_recorded
+from hippodrome.trial.core.ended import Episode
+from hippodrome.trial.core.message_log import Word
+from hippodrome.trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.resume import add_lines, load_recorded
 
 
 def header(rate=20):

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trial.recordings import recording
+from hippodrome.trial.recordings import recording
 
 
 def test_lines_are_json_whatever_the_info(tmp_path):

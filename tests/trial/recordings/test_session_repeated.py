@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol.session import Member
+from hippodrome.protocol.session import Member
+from hippodrome.trial.core.effects import ResetPolicy
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.settings import TrialSettings
 from testing.exploration import examples
 from tests.trial import repeated
 from tests.trial.repeated import repeat
-from trial.core.effects import ResetPolicy
-from trial.core.flow_control import Window
-from trial.core.unfinished import RecordedTrial
-from trial.settings import TrialSettings
 
 PLACES = {"P1": "me", "P2": "it"}
 

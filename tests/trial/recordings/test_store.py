@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import pytest
 
-from hippodrome.model import server
-from protocol import disk
+from hippodrome.control.model import server
+from hippodrome.protocol import disk
+from hippodrome.trial.recordings.spool import store_file
+from hippodrome.trial.recordings.store import Store, open_store
 from testing.strict_s3 import StrictS3
 from testing.studies import study
-from trial.recordings.spool import store_file
-from trial.recordings.store import Store, open_store
 
 FOLDER = "study/users/P1"
 ANSWER = f"{FOLDER}/answers/3.json"

@@ -14,11 +14,11 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
+from hippodrome.trial.pictures.frames import JPEG, Decoder, Frame
+from hippodrome.trial.pictures.scene import Scene, as_scene
+from hippodrome.trial.pictures.scene_encoder import HEADER, SCENE, SceneDecoder
+from hippodrome.trial.wire.connection import SUBPROTOCOL, Connection
 from testing.waiting import PATIENCE
-from trial.pictures.frames import JPEG, Decoder, Frame
-from trial.pictures.scene import Scene, as_scene
-from trial.pictures.scene_encoder import HEADER, SCENE, SceneDecoder
-from trial.wire.connection import SUBPROTOCOL, Connection
 
 NAMES = [Subprotocol(SUBPROTOCOL)]
 MANY_BALLS = [{"id": f"ball{n}", "type": "circle", "x": 0.5, "y": 0.25, "radius": 10} for n in range(200)]

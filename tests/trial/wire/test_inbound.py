@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from trial.core.flow_control import Window
-from trial.core.messages import BadMessage, CloseConnection
-from trial.wire.inbound import MESSAGES_A_SECOND, Inbound
+from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.messages import BadMessage, CloseConnection
+from hippodrome.trial.wire.inbound import MESSAGES_A_SECOND, Inbound
 
 
 def test_acknowledgements_count_among_the_messages_of_a_second() -> None:

@@ -8,9 +8,9 @@ from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.frames import Opcode
 
+from hippodrome.trial.wire import round_trips
 from testing.waiting import until_async
 from tests.trial.far_away import far_away
-from trial.wire import round_trips
 
 
 class Pinged(ServerConnection):

@@ -1,8 +1,0 @@
-"""Implements the ports of `hippodrome.ports` on S3, ECS and EC2, Route 53, EventBridge Scheduler, SNS and SQS.
-
-Importing this package is cheap: botocore is loaded when the first port is used.
-"""
-
-from hippodrome.aws.platform import AwsPlatform
-
-__all__ = ["AwsPlatform"]

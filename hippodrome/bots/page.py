@@ -1,0 +1,71 @@
+"""The page of a study, as a bot reads it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from hippodrome.bots import forms
+from hippodrome.control.participants.page_parser import PageParser, attributes_of
+
+
+@dataclass(frozen=True)
+class VisitedPage:
+    """A page of the study; `text` is its HTML."""
+
+    address: str
+    text: str
+
+    @property
+    def game(self) -> dict[str, Any] | None:
+        """The JSON data in the game page (docs/pages.md); None on other pages."""
+        found = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
+        data = json.loads(found[1]) if found else None
+        return data if isinstance(data, dict) else None
+
+    @property
+    def form(self) -> forms.Form | None:
+        return forms.to_answer(self.text)
+
+    @property
+    def step(self) -> str:
+        """The key of the step that the page shows."""
+        found = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
+        return html.unescape(found[1]) if found else ""
+
+    @property
+    def is_last(self) -> bool:
+        """Whether this is the study's last page."""
+        return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None
+
+    @property
+    def code(self) -> str | None:
+        """The text of the first element of class `code`: the completion code. None if there is no such element."""
+        found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
+        return html.unescape(found[1]).strip() if found else None
+
+
+def links(page: str) -> list[str]:
+    """Return the addresses of a page's links."""
+    reader = _Links()
+    reader.feed(page)
+    reader.close()
+    return reader.found
+
+
+class _Links(PageParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "a":
+            self.found.append(attributes_of(attrs).get("href", "").strip())
+
+
+def leads_elsewhere(address: str) -> bool:
+    """Return whether an address of a link is of another site."""
+    return address.lower().startswith(("https://", "http://"))

@@ -1,0 +1,199 @@
+"""The second check: compares values with each other."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from hippodrome.control.config import fargate, sessions, texts
+from hippodrome.control.config.diagnostics import Mistake
+from hippodrome.control.config.each_value import Checked, check_values
+from hippodrome.control.config.project_keys import STEPS
+from hippodrome.control.config.step_order import step_name, step_range
+from hippodrome.control.model.step_order import FINAL, default_start, position, visited
+from hippodrome.control.model.step_types import type_of
+from hippodrome.protocol.environment import PLAIN_ORIGINS
+from hippodrome.protocol.values import KeyPath
+
+
+def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
+    """Check each value of a file's sections by itself, and then the values against each other.
+
+    Returns the valid values and all mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
+    """
+    checked = check_values(sections, invalid)
+    checks = (
+        _missing,
+        _aws,
+        _step_numbers,
+        _game_step,
+        _event_steps,
+        _hours,
+        _warm,
+        _plain_clients,
+        _environment_size,
+        sessions.mistakes,
+        texts.mistakes,
+    )
+    checked.mistakes += [mistake for find in checks for mistake in find(checked)]
+    return checked
+
+
+def _missing(checked: Checked) -> Iterator[Mistake]:
+    """Sections and keys that every study needs."""
+    project = checked.project
+    if not checked.has_project:
+        if checked.valid(("project",)):
+            yield Mistake((), "the section project is missing")
+        return
+    if not project.id and checked.valid(("project", "id")):
+        yield Mistake(("project", "id"), "missing; give the project an id of letters, digits, dashes and underscores")
+    if not checked.step_keys and checked.valid(STEPS):
+        yield Mistake(STEPS, 'missing; list the pages in order, such as "1: consent"')
+    if checked.game_steps and not checked.trial.game and checked.valid(("trial", "game")):
+        yield Mistake(("trial", "game"), "missing; a project with a game step needs the name of its environment")
+
+
+def _hours(checked: Checked) -> Iterator[Mistake]:
+    """`maxServerHours` must cover `maxRuntime`: otherwise no server could start."""
+    project, path = checked.project, ("project", "maxServerHours")
+    if not checked.valid(path, ("project", "maxRuntime")) or project.max_server_hours is None:
+        return
+    if project.max_server_hours * 60 < project.max_runtime:
+        needed = math.ceil(project.max_runtime / 60)
+        yield Mistake(path, f"must be at least {needed}, since one server may run {project.max_runtime} minutes")
+
+
+def _warm(checked: Checked) -> Iterator[Mistake]:
+    """`warmServers` needs names without participants, a step that starts servers, and room within `maxServers`."""
+    project, path = checked.project, ("project", "warmServers")
+    if not project.warm_servers:
+        return
+    if project.subdomain == "userId":
+        why = "a warm server gets its name before a participant takes it"
+        yield Mistake(path, f"{why}: use subdomain: hash, or warmServers: 0")
+    if _starts_nothing(checked):
+        yield Mistake(path, "must be 0: no step of this study starts a server, so no participant would take one")
+    most = project.max_servers
+    if most is not None and project.warm_servers > most:
+        yield Mistake(path, f"must be at most maxServers, which is {most}: a warm server is one of them")
+
+
+def _plain_clients(checked: Checked) -> Iterator[Mistake]:
+    """`plainClients` needs the origin of HIPPO's front end, which finds a server by the participant's id."""
+    project, path = checked.project, ("project", "plainClients")
+    if not project.plain_clients or not checked.valid(path):
+        return
+    if not project.front_end and checked.valid(("project", "frontEnd")):
+        where = "plainClients is true, so say where the front end is, such as https://play.example.org"
+        yield Mistake(("project", "frontEnd"), f"missing; {where}")
+    if project.subdomain != "userId" and checked.valid(("project", "subdomain")):
+        yield Mistake(path, "HIPPO's front end finds servers by the participant's id: use subdomain: userId, or false")
+
+
+def _starts_nothing(checked: Checked) -> bool:
+    """Whether it is certain that no step starts a server."""
+    known = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
+    return known and not checked.game_steps and checked.project.events.start_server_step is None
+
+
+_AWS_NEEDS = {  # bucket, region and rootDomain may be missing: then the installation's count
+    "cpu": "the vCPUs of a server, such as 1",
+    "memory": "the memory of a server in GB, such as 4",
+}
+
+
+def _aws(checked: Checked) -> Iterator[Mistake]:
+    """`useAWS: true` needs a size of servers, and Fargate must offer this size."""
+    project, path = checked.project, ("project", "awsSetup")
+    setup = project.aws_setup
+    if not checked.valid(("project", "useAWS")) or project.keeps_off_aws:
+        return
+    for key, needed in _AWS_NEEDS.items():
+        if project.use_aws and not setup.given(key) and checked.valid((*path, key)):
+            yield Mistake((*path, key), f"missing; useAWS is true, so give {needed}")
+    if setup.cpu is not None and setup.memory is not None and not fargate.fits(setup.cpu, setup.memory):
+        fitting = fargate.memory_choices(setup.cpu)
+        yield Mistake((*path, "memory"), f"{setup.memory:g} GB do not go with cpu {setup.cpu:g}; choose {fitting}")
+
+
+def _keys_known(checked: Checked) -> bool:
+    """Whether there are steps, and all their keys are valid."""
+    invalid = [path[2:] for path in checked.invalid if path[:2] == STEPS]
+    return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in invalid)
+
+
+_ECS_LIMIT = 8192
+"""Characters of a task's overrides (https://docs.aws.amazon.com/AmazonECS/latest/APIReference/API_RunTask.html)."""
+_OTHER_LENGTH = 1210
+"""Characters of the names of variables, ids, secrets and addresses, each of its greatest length."""
+
+
+def _environment_size(checked: Checked) -> Iterator[Mistake]:
+    """The environment variables of a server must fit into the RunTask call, or ECS refuses it."""
+    if not checked.valid(("trial",), STEPS):
+        return
+    project, trial = checked.project, checked.trial.registered()
+    pages = [{"name": PLAIN_ORIGINS, "value": " ".join(project.front_end)}] if project.plain_clients else []
+    length = _OTHER_LENGTH + sum(len(_json(part)) for part in (_json(trial), ",".join(checked.game_steps), pages))
+    if length > _ECS_LIMIT:
+        key = max(trial, key=lambda name: len(_json(trial[name])))
+        message = (
+            f"too long: a server would be told {length} characters in all, and ECS allows {_ECS_LIMIT}; shorten it"
+        )
+        yield Mistake(("trial", key), message)
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"))
+
+
+def _step_numbers(checked: Checked) -> Iterator[Mistake]:
+    """The numbers of steps have no gaps."""
+    if not _keys_known(checked):
+        return
+    numbers = [int(key) for key in checked.step_keys if key != FINAL]
+    for before, number in itertools.pairwise([0, *(numbers or [2])]):  # with finalStep alone, step 1 is missing
+        if number > before + 1:
+            gap = f"step {before + 1} is" if number == before + 2 else f"steps {before + 1} to {number - 1} are"
+            after = str(number) if numbers else FINAL
+            yield Mistake((*STEPS, after), f"{gap} missing before it; number the steps 1, 2, 3 … without gaps")
+
+
+def _game_step(checked: Checked) -> Iterator[Mistake]:
+    """The last step is no game step."""
+    last = checked.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
+    if last and type_of(last).on_server:
+        path = (*STEPS, checked.step_keys[-1])
+        yield Mistake(path, "the game cannot be the last step; add a page after it, which stops the server")
+
+
+_START: KeyPath = ("project", "events", "startServerStep")
+_STOP: KeyPath = ("project", "events", "stopServerStep")
+
+
+def _event_steps(checked: Checked) -> Iterator[Mistake]:
+    """The steps of `events` exist; the server starts at the first game step or before, and stops after the last."""
+    steps, events = checked.project.steps, checked.project.events
+    if not _keys_known(checked):
+        return
+    keys = visited(checked.step_keys, steps)
+    names = [step_name(key) for key in keys]
+    start, stop = position(events.start_server_step, keys), position(events.stop_server_step, keys)
+    for path, key, found in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
+        if key is not None and found is None:
+            yield Mistake(path, f"there is no {step_name(key)}; the steps are {step_range(keys)}")
+    games = [index for index, key in enumerate(keys) if type_of(steps.get(key, "")).on_server]
+    if start is not None and games and start > games[0]:
+        default = keys[default_start(games)]
+        why = f"comes after the game, {names[games[0]]}, which needs the server; {default} is the usual choice"
+        yield Mistake(_START, f"{names[start]} {why}")
+    if stop is not None and games and stop <= games[-1]:
+        better = f"{keys[games[-1] + 1]} or later" if games[-1] + 1 < len(keys) else "a step after it"
+        why = f"does not come after the game, {names[games[-1]]}, which needs the server; use {better}"
+        yield Mistake(_STOP, f"{names[stop]} {why}")
+    if start is not None and stop is not None and stop < start and not games:
+        yield Mistake(_STOP, f"{names[stop]} comes before startServerStep, {names[start]}")

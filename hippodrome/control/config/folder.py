@@ -1,0 +1,169 @@
+"""Reads and checks a project folder: its config.yml and its step files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hippodrome.control.config import hippo_pages, sessions
+from hippodrome.control.config.config import Config, StepFiles
+from hippodrome.control.config.consistency import check
+from hippodrome.control.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
+from hippodrome.control.config.each_value import Checked
+from hippodrome.control.config.hippo import CLOSING_PAGE, Adapted, adapt
+from hippodrome.control.config.layout import AGENT, Layout, find
+from hippodrome.control.config.project_keys import STEPS
+from hippodrome.control.config.step_files import CLOSING, StepFileError, open_folder
+from hippodrome.control.model.project import number_of_groups
+from hippodrome.control.model.step_order import ordered, visited
+from hippodrome.control.model.step_types import type_of
+from hippodrome.protocol import players
+from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
+from hippodrome.protocol.values import KeyPath, is_blank, path_text
+
+if TYPE_CHECKING:
+    from hippodrome.control.config.yaml_file import ParsedFile
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigSource:
+    """A project's config.yml as read: its values in Hippodrome's form, and the line of each."""
+
+    layout: Layout
+    parsed: ParsedFile
+    adapted: Adapted
+
+    def diagnostic(self, path: KeyPath, message: str, *, line: int | None = None, remark: bool = False) -> Diagnostic:
+        """Return a mistake or remark on the value at this path of Hippodrome's form.
+
+        Without `line`, it names the line of the value.
+        """
+        origin = self.adapted.origin(path)
+        return self._diagnostic(origin, message, line, remark)
+
+    def remarks(self) -> list[Diagnostic]:
+        """Return a remark for each value that was translated from HIPPO's form."""
+        return in_order(self._diagnostic(path, message, None, True) for path, message in self.adapted.remarks)
+
+    def names(self, path: KeyPath) -> bool:
+        """Return whether the file gives a value for this path of Hippodrome's form."""
+        return self.adapted.origin(path) in self.parsed.lines
+
+    def _diagnostic(self, origin: KeyPath, message: str, line: int | None, remark: bool) -> Diagnostic:
+        if (
+            origin == ("trial", RATE_CHANGE)
+            and origin not in self.parsed.lines
+            and ("trial", RATE_CHANGE_MISSPELT) in self.parsed.lines
+        ):
+            line = line or self.parsed.lines["trial", RATE_CHANGE_MISSPELT]
+        file = self.layout.label(self.layout.config)
+        return Diagnostic(file, line or self.parsed.line(origin), path_text(origin), message, remark)
+
+
+def read_source(folder: Path) -> ConfigSource:
+    """Read the config.yml of the project in `folder`, without checking it. Raises ConfigErrors if it cannot be read."""
+    layout = find(folder)
+    parsed = _parse(layout)
+    return ConfigSource(layout, parsed, adapt(parsed.values, Path(folder).resolve().name))
+
+
+def read_project(folder: Path) -> Config:
+    """Read and check the project in `folder`: its config.yml (or config.yaml) and its step files (`layout`).
+
+    Raises ConfigErrors with all mistakes.
+    """
+    source = read_source(folder)
+    checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
+    steps, file_mistakes = _step_files(folder, checked)
+    game_pages, page_mistakes = _game_pages(folder, checked, steps)
+    file_mistakes += [*page_mistakes, *_missing_policies(source.layout, checked)]
+    if checked.valid(STEPS) and not file_mistakes:
+        groups = number_of_groups(page.variants for page in (*steps, *game_pages))
+        file_mistakes += sessions.mistakes_of_groups(checked, groups)
+    found = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
+    mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
+    agent = list(_agent_problems(source, others=bool(mistakes))) if any(step.type.on_server for step in steps) else []
+    mistakes += [problem for problem in agent if not problem.remark]
+    if mistakes:
+        raise ConfigErrors(in_order(mistakes))
+    loaded = _loaded_from(source, steps)
+    if loaded:
+        checked.project = checked.project.model_copy(update={"allowed_hosts": loaded})
+        message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
+        agent.append(source.diagnostic(("project",), message, remark=True))
+    return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
+
+
+def _agent_problems(source: ConfigSource, *, others: bool) -> Iterator[Diagnostic]:
+    """The mistakes and remarks on agent.py. A study without agent and environment is one, unless there are `others`."""
+    problems = list(source.layout.problems())
+    yield from problems
+    if others or source.layout.agent is not None or any(not problem.remark for problem in problems):
+        return
+    trial = source.parsed.values.get("trial")
+    if not isinstance(trial, dict) or ("game" in trial and is_blank(trial["game"])):
+        message = f"is empty, and there is no {AGENT}: name an environment, or write an {AGENT}"
+        yield source.diagnostic(("trial", "game"), message)
+
+
+def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
+    """A mistake for each policy's file in `trial.players` and `trial.substitute` that does not exist."""
+    for path, file in checked.trial.policy_files():
+        if not (layout.agent_folder / file).is_file():
+            hint = players.files_there(layout.agent_folder)
+            yield Mistake(("trial", *path), f"there is no file {file} beside agent.py{hint}")
+
+
+def _loaded_from(source: ConfigSource, steps: list[StepFiles]) -> tuple[str, ...]:
+    """The sites from which the pages of a HIPPO Gym project without `allowedHosts` load something."""
+    if not source.layout.of_hippo or source.names(("project", "allowedHosts")):
+        return ()
+    return hippo_pages.hosts(file for step in steps for file in step.files)
+
+
+def _parse(layout: Layout) -> ParsedFile:
+    from hippodrome.control.config import yaml_file  # noqa: PLC0415 - a function that only parses registrations needs no YAML
+
+    file, label = layout.config, layout.label(layout.config)
+    try:
+        with file.open("rb") as stream:
+            return yaml_file.parse_yaml(stream.read(yaml_file.LIMIT_BYTES + 1))
+    except yaml_file.UnreadableConfig as error:
+        raise ConfigErrors([Diagnostic(label, error.line, "", str(error))]) from None
+    except OSError as error:
+        message = f"the file cannot be read: {error.strerror or 'unknown reason'}"
+        raise ConfigErrors([Diagnostic(label, None, "", message)]) from None
+
+
+def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[Mistake]]:
+    """The steps with their files, and the mistakes in files."""
+    pages = checked.project.steps
+    steps: list[StepFiles] = []
+    mistakes: list[Mistake] = []
+    own = {page for page in pages.values() if type_of(page).has_files and page != CLOSING_PAGE}
+    try:
+        pages_folder = open_folder(folder) if own else None
+    except StepFileError as error:
+        return [], [Mistake(STEPS, str(error))]
+    for key in visited(ordered(pages), pages):
+        page = pages[key]
+        try:
+            variants, files = pages_folder.find(page) if pages_folder and page in own else (0, ())
+            steps.append(StepFiles(key, page, variants, (CLOSING,) if page == CLOSING_PAGE else files))
+        except StepFileError as error:
+            mistakes.append(Mistake((*STEPS, key), str(error)))
+    return steps, mistakes
+
+
+def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:
+    """The pages that the game page shows, with their files, and the mistakes in files."""
+    found: list[StepFiles] = []
+    mistakes: list[Mistake] = []
+    for key, page in checked.trial.pages.items() if any(step.type.on_server for step in steps) else ():
+        try:
+            found.append(StepFiles(key, page, *open_folder(folder).find(page)))
+        except StepFileError as error:
+            mistakes.append(Mistake(("trial", key), str(error)))
+    return found, mistakes

@@ -1,0 +1,145 @@
+"""The reads of a run of the lobby (`lobby.py`) before it decides: who can be a member, and which servers are ready."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from datetime import timedelta
+from functools import partial
+
+from hippodrome.control.lobby import entries as lobby_entries
+from hippodrome.control.lobby import rules
+from hippodrome.control.lobby.decisions import Decisions, Matched, Proposal
+from hippodrome.control.lobby.entries import Entries, Waiting
+from hippodrome.control.lobby.run import LobbyRun, StartedAhead
+from hippodrome.control.log import failure
+from hippodrome.control.model import ids, sessions
+from hippodrome.control.model.project import Project
+from hippodrome.control.model.server import Server
+from hippodrome.control.ports import Platform
+from hippodrome.control.storage.repository import Repository
+
+FORMED_LATE = timedelta(seconds=4)
+"""If a confirmed session was proposed longer ago than this, requests of other participants form it, too."""
+FORMED_AT_ONCE = 10
+"""The most sessions of other participants that one request forms."""
+LOOKED_AT = 5
+"""The most open sessions whose servers a request reads, if its own session is the first that waits for a server."""
+LOOKED_AT_IN_NEED = 50
+"""The most open sessions whose servers a request reads, if the server that its own session waits for has ended."""
+
+
+class Lookups:
+    """The reads of a run, besides the document of decisions and the listing of entries."""
+
+    def __init__(self, platform: Platform, repository: Repository) -> None:
+        self._platform = platform
+        self._repository = repository
+
+    def run(
+        self,
+        project: Project,
+        known: Decisions,
+        entries: Entries,
+        proposals: Sequence[Proposal],
+        *,
+        servers: StartedAhead,
+        chosen: Sequence[Sequence[str]] = (),
+    ) -> LobbyRun:
+        """Return a run that may form the sessions of these confirmed proposals. AWS calls: two reads per member.
+
+        `servers` is the result of the method `servers`. `chosen` is as in `rules.decide`.
+        """
+        members, broken = self._members(project, proposals, entries)
+        now, open_for = self._platform.now(), sessions.open_for(project, self._platform.settings)
+        return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
+
+    def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
+        """Return the confirmed proposals that this participant's request forms.
+
+        These are their own, and some that have waited for long: in a crowd more participants come than the document
+        takes writes, so one write decides on several sessions.
+        """
+        now = self._platform.now()
+        confirmed = rules.confirmed(known, entries)
+        own = [each for each in confirmed if label in each.labels]
+        late = [each for each in confirmed if label not in each.labels and now - each.at > FORMED_LATE]
+        return [*own, *late[:FORMED_AT_ONCE]]
+
+    # Servers that were started ahead
+
+    def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> StartedAhead:
+        """Read the records of the servers that this participant's request may give to sessions.
+
+        The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
+        started ahead. Then it has the record of that server, and the records of open sessions' servers: of some
+        (`LOOKED_AT`) if no other session has waited for longer, of more (`LOOKED_AT_IN_NEED`) if that server has ended.
+        """
+        formed = known.formed_of(label)
+        own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
+        if own is None:
+            return StartedAhead({})
+        waiting, now = known.without_server(), self._platform.now()
+        is_first = not waiting or waiting[0] is formed
+        open_for = sessions.open_for(project, self._platform.settings)
+        usable = [each.id for each in known.open if each.is_usable(own.players, now, open_for)]
+        some = usable[:LOOKED_AT] if is_first else []
+        found = self._records(project, [own.id, *some])
+        if own.id in found.over:
+            others = self._records(project, usable[len(some) : LOOKED_AT_IN_NEED])
+            return StartedAhead({**found.records, **others.records})
+        return found
+
+    def _records(self, project: Project, session_ids: Sequence[str]) -> StartedAhead:
+        acts = [partial(self._server, project, each) for each in session_ids]
+        return StartedAhead(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
+
+    def _server(self, project: Project, session_id: str) -> Server | None:
+        """The record of a session's server; None if there is none, or if it cannot be read this time."""
+        try:
+            return self._repository.server_of(project.id, session_id)
+        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
+            failure("the record of a server that was started ahead cannot be read", error, project=project.id)
+            return None
+
+    # Members
+
+    def _members(
+        self, project: Project, proposals: Sequence[Proposal], entries: Entries
+    ) -> tuple[Mapping[str, Sequence[Matched]], Collection[str]]:
+        """By the proposal's id, the members of each session that can be formed; and the ids of the other proposals.
+
+        A session cannot be formed if a member has left, or has a membership already (a late request of a second tab may
+        have brought them back into the lobby), or if the project has been registered with another number of players
+        since it was proposed. A proposal with a member who cannot be read is in neither: the next run reads again.
+        """
+        waiting = [entries.waiting[label] for each in proposals for label in each.labels]
+        looked = self._platform.run_all([partial(self._member, project, one) for one in waiting])
+        found = {one.label: member for one, member in zip(waiting, looked, strict=True)}
+        members, broken = {}, []
+        for each in proposals:
+            known = [found[label] for label in each.labels]
+            if any(isinstance(one, Exception) for one in known):
+                continue
+            able = [one for one in known if isinstance(one, Matched)]
+            if len(able) == len(known) and each.players == project.players:
+                members[each.id] = able
+            else:
+                broken.append(each.id)
+        return members, broken
+
+    def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
+        """The participant who waits, as a member; None if they have left or have a membership; the error of a read."""
+        try:
+            found = self._platform.documents.get(lobby_entries.waiting_key(project.id, one))
+            written = lobby_entries.read_body(found.body) if found else None
+            if written is None or ids.server_label(project.id, written.user_id) != one.label:
+                return None
+            membership = self._repository.membership(project.id, written.user_id)
+        except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
+            failure("a participant who waits cannot be read", error, project=project.id)
+            return error
+        if membership:
+            return None
+        return Matched(
+            one.label, written.user_id, written.group, lobby_entries.seconds_since(one.joined, self._platform.now())
+        )

@@ -1,0 +1,128 @@
+"""Chooses which of the participants who wait play together: by arrival, by traits, or as `match` has chosen. Pure.
+
+Here a session is a sequence of its members, in the order of their arrival.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
+
+from hippodrome.control.lobby import traits
+from hippodrome.control.lobby.entries import Waiting, milliseconds
+from hippodrome.control.model.project import Project
+
+PROPOSED_AT_ONCE = 50
+"""The most sessions that one run proposes, so that a crowd makes no function slow. The next run proposes more."""
+
+
+def patience_is_over(joined: int, project: Project, now: datetime) -> bool:
+    """Return whether a participant who came at `joined` (ms) has waited for `patience` seconds."""
+    return milliseconds(now) - joined >= round(project.patience * 1000)
+
+
+def choose(
+    free: Sequence[Waiting], project: Project, now: datetime, chosen: Sequence[Sequence[str]]
+) -> list[Sequence[Waiting]]:
+    """Return the sessions to propose, at most `PROPOSED_AT_ONCE`.
+
+    `free` are the participants who are in no session, in the order of arrival. `chosen` are the sessions that the
+    function `match` has chosen, each as its members' labels.
+    """
+    over = [one for one in free if patience_is_over(one.joined, project, now)]
+    with_policies = project.after_patience == "policies"
+    candidates = free if with_policies else [one for one in free if not patience_is_over(one.joined, project, now)]
+    if project.asks_match:
+        sessions = _of_match(candidates, project, chosen)
+    elif traits.together(project):
+        sessions = _of_one_trait(candidates, project.players)
+    else:
+        sessions = list(_of_different_traits(candidates, project))
+    sessions = sessions[:PROPOSED_AT_ONCE]
+    if with_policies:
+        sessions += _short_sessions(candidates, over, sessions, project)
+    return sessions[:PROPOSED_AT_ONCE]
+
+
+def _of_match(free: Sequence[Waiting], project: Project, chosen: Sequence[Sequence[str]]) -> list[Sequence[Waiting]]:
+    """The chosen sessions that have `players` different members, all of whom are free."""
+    waiting = {one.label: one for one in free}
+    sessions: list[Sequence[Waiting]] = []
+    for labels in chosen:
+        if len(set(labels)) == project.players and all(label in waiting for label in labels):
+            members = [waiting.pop(label) for label in dict.fromkeys(labels)]
+            sessions.append(members if project.seats == "match" else sorted(members, key=lambda one: one.order))
+    return sessions
+
+
+def _of_one_trait(free: Sequence[Waiting], players: int) -> list[Sequence[Waiting]]:
+    """Full sessions, each of one trait, in the order of arrival."""
+    by_trait: dict[str, list[Waiting]] = {}
+    for one in free:
+        by_trait.setdefault(one.trait, []).append(one)
+    sessions = [
+        found[start : start + players]
+        for found in by_trait.values()
+        for start in range(0, len(found) - players + 1, players)
+    ]
+    return sorted(sessions, key=lambda members: members[0].order)
+
+
+def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[Sequence[Waiting]]:
+    """Full sessions, in the order of arrival. In none of them is a trait more often than it may be."""
+    most = traits.most_of_one(project)
+    by_trait: dict[str, deque[Waiting]] = {}
+    for one in free:
+        by_trait.setdefault(one.trait, deque()).append(one)
+    heads = [(found[0].order, trait) for trait, found in by_trait.items()]  # in the order of arrival, so it is a heap
+    while heads:
+        members: list[Waiting] = []
+        spent: list[str] = []  # the traits of which this session may have no further member
+        count: dict[str, int] = {}
+        while heads and len(members) < project.players:
+            _, trait = heapq.heappop(heads)
+            members.append(by_trait[trait].popleft())
+            count[trait] = count.get(trait, 0) + 1
+            if count[trait] >= most:
+                spent.append(trait)
+            elif by_trait[trait]:
+                heapq.heappush(heads, (by_trait[trait][0].order, trait))
+        if len(members) < project.players:
+            return
+        yield sorted(members, key=lambda one: one.order)
+        for trait in spent:
+            if by_trait[trait]:
+                heapq.heappush(heads, (by_trait[trait][0].order, trait))
+
+
+def _short_sessions(
+    free: Sequence[Waiting], over: Sequence[Waiting], sessions: Iterable[Sequence[Waiting]], project: Project
+) -> list[Sequence[Waiting]]:
+    """A session for each participant in `over` without one, at most `PROPOSED_AT_ONCE`: with free ones, or alone."""
+    taken = {one.label for members in sessions for one in members}
+    found: list[Sequence[Waiting]] = []
+    for one in over:
+        if one.label in taken or len(found) == PROPOSED_AT_ONCE:
+            continue
+        members = around(one, [other for other in free if other.label not in taken], project)
+        taken |= {member.label for member in members}
+        found.append(members)
+    return found
+
+
+def around(one: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
+    """Return this participant and others who may play with them, in the order of arrival.
+
+    There are at most `players`, and fewer if not enough fit.
+    """
+    members, most = [one], None if traits.together(project) else traits.most_of_one(project)
+    for other in free:
+        if len(members) == project.players:
+            break
+        same = sum(other.trait == member.trait for member in members)
+        fits = other.trait == one.trait if most is None else same < most
+        if other.label != one.label and fits:
+            members.append(other)
+    return sorted(members, key=lambda each: each.order)

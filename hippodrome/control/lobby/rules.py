@@ -1,0 +1,228 @@
+"""Decides when a session is proposed, falls apart or is formed, and when a participant is unmatched. Pure.
+
+Each rule takes the document of decisions (`decisions.py`) and returns its next version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
+from datetime import datetime, timedelta
+
+import msgspec
+
+from hippodrome.control.lobby.decisions import Decisions, Formed, Matched, OpenSession, Proposal, Unmatched, by_age
+from hippodrome.control.lobby.entries import Entries, Waiting
+from hippodrome.control.lobby.matchmaking import around, choose, patience_is_over
+from hippodrome.control.model.project import Project
+
+CONFIRMED_WITHIN = timedelta(seconds=10)
+"""A proposal that not all members have confirmed within this time falls apart."""
+
+
+def decide(
+    document: Decisions,
+    entries: Entries,
+    project: Project,
+    now: datetime,
+    new_id: Callable[[], str],
+    *,
+    open_for: timedelta,
+    known: Decisions | None = None,
+    chosen: Sequence[Sequence[str]] = (),
+) -> Decisions:
+    """Drop proposals that have fallen apart, and propose sessions of participants who are present and in no session.
+
+    `known` is the document as it was read before the listing `entries` was made; None: `document` itself. Proposals
+    that are not in `known` stay, since they are newer than the listing. Participants who stand in `known` are not
+    proposed now, since the listing may be too old to say whether they are free. `chosen` are the sessions that the
+    function `match` has chosen, each as its members' labels; with `matching: match` no others are proposed. `new_id`
+    makes the id of a proposal, and of its session unless that gets an open session. An open session can be used for
+    `open_for` after its server was requested.
+    """
+    seen = known if known is not None else document
+    settled = _without_fallen(document, entries, seen, now)
+    if document.renewed is not None:
+        return settled
+    before = seen.labels()
+    among = [one for one in free(settled, entries, now) if one.label not in before]
+    sessions = choose(among, project, now, chosen)
+    return _with_proposals(settled, sessions, now, new_id, players=project.players, open_for=open_for)
+
+
+def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
+    """Return the participants who are present and in no session, in the order of arrival."""
+    busy = document.labels()
+    found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
+    return sorted(found, key=lambda one: one.order)
+
+
+def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
+    """Return the proposals that all members have confirmed and no member has left."""
+    return [
+        each
+        for each in document.proposed
+        if entries.confirmed.get(each.id, frozenset()) >= set(each.labels)
+        and all(label in entries.waiting for label in each.labels)
+    ]
+
+
+def number_here(document: Decisions, entries: Entries, project: Project, label: str, now: datetime) -> int:
+    """Return how many participants could play together now, this one included; at most `players`."""
+    proposal = document.proposal_of(label)
+    if proposal is not None:
+        return len(proposal.labels)
+    formed = document.formed_of(label)
+    if formed is not None:
+        return len(formed.members)
+    me = entries.waiting.get(label)
+    if me is None:
+        return 1
+    among = [
+        one
+        for one in free(document, entries, now)
+        if project.after_patience == "policies" or not patience_is_over(one.joined, project, now)
+    ]
+    return len(around(me, among, project))
+
+
+def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
+    """The document without the proposals in `seen` that have fallen apart."""
+    before = {each.id for each in seen.proposed}
+    fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
+    return without_proposals(document, fallen)
+
+
+def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
+    """Whether the proposal's time is over, a member has left, or one who has not confirmed is no longer present."""
+    if now - proposal.at >= CONFIRMED_WITHIN:
+        return True
+    labels = entries.confirmed.get(proposal.id, frozenset())
+    members = (entries.waiting.get(label) for label in proposal.labels)
+    return any(one is None or not (one.label in labels or one.is_present(now)) for one in members)
+
+
+def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
+    """Return the document without these proposals. The open sessions that they had are open again."""
+    if not any(each.id in ids for each in document.proposed):
+        return document
+    opened = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
+    return msgspec.structs.replace(
+        document,
+        proposed=tuple(each for each in document.proposed if each.id not in ids),
+        open=by_age([*document.open, *opened]),
+    )
+
+
+def _with_proposals(
+    document: Decisions,
+    sessions: Iterable[Sequence[Waiting]],
+    now: datetime,
+    new_id: Callable[[], str],
+    *,
+    players: int,
+    open_for: timedelta,
+) -> Decisions:
+    """The document with a proposal for each of these sessions. They get open sessions, the oldest first."""
+    usable = deque(each for each in document.open if each.is_usable(players, now, open_for))
+    added = []
+    for members in sessions:
+        ahead = usable.popleft() if usable else None
+        labels = tuple(one.label for one in members)
+        added.append(Proposal(new_id(), labels, now, ahead, players))
+    if not added:
+        return document
+    used = {each.ahead.id for each in added if each.ahead}
+    return msgspec.structs.replace(
+        document,
+        proposed=(*document.proposed, *added),
+        open=tuple(each for each in document.open if each.id not in used),
+    )
+
+
+# Decisions for good
+
+
+def form(
+    document: Decisions, proposal_id: str, members: Sequence[Matched], now: datetime, seats: str = "lot"
+) -> Decisions:
+    """Form the proposed session with these members, unless the document has no such proposal of theirs any more.
+
+    `seats` says which member plays which player (`project.seats`).
+    """
+    found = next((each for each in document.proposed if each.id == proposal_id), None)
+    if found is None or found.labels != tuple(member.label for member in members):
+        return document
+    seated = _seated(members, found.session_id, seats)
+    formed = Formed(found.session_id, seated, now, found.ahead is not None, found.ahead, found.players)
+    return msgspec.structs.replace(
+        document,
+        proposed=tuple(each for each in document.proposed if each is not found),
+        formed=(*document.formed, formed),
+    )
+
+
+def _seated(members: Sequence[Matched], lot: str, seats: str) -> tuple[Matched, ...]:
+    """The members in the order of their seats.
+
+    The lot is drawn from the session's random id. Otherwise the participant who comes first, and is perhaps more eager,
+    would always play the same player. The lot also decides between members of one group.
+    """
+    if seats == "match":
+        return tuple(members)
+    drawn = sorted(members, key=lambda member: hashlib.sha256(f"{lot}\0{member.label}".encode()).digest())
+    if seats == "group":
+        drawn.sort(key=lambda member: math.inf if member.group is None else member.group)
+    return tuple(drawn)
+
+
+def give_up(document: Decisions, one: Unmatched) -> Decisions:
+    """Make the participant unmatched, unless they stand in the document already."""
+    if document.renewed is not None or one.label in document.labels():
+        return document
+    return msgspec.structs.replace(document, unmatched=(*document.unmatched, one))
+
+
+def without_done(document: Decisions, done: Collection[str]) -> Decisions:
+    """Return the document without the decisions that are carried out.
+
+    `done` holds the ids of sessions, and the labels of unmatched participants.
+    """
+    if not any(each.id in done for each in document.formed) and not any(
+        each.label in done for each in document.unmatched
+    ):
+        return document
+    return msgspec.structs.replace(
+        document,
+        formed=tuple(each for each in document.formed if each.id not in done),
+        unmatched=tuple(each for each in document.unmatched if each.label not in done),
+    )
+
+
+def without(document: Decisions, label: str) -> Decisions:
+    """Return the document without this participant, whose data are erased.
+
+    Their seat in a formed session is empty then.
+    """
+
+    def unnamed(ahead: OpenSession | None) -> OpenSession | None:
+        return msgspec.structs.replace(ahead, by="") if ahead and ahead.by == label else ahead
+
+    formed = (
+        msgspec.structs.replace(
+            each,
+            members=tuple(Matched("", "") if member.label == label else member for member in each.members),
+            waits_for=unnamed(each.waits_for),
+        )
+        for each in document.formed
+    )
+    kept = without_proposals(document, [each.id for each in document.proposed if label in each.labels])
+    return msgspec.structs.replace(
+        kept,
+        open=tuple(found for each in kept.open if (found := unnamed(each))),
+        proposed=tuple(msgspec.structs.replace(each, ahead=unnamed(each.ahead)) for each in kept.proposed),
+        formed=tuple(each for each in formed if any(member.label for member in each.members)),
+        unmatched=tuple(each for each in kept.unmatched if each.label != label),
+    )

@@ -1,0 +1,62 @@
+"""Stores and reads the answers to steps: `Answers.store` stores a participant's form, `read` reads it for later pages.
+
+`journey.py` finds the step that a form answers and calls the step's type (`steps/`), which calls `store`. The trial
+stores the answer to a game step (`hippodrome/trial/recordings/recorder.py`) in a document of the same form
+(`hippodrome/protocol/answer.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from hippodrome.control.log import logger
+from hippodrome.control.model import participant
+from hippodrome.control.model.participant import Progress
+from hippodrome.control.model.project import Project, Step
+from hippodrome.control.participants.events import publish_events
+from hippodrome.control.ports import Conflict, Platform
+from hippodrome.protocol.answer import answers_in
+from hippodrome.protocol.keys import answer_key
+
+
+class Answers:
+    """The answers of all participants. A method makes one AWS call unless its docstring says otherwise."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._platform = platform
+
+    def store(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any]) -> None:
+        """Store the answers to a step, which moves the participant on. An answer that the step has already stays.
+
+        The messages of the following step are published first, so a crash in between repeats them but never loses them.
+        """
+        if following := participant.following_step(project, step):
+            publish_events(self._platform, project, user_id, following)
+        record = participant.new_answer(project, user_id, step, answers, self._platform.now())
+        body = msgspec.json.format(msgspec.json.encode(record), indent=1)
+        try:
+            self._platform.documents.create(answer_key(project.id, user_id, step.key), body)
+        except Conflict:
+            return
+        logger.info("answered", extra={"project": project.id, "step": step.key})
+
+    def read(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
+        """Return the participant's answers at a step; empty if there are none, or if the document holds no answers."""
+        found = self._platform.documents.get(answer_key(project_id, user_id, step))
+        answers = answers_in(found.body) if found else {}
+        if answers is None:
+            logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
+        return answers or {}
+
+    def repeats(self, project: Project, user_id: str, progress: Progress, answers: Mapping[str, Any]) -> bool:
+        """Return whether these answers, of a form that names no step, repeat the answers to a step of the last minute.
+
+        Simultaneous requests get the same result: `progress` has every answer before the due step, and answers never
+        change. AWS calls: one read for each answer of that minute, at most `participant.MAX_COMPARED`.
+        """
+        recent = progress.recently_answered(project, self._platform.now())
+        earlier = (self.read(project.id, user_id, key) for key in recent)
+        return any(participant.same_answers(answers, one) for one in earlier)

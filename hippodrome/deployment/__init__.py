@@ -1,0 +1,1 @@
+"""The command line for AWS: installs Hippodrome, registers studies, shows servers and costs, fetches data, removes."""

@@ -1,0 +1,60 @@
+"""The quotas of an account that decide whether a study can be held, and how to ask AWS for more.
+
+The codes are Service Quotas' own: Fargate's from its user guide's page on quotas; Lambda's L-B99A9384 "Concurrent
+executions"; CodeBuild's L-9D07B6EF "Concurrently running builds for Linux/Small environment" (`BUILD_GENERAL1_SMALL`,
+which the stack's image builder is); the VPCs' L-F678F1CE "VPCs per Region". New accounts may have only 6 vCPUs of
+Fargate, 10 executions of Lambda, and no build at all: "Cannot have more than 0 builds in queue for the account".
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
+
+from hippodrome.control.aws import errors
+from hippodrome.deployment.aws.account import Account
+
+
+class Quota(NamedTuple):
+    """A quota: the code of its service, and its own."""
+
+    service: str
+    code: str
+
+
+SPOT = Quota("fargate", "L-36FBB829")  # vCPUs
+ON_DEMAND = Quota("fargate", "L-3032A538")  # vCPUs
+EXECUTIONS = Quota("lambda", "L-B99A9384")
+BUILDS = Quota("codebuild", "L-9D07B6EF")
+VPCS = Quota("vpc", "L-F678F1CE")
+
+
+def applied(account: Account, quota: Quota) -> float | None:
+    """Ask for the quota's value in this account, else for AWS's default. Return None if AWS tells neither.
+
+    Raises botocore's errors.
+    """
+    client: Any = account.client("service-quotas")
+    for ask in (client.get_service_quota, client.get_aws_default_service_quota):
+        try:
+            return float(ask(ServiceCode=quota.service, QuotaCode=quota.code)["Quota"]["Value"])
+        except ClientError as error:
+            if errors.code(error) != "NoSuchResourceException":
+                raise
+        except KeyError:
+            continue
+    return None
+
+
+def request(account: Account, quota: Quota, wanted: float) -> str:
+    """Return the AWS CLI command that asks for a higher value, which AWS grants after hours or days."""
+    return (
+        f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
+        f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"
+    )
+
+
+def ask_for(account: Account, quota: Quota, wanted: float) -> str:
+    """Return the advice for a quota that is too small: to ask AWS for more, by the command that `request` returns."""
+    return f"Ask for more: {request(account, quota, wanted)}"

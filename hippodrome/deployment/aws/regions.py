@@ -1,0 +1,58 @@
+"""The AWS regions that Hippodrome can be installed in, and the zones of a region that run Fargate.
+
+CloudFormation refuses a template that names a type which the region does not have, even where a condition leaves the
+resource out ("Unrecognized resource types", cloudformation-coverage-roadmap 2177). `tests/infra/test_regions.py` holds
+the list against the types of `infra/template.yml`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hippodrome.console.problem import Problem
+
+SUPPORTED: Mapping[str, str] = {
+    "ap-northeast-1": "Tokyo",
+    "ap-northeast-2": "Seoul",
+    "ap-south-1": "Mumbai",
+    "ap-southeast-1": "Singapore",
+    "ap-southeast-2": "Sydney",
+    "ca-central-1": "Canada (Montréal)",
+    "eu-central-1": "Frankfurt",
+    "eu-west-1": "Ireland",
+    "eu-west-2": "London",
+    "eu-west-3": "Paris",
+    "sa-east-1": "São Paulo",
+    "us-east-1": "N. Virginia",
+    "us-east-2": "Ohio",
+    "us-west-1": "N. California",
+    "us-west-2": "Oregon",
+}
+"""By region, its name. Each region has every resource type of the template and every service of the commands."""
+
+FARGATE_ZONES: Mapping[str, frozenset[str]] = {
+    "ap-northeast-1": frozenset({"apne1-az1", "apne1-az2", "apne1-az4"}),
+    "ca-central-1": frozenset({"cac1-az1", "cac1-az2"}),
+    "us-west-1": frozenset({"usw1-az1", "usw1-az3"}),
+}
+"""By region, the ids of its zones that run Fargate. Regions in which all zones do are left out.
+
+Source: "Supported Regions for Amazon ECS on AWS Fargate", ECS's developer guide. Earlier editions restricted
+ca-central-1 to these two zones, and editions of 2026 do not. These two zones run Fargate in either case.
+"""
+
+
+def check(region: str) -> None:
+    """Raise `Problem` if Hippodrome cannot be installed in this region."""
+    if region in SUPPORTED:
+        return
+    near = [name for name in SUPPORTED if name.partition("-")[0] == region.partition("-")[0]]
+    raise Problem(
+        f"Hippodrome cannot be installed in {region}: not every service that it needs is there.",
+        f"Choose one of these with AWS_REGION or --region: {', '.join(near or SUPPORTED)}.",
+    )
+
+
+def runs_fargate(region: str, zone_id: str) -> bool:
+    """Whether Fargate runs tasks in this zone. `zone_id`: such as usw1-az1, since names of zones differ by account."""
+    return zone_id in FARGATE_ZONES.get(region, {zone_id})

@@ -1,0 +1,288 @@
+"""`data`: converts answers and recordings, from AWS or from a data folder of `make run`, into tables and datasets."""
+
+# ruff: noqa: PLC0415 - modules that only some runs need are imported there, so that the others start quickly
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hippodrome.console import formatting, screen
+from hippodrome.console.problem import Exit, Problem
+from hippodrome.deployment.aws import account
+from hippodrome.deployment.core import options
+
+if TYPE_CHECKING:
+    from hippodrome.deployment.core.study_selection import StudySelection
+    from hippodrome.export.listing import Tally
+    from hippodrome.export.source import Source
+
+FORMATS = ("csv", "parquet", "minari")
+
+
+def command(
+    *,
+    folder: Annotated[
+        Path | None, typer.Argument(help="The folder to write into; else data-<project> here.", show_default=False)
+    ] = None,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project",
+            help="The project's id or its folder; if left out, the id in this folder's config.yml.",
+            show_default=False,
+        ),
+    ] = None,
+    from_: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Convert this data folder of `make run` or `make try`. Without --from and --aws, config.yml decides: "
+            "AWS if it says `useAWS: true`, else the folder data/ beside it if that is there.",
+            show_default=False,
+        ),
+    ] = None,
+    aws: Annotated[bool, typer.Option("--aws", help="Fetch from AWS, whatever config.yml says.")] = False,
+    bucket: Annotated[
+        str | None,
+        typer.Option(
+            "--bucket",
+            metavar="NAME",
+            help="Fetch from this bucket, which `destroy` has kept; no installation is needed.",
+            show_default=False,
+        ),
+    ] = None,
+    formats: Annotated[
+        str, typer.Option("--format", help=f"Some of {', '.join(FORMATS)}, with commas between.")
+    ] = "csv,parquet",
+    identities: Annotated[
+        str | None,
+        typer.Option(
+            "--identities",
+            metavar="apart",
+            help="apart: ids and what recruiters' links carried go into private/; numbers stand everywhere else.",
+            show_default=False,
+        ),
+    ] = None,
+    long: Annotated[bool, typer.Option("--long", help="Write answers-long: a row for each answered field.")] = False,
+    spreadsheet: Annotated[
+        bool,
+        typer.Option("--spreadsheet", help="CSV for Excel and its like: answers that look like formulas stay text."),
+    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="Keep the files as they are in the bucket, too.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare the folder with its manifest: sizes and hashes.")
+    ] = False,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    stack: options.Stack = account.STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Fetch a study's data and convert them: from AWS, or from this machine if the study runs here.
+
+    Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
+    Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists
+    every file with its hash. Running it again fetches only what is new; it may be interrupted at any time.
+
+    These are personal data. With --identities apart, everything outside private/ names people by numbers only.
+    """
+    from hippodrome.deployment.core.study_selection import folder_for
+    from hippodrome.deployment.core.study_selection import selected as study_of
+    from hippodrome.export import run as work
+    from hippodrome.export.source import Folder
+
+    if from_ is not None and (bucket is not None or aws):
+        other = "--bucket" if bucket is not None else "--aws"
+        raise Problem(f"--from and {other} name two places.", "Give one of the two.")
+    if check:
+        return _check(folder or folder_for(study_of(project).id, from_), as_json)
+    chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
+    if not chosen or not chosen <= set(FORMATS):
+        raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
+    if identities not in (None, "apart"):
+        raise Problem(f"--identities {identities}: there is only `apart`.")
+    _packages(chosen)
+    study = study_of(project)
+    name = study.id
+    undecided = from_ is None and bucket is None and not aws  # no option says where the data are
+    local = _local(study) if undecided else from_
+    target = folder or folder_for(name, local)
+    wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
+    source: Source
+    if local:
+        _refuse_outer(local, name)
+        source = Folder(local)
+    else:
+        source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
+    if dry_run:
+        return _dry_run(work.look(source, name, target, wishes), target, as_json)
+    made = work.run(source, name, target, wishes)
+    if as_json:
+        screen.result_json(made)
+    else:
+        _tell(made, target)
+    return Exit.DONE
+
+
+def _packages(formats: frozenset[str]) -> None:
+    """Raise `Problem` if a package that writes one of these formats is not installed."""
+    for name, needed in (("pyarrow", formats & {"parquet", "minari"}), ("minari", formats & {"minari"})):
+        if needed and importlib.util.find_spec(name) is None:
+            raise Problem(
+                f"The package {name} is not installed, and --format {','.join(sorted(needed))} needs it.",
+                "`make data` installs it into .venv/ and does the same. `--format csv` needs no further package.",
+            )
+
+
+def _local(study: StudySelection) -> Path | None:
+    """Find the study's data folder on this machine, if no option says where the data are; None: they are on AWS.
+
+    Prints the choice if this machine has data, and how to choose AWS or the folder. Raises `Problem` as `local_data`.
+    """
+    from hippodrome.deployment.core.study_selection import DATA, local_data
+
+    found = local_data(study)
+    if found is not None:
+        screen.info(
+            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. "
+            "From AWS: --aws (with make: ARGS=--aws)"
+        )
+    elif study.folder is not None and (study.folder / DATA).is_dir():
+        local = study.folder / DATA
+        screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {local}")
+    return found
+
+
+def _refuse_outer(folder: Path, project: str) -> None:
+    """Raise `Problem` for a folder that has the project's data in folders below it, as `make try` leaves them."""
+    inner = [] if (folder / project).exists() else sorted(path.parent for path in folder.glob(f"*/{project}/users"))
+    if inner:
+        last = inner[-1].parent
+        raise Problem(
+            f"The data of {project} are not in {folder}, but in a folder below it.",
+            f"Name that: --from {last} (with make: DATA={last}).",
+            [f"{path.parent} has data of {project}." for path in inner[:20]] if len(inner) > 1 else [],
+        )
+
+
+def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:
+    """Open the account to fetch from. Raises `Problem` if it cannot be opened.
+
+    `undecided` is a study whose data may be on this machine instead. Then the problem is first about this machine: a
+    researcher who has never used AWS looks for a folder.
+    """
+    from hippodrome.deployment.core.project_folder import uses_aws
+    from hippodrome.deployment.core.study_selection import none_here
+
+    try:
+        return account.open_account(profile, region)
+    except Problem as problem:
+        if undecided is None or undecided.folder is None or uses_aws(undecided.folder):
+            raise
+        on_aws = f"If they are on AWS: {problem} {problem.advice}"
+        raise none_here(undecided.id, undecided.folder, on_aws) from None
+
+
+def _bucket(aws_account: account.Account, stack: str, kept: str | None, project: str) -> Source:
+    """Open the installation's bucket, or the bucket `kept` that `destroy` has kept."""
+    from hippodrome.deployment.stack.retained_bucket import open_bucket
+    from hippodrome.export.source import Bucket
+
+    if kept is not None:
+        return open_bucket(aws_account, kept, project)
+    try:
+        installation = account.find_installation(aws_account, stack)
+    except Problem as problem:
+        advice = f"{problem.advice} If it was removed, its data are in the bucket that `destroy` has named: --bucket."
+        raise Problem(str(problem), advice) from None
+    return Bucket(aws_account.client("s3"), installation["Bucket"], aws_account.id)
+
+
+def _check(folder: Path, as_json: bool) -> int:
+    from hippodrome.export import run as work
+
+    wrong = work.check(folder)
+    if as_json:
+        screen.result_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
+    if not wrong:
+        screen.success(f"{folder} is as its manifest says.")
+        return Exit.DONE
+    raise Problem(
+        f"{len(wrong)} files in {folder} are not as its manifest says.",
+        "Run the command without --check: what is damaged is made anew.",
+        wrong[:20] + ([f"… and {len(wrong) - 20} more"] if len(wrong) > 20 else []),
+    )
+
+
+def _dry_run(tally: Tally, target: Path, as_json: bool) -> int:
+    files = {
+        "new": tally.new,
+        "changed": tally.changed,
+        "unchanged": tally.unchanged,
+        "gone": tally.gone,
+        "damaged": tally.damaged,
+    }
+    if as_json:
+        screen.result_json({"folder": str(target), "participants": tally.participants, **files, "bytes": tally.bytes})
+    else:
+        screen.table(["what", "files"], [(name, f"{number:,}") for name, number in files.items()], right=["files"])
+        screen.result(
+            f"{formatting.count(tally.participants, 'participant')}; {formatting.size(tally.bytes)} to fetch "
+            f"into {target}/"
+        )
+    return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
+
+
+def _tell_moved(moved: list[dict[str, Any]]) -> None:
+    """Warn about steps whose answers come from another page than the present one."""
+    for step in moved:
+        name, page = step["step"], step["page"]
+        for other, count in step["others"].items():
+            answers = formatting.count(count, "answer")
+            screen.warning(f"Step {name} is {page} now, and has {answers} from {other}: column page.{name} says which.")
+    if moved:
+        screen.info("  `finished` is by the steps as they are now.")
+
+
+def _tell(made: dict[str, Any], target: Path) -> None:
+    counts, run = made["counts"], made["run"]
+    if run["damaged"]:
+        screen.warning(f"{run['damaged']:,} files here were damaged, and have been made anew.")
+    if run["gone"]:
+        screen.warning(f"{run['gone']:,} files are gone from the source, and so from here.")
+    for dataset in made["minari"]:
+        for why, count in dataset["leftOut"].items():
+            screen.warning(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
+        if not dataset["observations"] and dataset["observationsRecorded"]:
+            screen.warning(
+                f"{dataset['id']}: observations were recorded, but Minari has no space for them: steps' numbers stand "
+                "in their place. The recordings' Parquet files have them, in the column `other`."
+            )
+        elif not dataset["observations"]:
+            screen.warning(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
+    if not all(dataset["observationsRecorded"] for dataset in made["minari"]):
+        screen.info(
+            "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
+        )
+    _tell_moved(made["moved"])
+    if counts["problems"]:
+        problems = formatting.count(counts["problems"], "remark")
+        screen.warning(f"{problems} on files that are not as they should be: {target / 'problems.csv'}")
+    if target.stat().st_mode & 0o077:
+        screen.warning(f"Other users of this machine can read {target}/. To change that: chmod -R go-rwx {target}")
+    has_recordings = made["formats"] != ["csv"]
+    counted = ("participants", "finished", "answers", *(("episodes", "frames") if has_recordings else ()))
+    screen.table(["", "count"], [(name, f"{counts[name]:,}") for name in counted], right=["count"])
+    if not has_recordings:
+        screen.info("  Recordings were not fetched. --format csv,parquet makes their tables, such as episodes.csv.")
+    screen.success(
+        f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {target}/"
+    )
+    if datasets := ", ".join(dataset["id"] for dataset in made["minari"] if dataset["episodes"]):
+        screen.info(f"  MINARI_DATASETS_PATH={target.resolve() / 'minari'} {datasets}")
+    if made["identities"] == "apart":
+        screen.info(f"  Who is who: {target / 'private/identities.csv'}. Share everything but private/.")

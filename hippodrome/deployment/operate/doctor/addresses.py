@@ -1,0 +1,156 @@
+"""Checks names and certificates: whether participants reach the site and the servers."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import certifi
+
+from hippodrome.console.problem import Problem
+from hippodrome.control.certificates.rules import names_of
+from hippodrome.deployment.aws.hosted_zone import read_zone
+from hippodrome.deployment.core.finding import Finding, bad, good, look
+from hippodrome.deployment.operate import snapshot
+from hippodrome.deployment.operate.doctor.check_context import CheckContext
+from hippodrome.deployment.stack.stack import Stack
+
+PATIENCE = 10  # seconds to wait for the site
+
+
+def zone(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the hosted zone exists, is for the domain, and is delegated."""
+    domain = context.installation["RootDomain"]
+    try:
+        found = read_zone(context.account, context.installation["HostedZoneId"])
+    except Problem as problem:
+        yield bad(
+            "hosted zone",
+            str(problem),
+            "The servers' names are written there: run `python -m deploy apply` with --zone.",
+        )
+        return
+    if not found.holds(domain):
+        yield bad(
+            "hosted zone",
+            f"{found.id} is for {found.domain}, not for {domain}.",
+            "Give `python -m deploy apply` its zone.",
+        )
+        return
+    if context.delegation is None:
+        yield good("hosted zone", f"{found.domain} ({found.id}); DNS was not asked.")
+        return
+    answer = context.delegation(found)
+    servers = ", ".join(found.name_servers)
+    if not answer.problem:
+        yield good("hosted zone", f"{found.domain} is delegated to Route 53 ({found.id}).")
+    elif answer.certain:
+        yield bad("hosted zone", answer.problem, f"At the domain's registrar, make these its name servers: {servers}.")
+    else:
+        yield look("hosted zone", answer.problem, f"The name servers have to be {servers}.")
+
+
+def site_certificate(context: CheckContext) -> Iterator[Finding]:
+    """Check the site's certificate, which ACM renews by itself if DNS is right."""
+    stack = Stack(context.account, context.installation.stack)
+    arns = stack.ids_of("AWS::CertificateManager::Certificate")
+    if not arns:
+        yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
+    for arn in arns:
+        found = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
+        status, name = found["Status"], found["DomainName"]
+        if status == "ISSUED":
+            yield good("site certificate", f"{name}: issued.")
+        elif status == "PENDING_VALIDATION":
+            yield bad(
+                "site certificate",
+                f"{name}: waits for its validation in DNS.",
+                "It is issued as soon as the domain is delegated to the hosted zone.",
+            )
+        else:
+            yield bad(
+                "site certificate",
+                f"{name}: {status}.",
+                "See it in the ACM console, then run `python -m deploy apply`.",
+            )
+
+
+def site(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the site answers at the participants' address."""
+    if context.fetch is None:
+        return
+    address = context.installation["Site"]
+    try:
+        status = context.fetch(f"{address}/next")
+    except urllib.error.URLError as error:
+        why = "DNS does not know it" if isinstance(error.reason, socket.gaierror) else error.reason
+        yield bad("site", f"{address} cannot be reached: {why}.", "Look at the hosted zone and its certificate.")
+        return
+    except (OSError, ValueError) as error:
+        yield bad("site", f"{address} cannot be reached: {type(error).__name__}.", "Look at the hosted zone first.")
+        return
+    if status >= 500:
+        yield bad("site", f"{address} answers {status}.", "See `python -m deploy logs next_step --errors`.")
+    else:
+        yield good("site", f"{address} answers.")
+
+
+def fetch(address: str) -> int:
+    """Send a GET request over https, and return the status, also 4xx and 5xx. Raises OSError without an answer."""
+    if not address.startswith("https://"):
+        raise ValueError(address)
+    try:
+        with urllib.request.urlopen(  # noqa: S310 - https, see above  # nosec B310
+            address, timeout=PATIENCE, context=authorities()
+        ) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def authorities() -> ssl.SSLContext:
+    """Make a TLS context that trusts this machine's authorities and Mozilla's, which certifi has.
+
+    Python from python.org has no authorities on macOS (its `Install Certificates.command` adds certifi's). A network
+    that inspects TLS has an authority that only its machines know.
+    """
+    context = ssl.create_default_context()
+    context.load_verify_locations(certifi.where())
+    return context
+
+
+def certificate(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the servers' wildcard certificate is in place, valid, and renewed in time."""
+    order = "Order one: `python -m deploy certificate --production`."
+    try:
+        found = snapshot.certificate(context.installation, context.platform.documents, context.now)
+    except Problem as problem:
+        yield bad("certificate", str(problem), order)
+        return
+    if found is None:
+        yield bad("certificate", "There is none: no browser can reach a server.", order)
+        return
+    (wanted,) = names_of(context.installation.servers_domain)
+    if wanted not in found.names:
+        yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
+    elif found.days_left < 0 or found.expires <= context.now:
+        yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
+    elif found.staging:
+        yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
+    elif found.urgent(context.now):
+        yield bad(
+            "certificate",
+            f"{found.days_left} days left, and it was not renewed.",
+            f"{order} See `python -m deploy logs renew_certificate --errors`.",
+        )
+    elif found.overdue(context.now):
+        yield look(
+            "certificate",
+            f"{found.days_left} days left: it should be renewed by now.",
+            "See `python -m deploy logs renew_certificate`.",
+        )
+    else:
+        yield good("certificate", f"{', '.join(found.names)}: {found.days_left} days left.")

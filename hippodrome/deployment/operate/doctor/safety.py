@@ -1,0 +1,123 @@
+"""Checks the bucket, the queues, the alarms, and who gets the alarms' mails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+from botocore.exceptions import ClientError
+
+from hippodrome.control.aws import errors
+from hippodrome.deployment.core.finding import Finding, bad, good, look
+from hippodrome.deployment.operate import snapshot
+from hippodrome.deployment.operate.doctor.check_context import CheckContext
+
+APPLY = "Run `python -m deploy apply`: it puts this right."
+
+
+def bucket(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the bucket belongs to this account, is closed to the public, keeps versions, and requires TLS."""
+    name, client = context.installation["Bucket"], context.account.client("s3")
+    try:
+        client.head_bucket(Bucket=name, ExpectedBucketOwner=context.account.id)
+    except ClientError as error:
+        status = errors.status(error)
+        if status == 404:
+            yield bad("bucket", f"{name} is gone, and the data with it.", "See the S3 console; older copies may exist.")
+        elif status == 403:
+            yield bad(
+                "bucket", f"{name} may not be looked at, or belongs to another account.", "Check the credentials."
+            )
+        else:
+            raise
+        return
+    wrong = [*_public_access(context, name), *_versions_and_policy(context, name)]
+    yield from wrong
+    if not wrong:
+        yield good("bucket", f"{name}: private, versioned, TLS only.")
+
+
+def _public_access(context: CheckContext, name: str) -> Iterator[Finding]:
+    client = context.account.client("s3")
+    try:
+        block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
+    except ClientError as error:
+        if errors.code(error) != "NoSuchPublicAccessBlockConfiguration":
+            raise
+        block = {}
+    settings = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
+    off = [one for one in settings if not block.get(one)]
+    if off:
+        yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
+
+
+def _versions_and_policy(context: CheckContext, name: str) -> Iterator[Finding]:
+    client = context.account.client("s3")
+    if client.get_bucket_versioning(Bucket=name).get("Status") != "Enabled":
+        yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
+    try:
+        policy = json.loads(client.get_bucket_policy(Bucket=name)["Policy"])
+    except ClientError as error:
+        if errors.code(error) != "NoSuchBucketPolicy":
+            raise
+        policy = {}
+    statements = policy.get("Statement", [])
+    statements = [statements] if isinstance(statements, dict) else statements
+    if not any(_denies_without_tls(one) for one in statements):
+        yield bad("bucket", f"{name} can be read without TLS.", APPLY)
+    for one in statements:
+        if one.get("Effect") == "Allow" and one.get("Principal") in ("*", {"AWS": "*"}) and not one.get("Condition"):
+            yield bad("bucket", f"The policy of {name} lets everybody in.", "Take that statement out of it.")
+
+
+def _denies_without_tls(statement: dict[str, object]) -> bool:
+    condition = json.dumps(statement.get("Condition", {})).lower().replace(" ", "")
+    return statement.get("Effect") == "Deny" and '"aws:securetransport":"false"' in condition
+
+
+def queues(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the dead-letter queues are empty, and count the messages that wait."""
+    found = snapshot.queues(context.account, context.installation.stack)
+    dead = [queue for queue in found if queue.dead]
+    if not dead:
+        yield look("queues", "The stack has no dead-letter queues.", APPLY)
+        return
+    full = [f"{queue.name} {queue.waiting:,}" for queue in dead if queue.waiting]
+    if full:
+        yield bad(
+            "queues",
+            f"Messages that could not be dealt with: {', '.join(full)}.",
+            "`python -m deploy logs --errors` says why; SQS's console can send them again (redrive).",
+        )
+    else:
+        waiting = sum(queue.waiting for queue in found)
+        yield good("queues", f"No dead letters; {waiting:,} messages wait.")
+
+
+def alarms(context: CheckContext) -> Iterator[Finding]:
+    """Check whether an alarm fires."""
+    found = [*snapshot.alarms(context.account, context.installation)]
+    firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
+    if not found:
+        yield look("alarms", "The stack has no alarms.", APPLY)
+    elif firing:
+        yield bad(
+            "alarms",
+            f"Firing: {', '.join(firing)}.",
+            f"See {context.installation.outputs.get('Dashboard', 'the dashboard')}.",
+        )
+    else:
+        yield good("alarms", f"{len(found)} alarms, none fires.")
+
+
+def listeners(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the alarms' topic has a confirmed subscription."""
+    found = [*snapshot.subscriptions(context.account, context.installation)]
+    pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
+    confirmed = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
+    if pending:
+        yield look("alarm e-mail", f"{', '.join(pending)} has not confirmed.", "Follow the link in AWS's e-mail.")
+    if confirmed:
+        yield good("alarm e-mail", f"Alarms go to {', '.join(confirmed)}.")
+    elif not pending:
+        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `python -m deploy apply` an --email.")

@@ -1,0 +1,284 @@
+"""`deploy erase`: deletes everything about one participant, and writes a receipt that does not name them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress, TaskID
+
+from hippodrome.console import screen
+from hippodrome.console.formatting import count
+from hippodrome.console.problem import Exit, Problem
+from hippodrome.control.model import ids
+from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.versions import VersionedBucket
+from hippodrome.deployment.core import options, participants
+from hippodrome.deployment.operate import receipt as receipts
+from hippodrome.deployment.operate.eraser import ROUNDS, Eraser, FoundOfParticipant
+
+
+def command(
+    user: Annotated[str, typer.Argument(help="The participant's id (userId), exactly as in their link.")],
+    *,
+    project: Annotated[
+        str | None,
+        typer.Option(
+            "--project",
+            help="Erase only in this project, named by its id or its folder; if left out, on this machine in all "
+            "projects of the data folder, on AWS in the project of this folder's config.yml.",
+            show_default=False,
+        ),
+    ] = None,
+    from_: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Erase from this data folder of `make run`. Without --from and --aws, config.yml decides: AWS, or "
+            "the folder data/ beside it if the study runs on this machine only.",
+            show_default=False,
+        ),
+    ] = None,
+    aws: Annotated[bool, typer.Option("--aws", help="Erase on AWS, whatever config.yml says.")] = False,
+    everywhere: Annotated[
+        bool, typer.Option("--everywhere", help="Erase in every project of the installation, not in one.")
+    ] = False,
+    receipt: Annotated[
+        Path | None,
+        typer.Option("--receipt", help="Where to write the receipt; else erased-<time>.json here.", show_default=False),
+    ] = None,
+    with_id: Annotated[bool, typer.Option("--with-id", help="Write the id itself into the receipt, too.")] = False,
+    dry_run: options.DryRun = False,
+    yes: options.Yes = False,
+    json: options.Json = False,
+    stack: options.Stack = STACK,
+    region: options.Region = None,
+    profile: options.Profile = None,
+) -> int:
+    """Erase everything about one participant: documents in all their versions, recordings, their server and its traces.
+
+    This cannot be undone. On this machine, end `make run` first. On AWS, the receipt says what was deleted, when and by
+    whom, and that a last listing found nothing. It names the participant by a salted hash, which anyone who knows the
+    id can check. Afterwards run `data` again for each folder with downloaded data of the study: it removes the
+    participant there.
+    """
+    from hippodrome.deployment.core.study_selection import project_id  # noqa: PLC0415 - only here
+
+    _must_fit(user, project, everywhere=everywhere, two_places=from_ is not None and aws)
+    data = from_ if from_ is not None or aws or everywhere else _data_here(project)
+    if data is not None:
+        if everywhere or receipt is not None or with_id:
+            raise Problem(
+                "On this machine there is no receipt, and a participant is erased in all projects of the data folder.",
+                "Leave out --everywhere, --receipt and --with-id; on AWS, add --aws (with make: ARGS=--aws).",
+            )
+        only = None if project is None else project_id(project)
+        return _from_folder(data, only, user, dry_run=dry_run, yes=yes, json=json)
+    account = open_account(profile, region)
+    installation = find_installation(account, stack)
+    projects = _projects(account, installation) if everywhere else [project_id(project)]
+    erasers = [Eraser(account, installation, name, user) for name in projects]
+    found = {eraser.project: eraser.look() for eraser in erasers}
+    if not everywhere and not any(found.values()):
+        _must_be_known(projects[0], _projects(account, installation), stack)
+    if not json or dry_run:
+        _show(found, json, dry_run)
+    concerned = [name for name, one in found.items() if one]
+    if dry_run:
+        return Exit.CHANGES if concerned else Exit.DONE
+    if concerned:
+        screen.confirm(f"Erase this participant for good from {', '.join(concerned)}?", yes)
+    began, whole = datetime.now(UTC), False
+    target = receipt or _new_receipt(began)
+    if target.exists() or not target.parent.is_dir():
+        raise Problem(f"The receipt cannot be written to {target}.", "Name a new file in a folder that exists.")
+    try:
+        _erase(erasers, found)
+        whole = True
+    finally:
+        parts = [eraser.receipt for eraser in erasers]
+        made = receipts.receipt(parts, user, account, installation, began=began, whole=whole, with_id=with_id)
+        if whole or any(part.deleted for part in parts):
+            receipts.write(target, made)
+    if json:
+        screen.result_json(made)
+    _warn_of_unreadable(erasers)
+    if concerned:
+        screen.success(f"Everything is gone. The receipt: {target}")
+        screen.info("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
+    else:
+        screen.success(f"There is nothing of this participant. The receipt: {target}")
+    return Exit.DONE
+
+
+def _new_receipt(began: datetime) -> Path:
+    """Choose a file name that is free in this folder, since a script may erase several participants in a second."""
+    name = f"erased-{began:%Y%m%dT%H%M%SZ}"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
+
+
+def _must_fit(user: str, project: str | None, *, everywhere: bool, two_places: bool) -> None:
+    """Raise `Problem` if nobody can have this id, or if these options do not go together."""
+    if not ids.is_user_id(user):
+        raise Problem(
+            "This cannot be a participant's id.",
+            "Ids have letters, digits, dashes and underscores, 64 at most (with make: USER_ID=).",
+        )
+    if everywhere and project is not None:
+        raise Problem("--project names one project, --everywhere means all of them.", "Give one of the two.")
+    if two_places:
+        raise Problem("--from and --aws name two places.", "Give one of the two.")
+
+
+def _data_here(project: str | None) -> Path | None:
+    """Find the study's data folder on this machine, if no option says where the data are; None: they are on AWS.
+
+    Raises `Problem` if the participant may be in both places, since then neither may count as all of their data.
+    """
+    from hippodrome.deployment.core.project_folder import may_use_aws  # noqa: PLC0415 - pydantic, only where a folder is read
+    from hippodrome.deployment.core.study_selection import DATA, local_data, selected  # noqa: PLC0415 - the same
+
+    study = selected(project)
+    data = local_data(study)
+    if study.folder is None:
+        return None
+    if data is None:
+        if (study.folder / DATA).is_dir():
+            screen.info(f"On AWS: config.yml says useAWS: true. Data on this machine: --from {study.folder / DATA}")
+    elif may_use_aws(study.folder):
+        raise Problem(
+            f"The data of {study.id} may be in two places: in {data} on this machine, and on AWS.",
+            f"Erase in both, or where the study has run: once with --from {data} (with make: DATA={data}), once with "
+            "--aws (with make: ARGS=--aws).",
+        )
+    return data
+
+
+def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes: bool, json: bool) -> int:
+    """Erase the participant from a data folder, in all its projects, or in the project `only`."""
+    from hippodrome.deployment.operate import folder_eraser  # noqa: PLC0415 - only here
+    from hippodrome.deployment.operate.folder_eraser import FolderEraser  # noqa: PLC0415 - only here
+
+    folders = folder_eraser.folders(data)
+    present = {name for folder in folders for name in folder_eraser.projects(folder)}
+    _must_hold(data, only, sorted(present))
+    looks = [
+        (eraser, *eraser.look())
+        for folder in folders
+        for eraser in (FolderEraser(folder, name, user) for name in folder_eraser.projects(folder))
+    ]
+    found = [look for look in looks if (look[1] or look[2]) and only in (None, look[0].project)]
+    others = {look[0].project for look in looks if (look[1] or look[2]) and only not in (None, look[0].project)}
+    rows = [
+        (eraser.project, str(eraser.data), f"{len(own):,}", f"{len(sessions):,}") for eraser, own, sessions in found
+    ]
+    if rows and not json:
+        screen.table(["project", "data", "files", "sessions"], rows, right=["files", "sessions"])
+    done = []
+    if found and not dry_run:
+        screen.confirm(f"Erase this participant for good from {', '.join(dict.fromkeys(row[0] for row in rows))}?", yes)
+        done = [eraser.run() for eraser, *_ in found]
+    for eraser, *_ in looks:
+        for key in eraser.unreadable:
+            screen.warning(f"{eraser.data / key} cannot be read, and may name this participant: look at it yourself.")
+    if others:
+        screen.warning(f"They are also in {', '.join(sorted(others))}. Without --project, all projects are erased.")
+    elif not dry_run:
+        for path in (path for folder in folders for path in folder_eraser.mentions(folder, user)):
+            screen.warning(f"{path} still names them: look at it, and delete it if you do not need it.")
+    files, rewritten = sum(each.files for each in done), sum(each.rewritten for each in done)
+    if json:
+        amount = sum(len(own) + len(sessions) for _, own, sessions in found)
+        screen.result_json({"found": amount, "deleted": files, "rewritten": rewritten})
+    if done:
+        screen.success(f"{count(files, 'file')} deleted, {count(rewritten, 'recording')} rewritten without them.")
+        screen.info("  Where this study was converted, run `python -m deploy data` again: it removes them there.")
+    elif not found:
+        screen.success(f"There is nothing of this participant in {data}, in {only or ', '.join(sorted(present))}.")
+        screen.info("  An id must be written exactly as in their link.")
+    return Exit.CHANGES if dry_run and found else Exit.DONE
+
+
+def _must_hold(data: Path, only: str | None, present: list[str]) -> None:
+    """Raise `Problem` if the folder does not hold this project, or none: a wrong name must not look like an erasure."""
+    if not present:
+        raise Problem(
+            f"{data} is not a data folder: it holds no project.",
+            "Name the folder with the data of `make run`, such as ../my-study/data (--from, with make: DATA=).",
+        )
+    if only not in (None, *present):
+        raise Problem(
+            f"{data} holds nothing of a project {only}.",
+            f"It holds: {', '.join(present)}. Without --project, the participant is erased in all of them.",
+        )
+
+
+def _projects(account: Account, installation: Installation) -> list[str]:
+    """Return the ids of all projects that are registered or have documents in the bucket."""
+    names = {project.id for project in participants.registered_projects(account.platform(installation).documents)}
+    names.update(VersionedBucket(account, installation["Bucket"]).folders())
+    return sorted(name for name in names if ids.is_project_id(name))
+
+
+def _must_be_known(project: str, known: list[str], stack: str) -> None:
+    """Raise `Problem` for an unknown project: a mistyped id must not look like an erasure."""
+    if project not in known:
+        raise Problem(
+            f"The installation {stack} holds nothing of a project {project}.",
+            f"Name another with --project, or take --everywhere. It holds: {', '.join(known) or 'nothing yet'}.",
+        )
+
+
+def _erase(erasers: list[Eraser], found: Mapping[str, FoundOfParticipant]) -> None:
+    with screen.ProgressBars() as bars:
+        bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
+        for eraser in erasers:
+            if found[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):
+                raise Problem(
+                    f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
+                    "The participant's link is in use. Close the study with `register --no-live`, and run this again.",
+                )
+
+
+def _warn_of_unreadable(erasers: list[Eraser]) -> None:
+    for key in itertools.chain.from_iterable(eraser.unreadable() for eraser in erasers):
+        screen.warning(
+            f"{key} cannot be read, and may hold a hash of the id: `python -m deploy doctor` says what to do."
+        )
+
+
+def _advance(bars: Progress, bar: TaskID, count: int) -> None:
+    """Advance the bar. If more is deleted than was found, such as the server's last recording, the total grows."""
+    task = bars.tasks[0]
+    bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
+
+
+def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
+    if json:
+        screen.result_json({"found": {name: one.counts() for name, one in found.items()}})
+        return
+    rows = [(name, *one.counts().values()) for name, one in found.items() if one]
+    if rows:
+        heads = max((list(one.counts()) for one in found.values()), key=len)
+        screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
+        _warn_of_others(found)
+    elif dry_run:
+        screen.result(f"There is nothing of this participant in {', '.join(found) or 'any project'}.")
+
+
+def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
+    """Warn that the servers of sessions will be stopped on which other participants still play."""
+    playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
+    if playing:
+        screen.warning(
+            f"They play with others now: {count(playing, 'session')} will be stopped, for all who play there."
+        )
+
+
+def _words(found: FoundOfParticipant) -> str:
+    return ", ".join(f"{count:,} {what}" for what, count in found.counts().items() if count)

@@ -1,0 +1,111 @@
+"""A project's task definition in ECS: the image of its servers, their size, and their rights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from botocore.exceptions import ClientError
+
+from hippodrome.control.aws import errors
+from hippodrome.control.model.messages import CONTAINER
+from hippodrome.deployment.aws import resource_names
+from hippodrome.deployment.aws.account import Account, Installation
+from hippodrome.deployment.aws.resource_names import TAG
+from hippodrome.protocol import environment
+
+STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, for a server's last recording; Fargate allows no more
+SCRATCH = "/scratch"  # the only folder into which a trial may write (infra/Dockerfile)
+USER = "10001:10001"
+PRIVILEGED = 1024  # only a privileged user may listen on lower ports
+
+
+def port(installation: Installation) -> int:
+    """Return the port on which the servers of a study will listen if it is registered now."""
+    return int(installation["ServerPort"])
+
+
+def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
+    """Make the task definition, as RegisterTaskDefinition takes it. `cpu` in vCPU, `memory` in GB.
+
+    The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
+    the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
+    who is not root can write there. The definition holds no secret: RunTask gives a server its own values. There is no
+    task role, so the code in the container has no rights on AWS (hippodrome/control/servers/signing.py).
+
+    A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
+    namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
+    SystemControl, read November 2026), and others use this one there (statista-oss/routing-proxy). File capabilities
+    would have no effect, since all capabilities are dropped.
+    """
+    listens = port(installation)
+    container = {
+        "name": CONTAINER,
+        "image": image,
+        "essential": True,
+        "user": USER,
+        "readonlyRootFilesystem": True,
+        "portMappings": [{"containerPort": listens, "protocol": "tcp"}],
+        "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
+        "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
+        "stopTimeout": STOP_TIMEOUT,
+        "environment": [{"name": environment.STOP_SECONDS, "value": str(STOP_TIMEOUT)}],
+        "logConfiguration": {
+            "logDriver": "awslogs",
+            "options": {
+                "awslogs-group": installation["TrialLogGroup"],
+                "awslogs-region": installation.region,
+                "awslogs-stream-prefix": project_id,
+                "mode": "non-blocking",  # a game must not wait for its log
+                "max-buffer-size": "4m",
+            },
+        },
+    }
+    if listens < PRIVILEGED:
+        container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(listens)}]
+    return {
+        "family": resource_names.family(installation.stack, project_id),
+        "networkMode": "awsvpc",
+        "requiresCompatibilities": ["FARGATE"],
+        "runtimePlatform": {"cpuArchitecture": "X86_64", "operatingSystemFamily": "LINUX"},
+        "cpu": str(round(cpu * 1024)),
+        "memory": str(round(memory * 1024)),
+        "executionRoleArn": installation["TaskExecutionRole"],
+        "volumes": [{"name": "scratch"}],
+        "containerDefinitions": [container],
+    }
+
+
+def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
+    """Find the family's newest revision if it is active and has this content. Return its ARN, or None."""
+    try:
+        found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
+    except ClientError as error:
+        if errors.code(error) == "ClientException":  # there is no such family
+            return None
+        raise
+    if found.get("status", "ACTIVE") != "ACTIVE":
+        return None
+    return str(found["taskDefinitionArn"]) if _contains(found, wanted) else None
+
+
+def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
+    """Register a new revision, and return its ARN."""
+    tags = {TAG: installation.stack, "hippodrome:project": project_id}
+    answer = account.client("ecs").register_task_definition(
+        **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
+    )
+    return str(answer["taskDefinition"]["taskDefinitionArn"])
+
+
+def _contains(found: Any, wanted: Any) -> bool:
+    """Whether `found` has all values of `wanted`. ECS adds values that were left out, such as host ports."""
+    if isinstance(wanted, Mapping):
+        return isinstance(found, Mapping) and all(_contains(found.get(key), value) for key, value in wanted.items())
+    if isinstance(wanted, Sequence) and not isinstance(wanted, str):
+        return (
+            isinstance(found, Sequence)
+            and len(found) == len(wanted)
+            and all(_contains(one, other) for one, other in zip(found, wanted, strict=True))
+        )
+    return bool(found == wanted)

@@ -1,0 +1,104 @@
+"""Removes the data of one member from a session's recording, for the erasure of that participant.
+
+It removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
+their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id in any
+place. The actions, rewards and scores of their player stay: without them the game of the others cannot be read or
+repeated. Lines without data of the member stay byte for byte.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from hippodrome.export import recording_columns, recording_lines
+from hippodrome.export.scrub import SHORTEST, Scrub
+
+ABOUT_ONE = frozenset({"on_feedback", "on_join", "on_leave", "on_return"})
+"""Callbacks on one participant. A line of theirs without `player` may be about any member."""
+OF_EACH = ("roundTrip", "outcomes")
+"""Fields of lines that map each player to a value."""
+OF_KEYS = ("human", "pressedAt")
+"""Fields with the action of the participant's keys, and the time at which they were pressed."""
+
+
+def rewrite(source: Path, target: Path, seat: int, user: str) -> bool:
+    """Write the recording `source` into `target` without the data of the member at this seat, whose id is `user`.
+
+    Returns whether the two differ. A recording that was cut off stays cut off; lines that cannot be read are left out.
+    Raises OSError.
+    """
+    problems: list[str] = []
+    pack = zlib.compressobj(6, zlib.DEFLATED, 31)
+    erased: _Erased | None = None
+    differs = False
+    with target.open("wb") as file:
+        for text in recording_lines.texts(source, problems):
+            line = recording_lines.parsed(text)
+            erased = erased or _Erased(line or {}, seat, user)
+            left = erased.without(line, text) if line is not None else None
+            same = left == line and line is not None
+            differs = differs or (not same and bool(text.strip()))
+            if left is not None:
+                written = text if same else json.dumps(left, separators=(",", ":")).encode()
+                file.write(pack.compress(written + b"\n"))
+        file.write(pack.flush(zlib.Z_SYNC_FLUSH if problems else zlib.Z_FINISH))
+    return differs
+
+
+class _Erased:
+    """Removes a member's data from the lines of a recording, of which `header` is the first."""
+
+    def __init__(self, header: Mapping[str, Any], seat: int, user: str) -> None:
+        humans = recording_columns.humans_of(header)
+        self._first = humans[0] if humans else ""
+        players = {name for name, of in recording_columns.seats_of(header).items() if of == seat}
+        self._players: Collection[str] | None = players if header.get("kind") == "header" else None  # None: unknown
+        self._id = user.lower().encode() if len(user) >= SHORTEST else None
+        self._hide = Scrub({user: ""})
+
+    def without(self, line: Mapping[str, Any], text: bytes) -> dict[str, Any] | None:
+        """Return the line without the member's data; None if it is only about them. `text` is the line as written."""
+        if self._is_theirs(line):
+            return None
+        left = dict(line)
+        if isinstance(messages := line.get("messages"), list):
+            left["messages"] = [message for message in messages if not self._sent(message)]
+        for name in OF_EACH:
+            if isinstance(values := line.get(name), Mapping):
+                left[name] = {player: value for player, value in values.items() if not self._is(player)}
+        if isinstance(players := line.get("players"), Mapping) and line.get("kind") != "header":
+            left["players"] = {
+                player: _without_keys(part) if self._is(player) else part for player, part in players.items()
+            }
+        if self._is(self._first) and line.get("human") is not None:
+            left["human"] = None
+        if self._id is not None and self._id in text.lower():
+            left = self._hide.value(left)
+        return left
+
+    def _is(self, player: Any) -> bool:
+        return self._players is None or player in self._players
+
+    def _sent(self, message: Any) -> bool:
+        """Whether the member has sent a message, or may have sent it because it names no player."""
+        return not isinstance(message, Mapping) or "player" not in message or self._is(message["player"])
+
+    def _is_theirs(self, line: Mapping[str, Any]) -> bool:
+        kind = line.get("kind")
+        if kind == "presence":
+            # A line with a `seed` stays: a repetition of the game needs it for the policy that replaced the member.
+            return self._is(line.get("player")) and "seed" not in line
+        if kind == "ping":
+            trips = line.get("roundTrip")
+            return not isinstance(trips, Mapping) or all(map(self._is, trips))
+        if kind == "callback":
+            return self._is(line["player"]) if "player" in line else line.get("callback") in ABOUT_ONE
+        return False
+
+
+def _without_keys(part: Any) -> Any:
+    return {name: value for name, value in part.items() if name not in OF_KEYS} if isinstance(part, Mapping) else part

@@ -1,0 +1,1 @@
+"""The code of the Lambda functions. A handler reads its event, calls the control plane and shapes the reply."""

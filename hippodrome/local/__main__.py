@@ -1,0 +1,209 @@
+"""`python -m hippodrome.local [FOLDER]`: run a study on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import resource
+import select
+import signal
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import psutil
+import typer
+
+from hippodrome.local.activity.function_log import function_log
+from hippodrome.local.activity.log import ActivityLog
+from hippodrome.local.backend import files
+from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.publish import NotPublished
+from hippodrome.local.study import Study, from_here
+from hippodrome.local.web import server
+from hippodrome.local.web.access import origin_of
+
+ROOT = ".hippodrome"
+STARTER_SECONDS = 1.0  # seconds between two looks whether the starter still runs
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    *,
+    port: Annotated[int, typer.Option(help="If it is in use, the next free one is taken. 0: any free one.")] = 8000,
+    data: Annotated[Path, typer.Option(help="Where answers and recordings are kept.")] = Path("data"),
+    host: Annotated[
+        str, typer.Option(help="127.0.0.1 or localhost: a study runs for this machine only.")
+    ] = server.HOST,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Answer pages of this origin too, such as another front end at http://localhost:3000. "
+            "May be given several times.",
+            show_default=False,
+        ),
+    ] = None,
+    tls: Annotated[
+        bool, typer.Option("--tls", help="Serve pages by https, and servers by TLS at names below localhost.")
+    ] = False,
+    names: Annotated[
+        str | None,
+        typer.Option(
+            help="With --tls: `hash`, or `userId` to name servers after participants' ids.", show_default=False
+        ),
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; earlier data are moved aside.")] = False,
+    starter: Annotated[
+        int | None, typer.Option(help="End the study when the process with this id has ended.", hidden=True)
+    ] = None,
+) -> None:
+    """Run the study of FOLDER on this machine, and print its link."""
+    os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
+    activity_log = ActivityLog()
+    if host not in ("127.0.0.1", "localhost"):
+        activity_log.show(
+            f"A study cannot run at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
+            "so participants could not play on another machine. Leave --host out (with make: HOST=)."
+        )
+        raise typer.Exit(1)
+    origins = [origin_of(given) for given in origin or ()]
+    if None in origins:
+        activity_log.show(
+            f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000."
+        )
+        raise typer.Exit(1)
+    if names is not None and (names not in ("hash", "userId") or not tls):
+        activity_log.show(
+            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses "
+            "(with make: TLS=1 NAMES=userId)."
+        )
+        raise typer.Exit(1)
+    new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
+    try:
+        _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study, starter=starter)
+    except files.InUse as error:
+        at = f", at {error}" if str(error) else ""
+        activity_log.show(f"A study already runs with the data in {data}{at}.", "End it there with Ctrl-C first.")
+    except NotPublished as error:
+        activity_log.show("The study cannot run yet:", *(f"  {problem}" for problem in error.problems))
+    except server.NoPort as error:
+        activity_log.show(f"{error}.")
+    except OSError as error:
+        activity_log.show(f"The study cannot run with the data in {data}: {_reason(error)}.", _remedy(error))
+    else:
+        return
+    raise typer.Exit(1)
+
+
+def _run_study(
+    folder: Path,
+    port: int,
+    data: Path,
+    fresh: bool,
+    *,
+    activity_log: ActivityLog,
+    new_study: Callable[..., Study],
+    starter: int | None,
+) -> None:
+    """Run the study until a signal or the end of the process `starter` ends it.
+
+    Raises InUse, OSError, and the errors of `Study`.
+    """
+    root = data.resolve().parent / ROOT
+    state = root / data.resolve().name
+    root.mkdir(parents=True, exist_ok=True)
+    hold = files.Hold(root / f"{state.name}.lock")
+    if fresh:
+        _move_aside(data.resolve(), state, activity_log)
+    _allow_more_files()
+    with _signals() as ended, function_log(state / "logs", activity_log):
+        study = new_study(folder, data, state, port, activity_log)
+        hold.write(f"{study.server.url} (process {os.getpid()})")
+        try:
+            study.start()
+            _wait(ended, starter)
+        finally:
+            study.close()
+
+
+def _wait(ended: int, starter: int | None) -> None:
+    """Return once a byte can be read from `ended`, or the process `starter` has ended (looked at once a second)."""
+    process = None
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(starter) if starter is not None else None
+    while not select.select([ended], [], [], None if starter is None else STARTER_SECONDS)[0]:
+        if process is None or not process.is_running():
+            return
+
+
+_REMEDIES = {
+    errno.ENOSPC: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
+    errno.EDQUOT: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
+    errno.EMFILE: "Allow this process more open files (`ulimit -n 8192`), and try again.",
+    errno.ENFILE: "Close other programs, and try again.",
+}
+_ELSEWHERE = "Put the data where you may write with DATA=FOLDER, or change who may write there."
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error)).rstrip(".")
+
+
+def _remedy(error: OSError) -> str:
+    return _REMEDIES.get(error.errno or 0, _ELSEWHERE)
+
+
+def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
+    """End the study's servers, and move its data and state into the folder `earlier`, so that this run begins anew."""
+    end_everything(state)
+    place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for folder, name in ((data, "data"), (state, "state")):
+        if folder.exists():
+            place.mkdir(parents=True, exist_ok=True)
+            folder.rename(place / name)
+    if (place / "data").exists():
+        activity_log.show(f"Earlier data are in {from_here(place / 'data')} now.")
+
+
+def _allow_more_files() -> None:
+    """Raise this process's limit of open files: each server takes a few, and macOS allows 256 by default."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 8192 if hard == resource.RLIM_INFINITY else min(8192, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+@contextlib.contextmanager
+def _signals() -> Iterator[int]:
+    """A handle from which a byte can be read once a signal asks the process to end. The third signal ends it at once.
+
+    Python writes the byte as the signal arrives (`set_wakeup_fd`), in any thread. The handler runs later, in the main
+    thread: the signal does not wake that thread if another one got it, or if it was just about to read.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signals = []
+
+    def count(number: int, _frame: object) -> None:
+        signals.append(number)
+        if len(signals) > 2:  # the next start takes over the servers that still run
+            os._exit(1)
+
+    woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield reader
+    finally:
+        signal.set_wakeup_fd(woken)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        os.close(reader)
+        os.close(writer)
+
+
+if __name__ == "__main__":
+    typer.run(main)

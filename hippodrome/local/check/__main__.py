@@ -1,0 +1,87 @@
+"""`python -m hippodrome.local.check [FOLDER]`: find what would go wrong in the study of a project.
+
+With a mistake the exit status is 1. A remark is about something that works, but most likely not as it was meant.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
+from hippodrome.local.check import agent, agent_file
+from hippodrome.local.check.project import check_project
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+    seconds: Annotated[float, typer.Option(min=1, help="How long agent.py may take.")] = agent.SECONDS,
+    strict: Annotated[bool, typer.Option("--strict", help="Count remarks as mistakes.")] = False,
+) -> None:
+    """Name every mistake in config.yml and the step pages, and try agent.py."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
+    config, found = None, []
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        found += errors.diagnostics
+    found += check_project(folder, config)
+    label = agent_file.label_of(folder)
+    readable = not any(problem.file == label for problem in _mistakes(found))
+    playable = config is not None and bool(config.game_steps) and readable
+    if playable and config and config.project.may_run_on_aws:
+        lacking = [*agent_imports.missing(folder), *agent_imports.missing_for_players(folder, config)]
+        found += lacking if config.project.use_aws else [replace(problem, remark=True) for problem in lacking]
+    _print(found)
+    if playable and config:
+        sys.stdout.write(f"trying {label or config.trial.game} …\n")
+        sys.stdout.flush()
+        try:
+            tried = agent.try_agent(folder, config, seconds, _say, _say if sys.stdout.isatty() else lambda line: None)
+        except agent.InterruptedCall as interrupted:
+            _print([interrupted.problem])
+            raise typer.Exit(130) from None
+        _print(tried)
+        found += tried
+    sys.stdout.write(f"{_summary(found, config)}\n")
+    if strict and found and not _mistakes(found):
+        sys.stdout.write("With --strict, remarks count as mistakes.\n")
+    raise typer.Exit(1 if _mistakes(found) or (strict and found) else 0)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"  {line}\n")
+    sys.stdout.flush()
+
+
+def _print(found: Iterable[Diagnostic]) -> None:
+    for problem in found:
+        sys.stdout.write(f"{problem}\n")
+
+
+def _mistakes(found: Iterable[Diagnostic]) -> list[Diagnostic]:
+    return [problem for problem in found if not problem.remark]
+
+
+def _summary(found: list[Diagnostic], config: Config | None) -> str:
+    mistakes = len(_mistakes(found))
+    remarks = len(found) - mistakes
+    counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]
+    if config is None or mistakes:
+        return f"{' and '.join(counts)}."
+    return f"No mistakes{f', {counts[0]}' if counts else ''}: {config.summary()}"
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+if __name__ == "__main__":
+    typer.run(main)

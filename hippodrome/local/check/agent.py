@@ -1,0 +1,154 @@
+"""Tries the agent: starts it, and lets it play whole episodes, in each group.
+
+The agent is tried as a trial server would run it, in a process of its own (`agent_process.py`) with a server's
+environment variables. With `warmServers` it is tried as on a warm server (`hippodrome/trial/server/assignment.py`): the
+participant becomes known only before the first `reset`, and code that asks for the participant earlier gets a remark.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hippodrome.control.config import Config, Diagnostic, layout
+from hippodrome.control.config.step_files import StepFileError, open_folder
+from hippodrome.control.model.matching import MATCH
+from hippodrome.local.check import waiting
+from hippodrome.local.check.agent_report import AgentReport
+from hippodrome.local.check.earlier_answers import EarlierAnswers
+from hippodrome.local.inherited import inherited_environment
+from hippodrome.protocol import environment as variables
+from hippodrome.protocol.handover import Handover
+from hippodrome.trial.server import process_group
+from hippodrome.trial.settings import STEP_SECONDS
+
+SECONDS = 120.0  # seconds in which all calls of the agent must return, in each group
+CALL_SECONDS = STEP_SECONDS  # seconds in which a single call of step, reset or render must return
+PLAY_SECONDS = 20.0  # seconds of playing, in all groups together; the start is not counted
+
+_STACK_SECONDS = 10.0  # seconds more, in which the agent's process must have written down where it hangs
+_SESSION = f"s.{'0' * 20}"
+
+
+class InterruptedCall(KeyboardInterrupt):
+    """The user has interrupted the agent in a call, which `problem` names with its line."""
+
+    def __init__(self, problem: Diagnostic) -> None:
+        super().__init__()
+        self.problem = problem
+
+
+def try_agent(
+    folder: Path,
+    config: Config,
+    seconds: float = SECONDS,
+    say: Callable[[str], None] = lambda line: None,
+    say_long: Callable[[str], None] = lambda line: None,
+) -> list[Diagnostic]:
+    """Let the agent play in each group (Hippodrome's agent, if the project has none), and return its problems.
+
+    `say` gets a line for each group: how far the agent played. After a mistake in one group the others are not tried.
+    `say_long` gets a line for each call that takes long. Raises InterruptedCall for a KeyboardInterrupt in a call.
+    """
+    folder = folder.resolve()
+    found: list[Diagnostic] = []
+    for group in config.each_group:
+        with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
+            place = Path(temporary)
+            report, status = _try(folder, config, place, seconds, group, say_long=say_long)
+            found += [problem for problem in report.problems(status) if problem not in found]
+            if report.played:
+                say(report.how_far())
+        if any(not problem.remark for problem in found):
+            break
+    return found
+
+
+def _try(
+    folder: Path, config: Config, place: Path, seconds: float, group: int | None, *, say_long: Callable[[str], None]
+) -> tuple[AgentReport, int | None]:
+    """Let the agent play in one group. Return its report and the exit status of its process."""
+    environment = _environment(folder, config, place, seconds, group)
+    environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
+    code = layout.agent_folder(folder).resolve()
+    report_now = partial(AgentReport, folder, config, place, seconds, group)
+    try:
+        status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
+    except KeyboardInterrupt:
+        problem = report_now().interrupted()
+        if problem is None:
+            raise
+        raise InterruptedCall(problem) from None
+    return report_now(), status
+
+
+def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
+    """Environment variables as a trial server has them (`local/backend/task_process.py`, `trial/settings.py`)."""
+    several = config.project.has_sessions
+    if config.project.warm_servers or several:  # a session's members are not known when its server starts
+        owner = {
+            variables.WARM_SERVER: "on",
+            "GIVEN": Handover(_SESSION if several else "check", group, "check").to_json().decode(),
+        }
+    else:
+        owner = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
+    question = {"MATCH": json.dumps(_question(folder, config))} if config.project.matching == MATCH and several else {}
+    return {
+        **inherited_environment(),
+        **owner,
+        **question,
+        variables.PROJECT_ID: config.project.id,
+        variables.SERVER: "check",
+        variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
+        variables.TRIAL: json.dumps(config.registration()["trial"]),
+        variables.STORE: str(place),
+        variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
+        "SECONDS": str(seconds),
+        "CALL_SECONDS": str(CALL_SECONDS),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+
+
+def _question(folder: Path, config: Config) -> dict[str, Any]:
+    """What `match` is asked: made-up participants who have answered the pages before the game.
+
+    Their answers are random, but the last of them give the answers of the first.
+    """
+    try:
+        pages = EarlierAnswers.before_the_game(open_folder(folder).path, config)
+    except StepFileError:
+        pages = None
+    players, groups = config.project.players, config.groups
+    waiting = []
+    for number in range(3 * players):
+        group = number % groups if groups else None
+        found = pages.answers(group, number % (2 * players))[number // players % 2] if pages else {}
+        answers = {name: value for answered in found.values() for name, value in answered.items()}
+        waiting.append(
+            {"id": f"made-up-{number}", "waited": 5 * (3 * players - number), "group": group, "answers": answers}
+        )
+    return {"players": players, "waiting": waiting}
+
+
+def _run(
+    place: Path, environment: Mapping[str, str], folder: Path, seconds: float, long: Callable[[], None]
+) -> int | None:
+    """Run the agent's process; return its exit status, or None if it had to be killed."""
+    report = place / "report"
+    with (
+        (place / "output").open("wb") as output,
+        process_group.started(
+            [sys.executable, "-P", "-m", "hippodrome.local.check.agent_process", str(report)],
+            env=environment,
+            cwd=folder,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        ) as process,
+    ):
+        return waiting.wait(process, seconds, report, long)

@@ -1,0 +1,26 @@
+"""Checks a whole project without running it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hippodrome.control.config import Config, Diagnostic, agent_imports, remarks
+from hippodrome.local.check.agent_file import never_called, read_agent
+from hippodrome.local.check.pages import check_pages
+from hippodrome.local.check.sessions import check_sessions
+
+
+def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
+    """Return the problems of pages and agent.py, and remarks on the configuration. agent.py is not run.
+
+    `config` is None if the configuration cannot be read.
+    """
+    plays = config is None or bool(config.game_steps)
+    found = remarks.remarks_on(folder, config) if config else []
+    if config and plays and config.project.may_run_on_aws:
+        found += agent_imports.requirement_remarks(folder)
+    if config:
+        found += check_sessions(folder, config)
+    if config and plays:
+        found += [*never_called(folder, config), *agent_imports.hidden_files(folder)]
+    return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

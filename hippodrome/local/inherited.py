@@ -1,0 +1,18 @@
+"""The environment variables that servers and `make check` take over from this process."""
+
+from __future__ import annotations
+
+import os
+
+from hippodrome import places
+from hippodrome.protocol import environment
+
+_AWS = ("AWS_", "ECS_")  # a server needs no credentials, and knows nothing of a task on AWS
+# Names of a server's owner. They are common: a desktop may set SESSION, and a shell GROUP, for purposes of its own.
+_OWNER = (*environment.PARTICIPANT, environment.SESSION)
+
+
+def inherited_environment() -> dict[str, str]:
+    """Return this process's variables without AWS's and those of a server's owner, with Hippodrome in PYTHONPATH."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(_AWS) and name not in _OWNER}
+    return {**kept, "PYTHONPATH": os.pathsep.join([str(places.PACKAGES), *filter(None, [kept.get("PYTHONPATH")])])}

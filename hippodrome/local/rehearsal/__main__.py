@@ -1,0 +1,266 @@
+"""`python -m hippodrome.local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
+
+It runs the study with a data folder of its own, which stays in `data-try/` of the project, and lets bots walk through
+it. Then it checks that everything that they sent and played is in the data, and that no server is left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import shlex
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from random import Random
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from hippodrome.bots.addresses import THIS_MACHINE, AddressRefused
+from hippodrome.bots.bot import Bot
+from hippodrome.bots.crowd import SIGNALS, interruptible, walk
+from hippodrome.bots.links import with_project
+from hippodrome.bots.report import BotReport
+from hippodrome.control.config import Config, ConfigErrors, read_project
+from hippodrome.local.rehearsal.crashes import ServerLogs
+from hippodrome.local.rehearsal.logs import FunctionLog, verify
+from hippodrome.local.rehearsal.report import report
+from hippodrome.local.rehearsal.study_process import (
+    TRIED,
+    StudyNotStarted,
+    StudyProcess,
+    copy_of,
+    logs_of,
+    sessions_not_open,
+    sessions_of,
+    wait_until_gone,
+)
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """How many bots walk through the study, and how. `at_once` is how many walk at one time; times are in seconds."""
+
+    bots: int
+    _: KW_ONLY
+    play: float
+    at_once: int
+    patience: float
+    ramp: float
+
+
+async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
+    """Send the crowd through the study, and return the bots' reports. If this is cancelled, all bots end."""
+    run, width = secrets.token_hex(3), len(str(crowd.bots))
+    bots = [
+        Bot(link, f"bot-{run}-{number:0{width}}", Random(f"{run}{number}"), play=crowd.play, patience=crowd.patience)  # noqa: S311
+        for number in range(1, crowd.bots + 1)
+    ]
+    return await walk(bots, at_once=crowd.at_once, ramp=crowd.ramp, watch=watch)
+
+
+@contextlib.contextmanager
+def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]], None]]:
+    """A progress bar that shows how far the bots are."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[doing]}"),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("Bots", total=bots, doing="")
+
+        def watch(reports: Sequence[BotReport]) -> None:
+            stages = [re.sub(r"step \S+", "pages", bot.stage) for bot in reports]
+            over = sum(stage in ("finished", "ended", "failed") for stage in stages)
+            doing = [
+                f"{stages.count(stage)} {words}"
+                for stage, words in (
+                    ("answers pages", "answering"),
+                    ("waits for others", "in the lobby"),
+                    ("waits for its server", "waiting"),
+                    ("plays", "playing"),
+                    ("ended", "ended before the last page"),
+                    ("failed", "failed"),
+                )
+                if stage in stages
+            ]
+            progress.update(bar, completed=over, doing=", ".join(doing))
+
+        yield watch
+
+
+# The command line
+
+
+@contextlib.contextmanager
+def _running(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[StudyProcess]:
+    """Run the study, or a copy of it in which bots can end the game if `changed`. Nothing runs afterwards."""
+    with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
+        place = Path(temporary)
+        project = place / "project" if changed else folder
+        if changed and (changes := copy_of(folder, project)):
+            words = " and ".join(changes)
+            console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
+        study = StudyProcess(project, data, log=place / "local.log")
+        try:
+            study.start()
+            yield study
+        except KeyboardInterrupt:
+            console.print("Interrupted: the servers are being ended …")
+            study.interrupt()
+            raise
+        finally:
+            study.clear()
+
+
+def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
+    """Make the folder for the bots' data. Raises StudyNotStarted if it is for people's data or cannot be written."""
+    place = data or folder / TRIED / f"try-{time.strftime('%Y%m%d-%H%M%S')}"
+    users = place / project_id / "users"
+    people = [user.name for user in users.iterdir() if not user.name.startswith("bot-")] if users.is_dir() else []
+    if people or place.resolve() == (folder / "data").resolve():
+        reason = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
+        raise StudyNotStarted(
+            f"{place} {reason}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
+        )
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StudyNotStarted(
+            f"The bots' data cannot be stored in {place}: {error.strerror}. Name another folder with --data "
+            "(with make: DATA=)."
+        ) from None
+    return place
+
+
+def _how_to_read(folder: Path, data: Path) -> str:
+    """Where the data are, and the command that makes tables of them."""
+    project = "" if folder.resolve() == Path.cwd() else f" PROJECT={shlex.quote(str(folder))}"
+    return f"The bots' data are in {data}. This makes tables of them: make data{project} DATA={shlex.quote(str(data))}"
+
+
+def _keep_logs(study: StudyProcess, project: Path) -> Path:
+    """Copy the logs to a folder that stays; there they name the project and the copied logs, not temporary folders."""
+    place = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
+    shutil.copy(study.log, place)
+    servers = logs_of(study.data)
+    if servers.is_dir():
+        shutil.copytree(servers, place / "logs")
+    names = {str(servers): str(place / "logs"), str(study.folder): str(project.resolve())}
+    for log in place.rglob("*.log"):
+        text = log.read_text(encoding="utf-8", errors="replace")
+        for before, after in names.items():
+            text = text.replace(before, after)
+        log.write_text(text, encoding="utf-8")
+    return place
+
+
+def _rehearse_and_report(
+    folder: Path,
+    config: Config,
+    crowd: Crowd,
+    *,
+    link: str,
+    data: Path | None,
+    study: StudyProcess | None,
+    console: Console,
+    began: float,
+) -> bool:
+    """Send the crowd through the study at `link`, and print the report; return whether all is well.
+
+    `data` is None if the folder of its data is not known.
+    """
+    functions = FunctionLog(data) if data else None
+    servers = ServerLogs(data) if data else None
+    with _bar(console, crowd.bots) as watch:
+        reports = interruptible(rehearse(link, crowd, watch))
+    left = None
+    if data:
+        ids = {bot.user_id for bot in reports}
+        sessions = sessions_of(data, config.project.id, ids)
+        left = wait_until_gone(data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set()))
+    if study and left:
+        left.local_mode_killed = not study.interrupt()
+        left.processes = max(left.processes, study.clear())
+    found = verify(data, config.project.id, reports, recorded=config.trial.s3upload) if data else None
+    fine = report(
+        console,
+        reports,
+        found,
+        left,
+        time.monotonic() - began,
+        play=crowd.play,
+        recorded=config.trial.s3upload,
+        live=config.project.live or bool(study and crowd.play > 0),  # the copy for bots is live
+        warnings=functions.warnings() if functions else (),
+        crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
+    )
+    if not fine and study:
+        logs = _keep_logs(study, folder)
+        console.print(f"The logs of local mode and of the servers are in {logs}.", soft_wrap=True)
+    if study and data:
+        console.print(_how_to_read(folder, data), markup=False, soft_wrap=True)
+    return fine
+
+
+def main(
+    folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
+    *,
+    bots: Annotated[int, typer.Option(min=1, max=1000, help="How many simulated participants.")] = 20,
+    at_once: Annotated[int, typer.Option(min=1, help="How many of them walk at the same time.")] = 10,
+    play: Annotated[float, typer.Option(min=0, help="Seconds that each plays; 0: to the end of the game.")] = 8.0,
+    patience: Annotated[float, typer.Option(min=1, help="Seconds that a bot waits for any one thing.")] = 300.0,
+    ramp: Annotated[float, typer.Option(min=0, help="Seconds between the first arrivals.")] = 0.3,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="The folder for the bots' data; default: data-try/ of the project. With --url: that study's data."
+        ),
+    ] = None,
+    url: Annotated[
+        str | None, typer.Option(help="The link of a study that runs already, on this machine only.")
+    ] = None,
+) -> None:
+    """Send simulated participants through the whole study of FOLDER, and check that everything arrives."""
+    os.umask(0o077)  # like `make run`: only their owner may read these files
+    console = Console(highlight=False)
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)  # like Ctrl-C, after which nothing is left running
+    began = time.monotonic()
+    try:
+        config = read_project(folder)
+        link = with_project(THIS_MACHINE.page(url), config.project.id) if url else None
+        place = data if link else _data_of_bots(folder, config.project.id, data)
+        with _running(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
+            fine = _rehearse_and_report(
+                folder,
+                config,
+                Crowd(bots, play=play, at_once=max(at_once, config.project.players), patience=patience, ramp=ramp),
+                link=study.link if study else str(link),
+                data=place,
+                study=study,
+                console=console,
+                began=began,
+            )
+    except (ConfigErrors, AddressRefused, StudyNotStarted) as error:
+        console.print(str(error), markup=False, soft_wrap=True)
+        raise typer.Exit(1) from None
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    raise typer.Exit(0 if fine else 1)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,101 @@
+"""Rules between the keys of the section `trial`.
+
+A rule gets the section with its defaults, and the names of the keys that the file has. `trial_check.check` drops a
+problem if one of the values that it compares is wrong by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from hippodrome.protocol import values
+from hippodrome.protocol.players import GYM_PLAYER
+from hippodrome.protocol.similar import did_you_mean
+from hippodrome.protocol.trial import TrialSection
+from hippodrome.protocol.values import SectionProblem
+
+
+def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProblem]:
+    """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is at a key that the file has."""
+    rates = {
+        "minFrameRate": trial.min_frame_rate,
+        "startingFrameRate": trial.starting_frame_rate,
+        "maxFrameRate": trial.max_frame_rate,
+    }
+    low, start, high = rates
+    pairs = [(low, high)] if rates[low] > rates[high] else [(low, start), (start, high)]
+    for lower, upper in pairs:
+        if rates[lower] <= rates[upper]:
+            continue
+        key = next(key for key in (start, low, high) if key in (lower, upper) and key in given)
+        other, bound = (upper, "most") if key == lower else (lower, "least")
+        default = "" if other in given else " by default"
+        hint = f"; set {other} too" if default else ""
+        sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
+        yield SectionProblem((key,), sentence, (lower, upper))
+
+
+def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`keys` and `labels` name only actions of `actionSpace`, if the file has it."""
+    names = [action.lower() for action in trial.action_space]
+    if not names:
+        return
+    named = [("keys", (*place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
+    named += [("labels", (action,), action) for action in trial.labels]
+    for section, path, action in named:
+        if action in names:
+            continue
+        hint = did_you_mean(action, names) or f"; the actions are {values.printable(', '.join(names), 100)}"
+        sentence = f"there is no action {values.show(action)} in actionSpace{hint}"
+        yield SectionProblem((section, *path), sentence, ("actionSpace", section))
+
+
+def _players_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`keys` by player and `playerNames` name only players of `players`, if the file has it."""
+    known = trial.named_players()
+    named = [("keys", player) for player, keys in trial.keys.items() if isinstance(keys, dict)]
+    named += [("playerNames", player) for player in trial.player_names]
+    for section, player in named:
+        if known and player not in known:
+            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
+            yield SectionProblem((section, player), sentence, ("players", section))
+
+
+def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`actionSpace` has no name twice."""
+    first: dict[str, int] = {}
+    for index, action in enumerate(trial.action_space):
+        name = action.lower()  # as the trial server writes names
+        if first.setdefault(name, index) != index:
+            sentence = f"{values.show(action)} is item {first[name] + 1} already; names must differ"
+            yield SectionProblem(("actionSpace", index), sentence, ("actionSpace",))
+
+
+def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """A program plays only with `gym: advise`."""
+    if trial.gym == "advise":
+        return
+    for _, players in trial.player_maps():
+        for name, plays in players.items():
+            if plays.startswith(GYM_PLAYER):
+                yield SectionProblem(
+                    ("players",), f"{values.printable(name)} is {plays}: write gym: advise too", ("gym",)
+                )
+                return
+
+
+def _substitute(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+    """`afterAbsent: policy` needs `substitute`."""
+    if trial.after_absent == "policy" and trial.substitute is None:
+        sentence = "missing; afterAbsent: policy needs a policy that takes the place, such as substitute: random"
+        yield SectionProblem(("substitute",), sentence, ("afterAbsent", "substitute"))
+
+
+RULES: tuple[Callable[[TrialSection, set[str]], Iterator[SectionProblem]], ...] = (
+    _frame_rates,
+    _different_actions,
+    _actions_that_exist,
+    _players_that_exist,
+    _programs,
+    _substitute,
+)

@@ -1,0 +1,87 @@
+"""The sections `ui` and `scene` in `trial` of config.yml: the page's controls, and how a game is drawn by objects."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from hippodrome.protocol import trial_keys as keyed
+from hippodrome.protocol import values
+
+
+def _control() -> Any:
+    return keyed.key(values.flag, False, "", {"type": "boolean"})
+
+
+@dataclass(frozen=True, slots=True)
+class Ui:
+    """The section `ui`: the controls that the game page shows. Controls that the section does not name are hidden."""
+
+    left: bool = _control()
+    right: bool = _control()
+    up: bool = _control()
+    down: bool = _control()
+    start: bool = _control()
+    stop: bool = _control()
+    pause: bool = _control()
+    reset: bool = _control()
+    train_offline: bool = _control()
+    train_online: bool = _control()
+    good: bool = _control()
+    bad: bool = _control()
+    fps_set: bool = _control()
+    fps_up: bool = _control()
+    fps_down: bool = _control()
+    own: tuple[str, ...] = ()
+    """The project's own controls: all other keys that are true. A press calls feedback(name) of the agent."""
+
+    def shown(self) -> tuple[str, ...]:
+        """Return the names of all controls that are shown, the project's own last."""
+        return tuple(name for name, shown in keyed.document(self).items() if shown)
+
+
+_COLOR = re.compile(r"#[0-9a-fA-F]{6}")
+_FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+
+
+def _color(value: object) -> str:
+    """Check a color of the form `#rrggbb`, and return it in small letters."""
+    found = values.as_text(value, 'a color such as "#ffffff", in quotes')
+    if not _COLOR.fullmatch(found):
+        raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
+    return found.lower()
+
+
+def _folder(value: object) -> str:
+    """Check the name of a folder in the project's folder."""
+    found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
+    if len(found) > 200 or not _FOLDER.fullmatch(found):
+        raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
+    return found
+
+
+def _pixels(default: int, meaning: str) -> Any:
+    return keyed.whole(1, 4096, default, meaning)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneSection:
+    """The section `scene`: the picture of a game that is drawn by objects (docs/objects.md)."""
+
+    width: int = _pixels(600, "Width of the picture, in its own pixels; the page makes the picture larger or smaller.")
+    height: int = _pixels(400, "Height of the picture, in its own pixels.")
+    background: str = keyed.key(
+        _color,
+        "#ffffff",
+        "Color behind all objects, as #rrggbb in quotes.",
+        {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
+    )
+    coordinates: str = keyed.choice(
+        ("relative", "pixels"),
+        "Whether x, y and points are fractions of the picture, from 0 to 1, or its pixels.",
+    )
+    pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
+    assets: str = keyed.key(
+        _folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"}
+    )

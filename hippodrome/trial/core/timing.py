@@ -1,0 +1,214 @@
+"""Decides what is due: a step, a reset, or the end of a turn, a break, a first picture or an episode. Pure.
+
+All times are seconds of one monotonic clock, which is passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import Enum, auto
+from typing import Any, NamedTuple
+
+from hippodrome.protocol.trial import TrialSection
+from hippodrome.trial.core.episode_time import EpisodeTime
+from hippodrome.trial.core.progress import TrialProgress
+
+
+class Due(Enum):
+    """What is due now."""
+
+    NOTHING = auto()
+    RESET = auto()
+    STEP = auto()
+
+
+class StateTimes(NamedTuple):
+    """The times that a client is sent with the trial's state, in seconds from now on. None: there is no such time."""
+
+    next_in: float | None = None
+    """The time until the break ends; infinite if the participant ends it."""
+    turn_ends_in: float | None = None
+    starts_in: float | None = None
+    """The time for which the first picture is still shown before the game goes on."""
+    time_left: float | None = None
+    """The time of play that is left in the episode."""
+    session: Mapping[str, Any] | None = None
+    """In a session, the fields about its members."""
+
+
+class Pacer:
+    """Says when each frame is due. Frames whose time was missed are skipped."""
+
+    def __init__(self) -> None:
+        self._due: float | None = None
+
+    def rest(self) -> None:
+        """Let the next frame be due at once when the game goes on. Call it while the game is held."""
+        self._due = None
+
+    def next(self, now: float, rate: int) -> float:
+        """Return the time at which the next frame is due. `rate`: frames per second."""
+        interval = 1.0 / rate
+        if self._due is None:
+            self._due = now
+            return now
+        self._due += interval
+        missed = max(0, int((now - self._due) / interval))
+        self._due += missed * interval  # whole intervals: the next frames are due at the same regular times as before
+        return self._due
+
+
+class Timing:
+    """Keeps the times of one trial, and ends breaks, first pictures, turns and episodes whose time is over."""
+
+    def __init__(self, config: TrialSection) -> None:
+        self.seconds = 0.0
+        """The time that was played, in seconds."""
+        self.wake_at: float | None = None
+        """After `next` returned NOTHING: the time to call it again; None if only another event makes something due."""
+        self._between = config.between_seconds
+        self._max_steps = config.max_steps
+        self._episode = EpisodeTime(config.reset_freeze, config.episode_seconds)
+        self._pacer = Pacer()
+        self._due: float | None = None
+        self._last_step: float | None = None
+        self._break_began: float | None = None
+
+    # ---- what has happened
+
+    def begin_episode(self) -> None:
+        """Begin an episode, which shows its first picture."""
+        self._episode.begin()
+
+    def resume_episode(self, played: float) -> None:
+        """Continue an episode that was played for `played` seconds on an earlier server."""
+        self._episode.resume(played)
+
+    def skip(self) -> None:
+        """Let the next frame be due in the place of the step that was due and is not taken."""
+        self._due = None
+
+    def stepped(self, now: float, frame_rate: int) -> None:
+        """Count the time since the step before as played, after a step was taken."""
+        self.seconds += 1.0 / frame_rate if self._last_step is None else now - self._last_step
+        self._last_step = now
+
+    # ---- what is due
+
+    def next(self, progress: TrialProgress, now: float) -> Due | None:
+        """Return what is due now. If NOTHING is due, `wake_at` says when to ask again.
+
+        None: nothing for the caller to do, but the progress has changed, so ask again at once.
+        """
+        self.wake_at = None
+        playing = progress.playing
+        if not playing:
+            self._episode.rest(now)
+            left = self._break_left(progress, now)
+            if left is not None:
+                self._rest()
+                return self._break_over(progress, left, now)
+        else:
+            self._break_began = None
+        if progress.needs_reset:
+            return Due.RESET
+        if not playing:
+            self._rest()
+            if progress.turns is not None:
+                progress.turns.hold(now)
+            return Due.NOTHING
+        if self._frozen(progress, now):
+            return Due.NOTHING
+        return self._step_due(progress, now) if progress.turns is None else self._turn_over(progress, now)
+
+    def _rest(self) -> None:
+        """Forget when the next step is due, since none is taken now. When the game goes on, a step is due at once."""
+        self._pacer.rest()
+        self._due = self._last_step = None
+
+    def _break_left(self, progress: TrialProgress, now: float) -> float | None:
+        """Return the seconds until the break ends, infinite if the participant ends it; None outside a break.
+
+        The time of a break runs from the first call in it.
+        """
+        if not progress.on_break:
+            return None
+        if self._break_began is None:
+            self._break_began = now
+        return max(0.0, self._break_began + self._between - now)
+
+    def _break_over(self, progress: TrialProgress, left: float, now: float) -> Due | None:
+        if left > 0.0:
+            self.wake_at = now + left if left < math.inf else None
+            return Due.NOTHING
+        progress.go_on()
+        return None
+
+    def _frozen(self, progress: TrialProgress, now: float) -> bool:
+        """Return whether the first picture is still to be shown. If not, count the time from now on as played."""
+        left = self._episode.starts_in(now)
+        if left > 0.0:
+            self._rest()
+            if progress.turns is not None:
+                progress.turns.hold(now)
+            self.wake_at = now + left
+            return True
+        if progress.frozen:
+            progress.thaw()
+        self._episode.run(now)
+        return False
+
+    def _step_due(self, progress: TrialProgress, now: float) -> Due:
+        """In real time: return STEP if the next frame is due, else NOTHING."""
+        if self._due is None:
+            self._due = self._pacer.next(now, progress.frame_rate)
+        if now < self._due:
+            self.wake_at = self._due
+            return Due.NOTHING
+        self._due = None
+        return Due.STEP
+
+    def _turn_over(self, progress: TrialProgress, now: float) -> Due | None:
+        """Turn by turn: return STEP once all have chosen and the last picture was shown for one frame's time."""
+        turns, choices = progress.turns, progress.choices
+        assert turns is not None
+        turns.run(now)
+        choices.policies_choose(now)
+        ends_in = turns.ends_in(now) if choices.waits_for else None
+        if ends_in is not None and ends_in <= 0.0:
+            progress.turn_over()
+            return None
+        if turns.waiting:
+            left = self._episode.left(now)
+            if left is not None and left <= 0.0:
+                progress.time_over()
+                return None
+            ends = (choices.policies_until(), *(None if each is None else now + each for each in (left, ends_in)))
+            self.wake_at = min((each for each in ends if each is not None), default=None)
+            return Due.NOTHING
+        due = None if self._last_step is None else self._last_step + 1.0 / progress.frame_rate
+        if due is not None and now < due:
+            self.wake_at = due
+            return Due.NOTHING
+        return Due.STEP
+
+    def limit_of_step(self, progress: TrialProgress, now: float) -> str | None:
+        """Return the key of `trial` whose limit makes the step that is due the episode's last; None if none does."""
+        if self._max_steps and progress.steps + 1 >= self._max_steps:
+            return "maxSteps"
+        left = self._episode.left(now)
+        half_frame = 0.5 / progress.frame_rate  # the step less than half a frame before the limit is the nearest to it
+        return "episodeSeconds" if left is not None and left <= half_frame else None
+
+    # ---- what clients are told
+
+    def state_times(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
+        """Return the times that clients are sent with the state. `session`: the fields about a session's members."""
+        return StateTimes(
+            next_in=self._break_left(progress, now),
+            turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
+            starts_in=self._episode.starts_in(now) if progress.shows_first_picture else None,
+            time_left=None if progress.over or progress.on_break else self._episode.left(now),
+            session=session,
+        )

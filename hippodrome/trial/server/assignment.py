@@ -1,0 +1,123 @@
+"""Finds out who plays on a server that was started ahead: a warm server (`warmServers`), or the server of a session.
+
+A warm server reads its handover (`hippodrome/protocol/handover.py`), which names a participant or a session. The server
+of a session reads the members in the session's document (`hippodrome/protocol/session.py`). Until these documents
+exist, the server refuses all clients.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Awaitable, Callable, MutableMapping
+from dataclasses import replace
+
+from hippodrome.protocol import environment as variables
+from hippodrome.protocol import handover, session
+from hippodrome.protocol.handover import BadHandover, Handover
+from hippodrome.protocol.keys import handover_key, session_key
+from hippodrome.protocol.session import BadSession, SessionDocument, is_session_id
+from hippodrome.trial.recordings.store import Store, short_error
+from hippodrome.trial.settings import TrialSettings
+
+log = logging.getLogger("trial")
+
+AssignmentDocument = Handover | SessionDocument
+"""A document that says who plays on a server."""
+
+
+def with_handover(settings: TrialSettings, found: Handover) -> TrialSettings:
+    """Return the settings of a warm server with what its handover `found` says: who plays there, or which session."""
+    if is_session_id(found.user_id):
+        return replace(settings, warm_server=False, session=found.user_id, group=found.group, server=found.server)
+    return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
+
+
+def with_members(settings: TrialSettings, found: SessionDocument) -> TrialSettings:
+    """Return the settings of a session's server with the members of the document. Raises BadSession."""
+    if found.id != settings.session:
+        raise BadSession("its document is that of another session")
+    return replace(settings, players=found.players, members=found.members, group=found.group)
+
+
+def set_environment(environment: MutableMapping[str, str], found: AssignmentDocument | None) -> None:
+    """Set the environment variables that tell the researcher's code who plays; remove them if that is not `found` yet.
+
+    For a session they hold its id and group; no variable holds a participant's id.
+    """
+    for name in (*variables.PARTICIPANT, variables.SESSION):
+        environment.pop(name, None)
+    if isinstance(found, SessionDocument):
+        environment[variables.SESSION] = found.id
+        environment[variables.GROUP] = variables.group_text(found.group)
+    elif found is not None and not is_session_id(found.user_id):
+        environment[variables.USER_ID] = found.user_id
+        environment[variables.GROUP] = variables.group_text(found.group)
+
+
+class Search:
+    """Looks for the documents that say who plays: every `warm_server_seconds` (settings), and when `look` is called."""
+
+    def __init__(self, store: Store, settings: TrialSettings) -> None:
+        self._store = store
+        self._settings = settings
+        self._asked = asyncio.Event()
+        self._looked = asyncio.Event()
+        self._logged = ""
+
+    async def run(self, assign: Callable[[TrialSettings, AssignmentDocument], Awaitable[None]]) -> None:
+        """Look until it is known who plays. Call `assign` with each document and the settings that follow from it.
+
+        If a call of `look` leads to a document, it returns only after `assign` has taken the document.
+        """
+        while not self._settings.assigned:
+            looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next pass
+            self._asked.clear()
+            while not self._settings.assigned and (found := await self._find()) is not None:
+                self._settings, document = found
+                await assign(self._settings, document)
+            looked.set()
+            if self._settings.assigned:
+                self._looked.set()
+                return
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._settings.warm_server_seconds):
+                    await self._asked.wait()
+
+    async def look(self) -> None:
+        """Look once more now, and wait until that is done."""
+        looked = self._looked
+        self._asked.set()
+        await looked.wait()
+
+    async def _find(self) -> tuple[TrialSettings, AssignmentDocument] | None:
+        """Return the next document that is found, and the settings that follow from it; None if there is none yet."""
+        settings, found, problem = self._settings, None, ""
+        try:
+            body = await asyncio.to_thread(self._store.get, _key(settings))
+            found = None if body is None else _read(settings, body)
+        except (BadHandover, BadSession) as error:
+            problem = str(error)
+        except Exception as error:  # noqa: BLE001 - whatever the store raises, the next look may succeed
+            problem = short_error(error)
+        if problem and problem != self._logged:
+            log.warning("cannot see whose this server is (%s); trying again", problem)
+        self._logged = problem
+        return found
+
+
+def _key(settings: TrialSettings) -> str:
+    """Return the key of the document that a server with these settings still needs."""
+    if settings.warm_server:
+        return handover_key(settings.project_id, settings.server)
+    return session_key(settings.project_id, settings.session)
+
+
+def _read(settings: TrialSettings, body: bytes) -> tuple[TrialSettings, AssignmentDocument]:
+    """Parse the document, and return it with the settings that follow from it. Raises BadHandover and BadSession."""
+    if settings.warm_server:
+        assigned = handover.parse(body)
+        return with_handover(settings, assigned), assigned
+    formed = session.parse(body)
+    return with_members(settings, formed), formed

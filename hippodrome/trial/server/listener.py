@@ -1,0 +1,155 @@
+"""The WebSocket server: its port, its certificate, and its limits for connections that are not authenticated yet."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+from websockets.asyncio.server import Server as WebSocketServer
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.frames import Frame, Opcode
+from websockets.protocol import Event
+from websockets.typing import Subprotocol
+
+from hippodrome.trial.recordings.store import Store
+from hippodrome.trial.server.certificate import RELOAD_SECONDS, Certificate
+from hippodrome.trial.server.handshake import process_request, select_subprotocol
+from hippodrome.trial.settings import TrialSettings
+from hippodrome.trial.wire.connection import SUBPROTOCOL
+from hippodrome.trial.wire.inbound import RateLimit
+
+log = logging.getLogger("trial")
+
+MAX_MESSAGE = 4096
+"""The most bytes in a client's message."""
+PINGS_A_SECOND = 50
+"""The most pings and pongs that a client may send in a second. Browsers only answer the server's few pings."""
+MAX_UNAUTHENTICATED_WEBSOCKETS = 64
+"""The most WebSockets that have not authenticated. One more closes the oldest."""
+CLOSE_SECONDS = 2.0
+"""The time that a client has to answer a close."""
+
+
+class PortNotPermitted(Exception):
+    """The system does not let this process listen on the port."""
+
+
+class _Connection(ServerConnection):
+    """Cuts off a client that sends too many pings: to answer them would keep the server from the others' game."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._pings = RateLimit(PINGS_A_SECOND)
+
+    def data_received(self, data: bytes) -> None:
+        """Read received bytes in parts, so that of a flood only the first part is read."""
+        for start in range(0, len(data), MAX_MESSAGE):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + MAX_MESSAGE])
+
+    def process_event(self, event: Event) -> None:
+        """Count a ping or pong."""
+        pings = isinstance(event, Frame) and event.opcode in (Opcode.PING, Opcode.PONG)
+        if pings and self._pings.exceeded(self.loop.time()):
+            self.transport.abort()
+        super().process_event(event)
+
+
+class Listener:
+    """Accepts connections. `handle` is called for each one whose WebSocket handshake is done."""
+
+    def __init__(
+        self, settings: TrialSettings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]
+    ) -> None:
+        self._settings = settings
+        self._handle = handle
+        self._certificate = Certificate(settings, store) if settings.tls else None
+        self._server: WebSocketServer
+        self._unauthenticated: dict[ServerConnection, None] = {}
+
+    async def open(self) -> int:
+        """Begin to listen, and return the port.
+
+        Raises PortNotPermitted, OSError, and for the certificate SettingsError, ssl.SSLError and the store's errors.
+        """
+        settings, certificate = self._settings, self._certificate
+        if certificate is not None:
+            await asyncio.to_thread(certificate.load)
+        try:
+            self._server = await self._serve()
+        except PermissionError as error:
+            raise PortNotPermitted(f"port {settings.port} is for privileged processes") from error
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    async def _serve(self) -> WebSocketServer:
+        settings, certificate = self._settings, self._certificate
+        return await serve(
+            self._connected,
+            settings.host,
+            settings.port,
+            open_timeout=settings.hello_seconds,
+            ssl=certificate.context if certificate is not None else None,
+            ssl_handshake_timeout=settings.hello_seconds if certificate is not None else None,
+            subprotocols=[Subprotocol(SUBPROTOCOL)],
+            select_subprotocol=select_subprotocol,
+            process_request=partial(process_request, gym=settings.trial.gym),
+            create_connection=_Connection,
+            server_header=None,
+            compression=None,
+            max_size=MAX_MESSAGE,
+            write_limit=(1, 0),  # so that `send` returns only when the write buffer is empty
+            ping_interval=15,
+            ping_timeout=15,
+            close_timeout=CLOSE_SECONDS,
+            logger=_silent(),
+        )
+
+    def authenticated(self, websocket: ServerConnection) -> None:
+        """Take a connection that has authenticated out of the limit."""
+        self._unauthenticated.pop(websocket, None)
+
+    async def renew_certificate(self) -> None:
+        """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled. Without TLS, return at once."""
+        certificate = self._certificate
+        if certificate is None:
+            return
+        while True:
+            await asyncio.sleep(RELOAD_SECONDS)
+            try:
+                renewed = await asyncio.to_thread(certificate.fetch)
+                if renewed is not None:
+                    certificate.use(renewed)
+                    log.info("a renewed certificate is in use")
+            except Exception:
+                log.exception("the certificate cannot be renewed; the present one stays")
+
+    def close(self, reason: str) -> None:
+        """Accept no more connections, and close the open ones with code 1001."""
+        self._server.close(code=1001, reason=reason)
+
+    async def wait_closed(self) -> None:
+        """Wait until all connections are closed."""
+        await self._server.wait_closed()
+
+    async def _connected(self, websocket: ServerConnection) -> None:
+        self._unauthenticated[websocket] = None
+        if len(self._unauthenticated) > MAX_UNAUTHENTICATED_WEBSOCKETS:
+            oldest = next(iter(self._unauthenticated))
+            del self._unauthenticated[oldest]
+            oldest.transport.abort()
+        try:
+            await self._handle(websocket)
+        finally:
+            self._unauthenticated.pop(websocket, None)
+
+
+def _silent() -> logging.Logger:
+    """Return a logger that logs nothing: unauthenticated clients could write to the log by what they send."""
+    logger = logging.getLogger("trial.websockets")
+    logger.setLevel(logging.CRITICAL + 1)
+    return logger

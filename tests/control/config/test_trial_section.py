@@ -1,0 +1,218 @@
+"""The `trial` section is checked by one function, when a study is registered and when its servers start."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hippodrome.control.config import ConfigErrors, parse_registration, remarks
+from hippodrome.control.config.config import Config, StepFiles
+from hippodrome.control.config.consistency import check
+from hippodrome.protocol import trial, trial_check, trial_keys
+from hippodrome.protocol.values import Plain
+from hippodrome.trial.settings import SettingsError, trial_section
+
+STEPS = [{"key": "1", "page": "game"}, {"key": "2", "page": "bye"}]
+NUMBERS = st.sampled_from([-1, 0, 1, 2, 0.5, 30, 90, 240, 241, 600, 601, 10_000, 10_001, 10**6, 10**6 + 1, 10**9])
+NAMES = st.lists(st.sampled_from(["up", "Up", " up", "noop", "left", "a" * 64, "a" * 65, "İ" * 64, "ß", 3]), max_size=4)
+FLAGS = st.sampled_from([True, False, None, "", "yes", "off", "maybe", 1])
+ACTIONS = st.sampled_from(["up", "Up", 3, "", None, {"a": "up"}, {"Esc": "up"}, {"a": {}}])
+ODD = st.sampled_from(
+    [None, "", "x", " 3 ", "0.5", True, [], {}, ["up"], {"left": True}, float("nan"), float("inf"), 10**400]
+)
+PLAYERS = st.sampled_from(["player_0", "player_1", "a" * 65])
+WHO = st.dictionaries(
+    PLAYERS,
+    st.sampled_from(
+        ["human", "random", "idle", "agent:Partner", "agent:2", "policies/x.onnx", "../x.onnx", "gym://x", "gym://", 3]
+    ),
+    max_size=3,
+)
+KEYS: dict[str, st.SearchStrategy[Any]] = {
+    **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "frameRateStepSize", "callbackSeconds"), NUMBERS),
+    **dict.fromkeys(("maxSteps", "resetFreeze", "episodeSeconds"), NUMBERS),
+    "betweenEpisodes": NUMBERS | st.sampled_from(["pause", "pause.html", "../pause", "game"]),
+    "instructions": st.sampled_from(["rules", "rules.html", "a/b", "game", "é", 3]),
+    "keys": st.dictionaries(st.sampled_from(["a", "A", "Space", "a+b", "Left", "Tab", "p"]), NAMES.map(str) | ACTIONS),
+    "labels": st.dictionaries(st.sampled_from(["up", "Up", "left", ""]), st.sampled_from(["Go", "", 3, "x" * 65])),
+    **dict.fromkeys(("input", "policyActions"), st.sampled_from(["held", "single", "both"])),
+    **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
+    **dict.fromkeys(
+        (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS
+    ),
+    "actionSpace": NAMES,
+    "dataFile": st.sampled_from(["episode", "trial", "both"]),
+    "gym": st.sampled_from(["none", "watch", "advise", "play"]),
+    **dict.fromkeys(("frameSkip", "policySeconds", "seed", "turnSeconds"), NUMBERS),
+    "pace": st.sampled_from(["realtime", "turns", "fast"]),
+    **dict.fromkeys(("absent", "gather", "countdown", "maxPing", "pingSamples"), NUMBERS),
+    "afterAbsent": st.sampled_from(["end", "policy", "wait"]),
+    "substitute": st.sampled_from(["random", "human", "agent:Partner", "../x.onnx", "gym://x", 3]),
+    "playerNames": st.dictionaries(PLAYERS, st.sampled_from(["Red", "", 3, "x" * 65]), max_size=2),
+    "turnEnds": st.sampled_from(["idle", "random", "episode", "game"]),
+    "idleAction": st.sampled_from(["noop", "up", 3, "a" * 65]) | st.dictionaries(PLAYERS, st.just("up"), max_size=2),
+    "players": WHO | st.dictionaries(st.sampled_from(["0", "1", "x"]), WHO, max_size=2),
+    "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
+    "scene": st.fixed_dictionaries(
+        {},
+        optional={
+            "width": st.integers(0, 9),
+            "background": st.sampled_from(["#FFF", "#00FF00"]),
+            "coordinates": st.sampled_from(["relative", "pixels", "world"]),
+            "pixelArt": FLAGS,
+            "assets": st.sampled_from(["assets", "./images/", "../other"]),
+        },
+    ),
+    "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
+}
+SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: each | ODD for key, each in KEYS.items()})
+
+
+def registered(section: dict[str, Any]) -> dict[str, Any] | list[str]:
+    """Return the section that the study's servers get after registration, or the list of problems."""
+    try:
+        return dict(parse_registration({"id": "p", "steps": STEPS, "trial": section})["trial"])
+    except ConfigErrors as errors:
+        return [f"{problem.where}: {problem.message}" for problem in errors.diagnostics]
+
+
+def started(section: dict[str, Any]) -> trial.TrialSection | str:
+    """Return the settings that a server reads from it, or the first problem."""
+    try:
+        return trial_section(section)
+    except SettingsError as error:
+        return str(error)
+
+
+def test_these_tests_try_every_key() -> None:
+    assert set(KEYS) | {"game"} == trial_keys.names(trial.TrialSection) | {trial.RATE_CHANGE_MISSPELT}
+
+
+@given(SECTIONS)
+def test_registration_and_server_read_the_same_from_a_section(section: dict[str, Any]) -> None:
+    told, made = registered(section), started(section)
+    if isinstance(told, list):
+        assert made == told[0]
+    else:
+        assert started(told) == made
+        assert registered(told) == told
+
+
+@given(SECTIONS)
+def test_a_wrong_value_is_replaced_by_its_default(section: dict[str, Any]) -> None:
+    found, problems = trial_check.check(section)
+    wrong = {str(problem.path[0]) for problem in problems if not problem.compared}
+    defaults = trial.TrialSection().document()
+    document = found.document()
+    assert {key: document[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}} == {
+        key: defaults[key] for key in wrong - {trial.RATE_CHANGE_MISSPELT}
+    }
+
+
+def test_registration_and_server_refuse_a_rate_beyond_a_default() -> None:
+    expected = "trial.minFrameRate: must be at most startingFrameRate, which is 30 by default, not 50; set startingFrameRate too"
+    assert registered({"game": "x/Y-v0", "minFrameRate": 50}) == [expected]
+    assert started({"minFrameRate": 50}) == expected
+
+
+def test_registration_and_server_refuse_both_spellings_at_once() -> None:
+    section = {"game": "x/Y-v0", trial.RATE_CHANGE: True, trial.RATE_CHANGE_MISSPELT: False}
+    expected = "trial.allowFramRateChange: allowFrameRateChange is given too; keep that one"
+    assert registered(section) == [expected]
+    assert started(section) == expected
+
+
+def test_registration_and_server_read_an_action_that_is_a_number_as_a_name() -> None:
+    told = registered({"game": "x/Y-v0", "actionSpace": [0, "1"]})
+    assert isinstance(told, dict)
+    assert told["actionSpace"] == ["0", "1"]
+    made = started({"actionSpace": [0, "1"]})
+    assert isinstance(made, trial.TrialSection)
+    assert made.action_space == ("0", "1")
+
+
+def test_a_number_that_names_an_action_is_the_same_text_in_every_key() -> None:
+    one = Plain(1, "01")  # as YAML reads 01
+    found, problems = trial_check.check(
+        {"actionSpace": [Plain(0, "00"), one], "idleAction": one, "keys": {"a": one}, "labels": {"01": "Go"}}
+    )
+    assert not problems
+    assert (found.action_space[1], found.idle_action, found.keys, found.labels) == (
+        "01",
+        "01",
+        {"a": "01"},
+        {"01": "Go"},
+    )
+
+
+@pytest.mark.parametrize("section", ["x", [1], 3, True])
+def test_a_section_that_is_no_map_is_one_problem(section: object) -> None:
+    found, problems = trial_check.check(section)
+    assert found == trial.TrialSection()
+    assert [problem.path for problem in problems] == [()]
+
+
+def test_a_policy_time_of_zero_seconds_is_a_mistake() -> None:
+    (problem,) = trial_check.check({"policySeconds": 0})[1]
+    assert problem.path == ("policySeconds",)
+
+
+@pytest.mark.parametrize(("seconds", "fits"), [(-0.5, False), (0, True), (600, True), (600.5, False)])
+def test_a_break_has_0_to_600_seconds_both_included(seconds: float, fits: bool) -> None:
+    told, made = registered({"game": "x/Y-v0", "betweenEpisodes": seconds}), started({"betweenEpisodes": seconds})
+    assert isinstance(told, dict) == isinstance(made, trial.TrialSection) == fits
+    if fits:
+        assert (told["betweenEpisodes"], made.between_episodes) == (seconds, seconds)
+
+
+@pytest.mark.parametrize("value", [True, [], {}, float("nan"), None])
+def test_a_wrong_length_of_a_break_gets_a_message_and_an_empty_one_is_the_default(value: Any) -> None:
+    if value is None:
+        assert trial_section({"betweenEpisodes": value}).between_episodes == 3
+        return
+    with pytest.raises(
+        SettingsError,
+        match=r"trial.betweenEpisodes: must be a number from 0 to 600, not .*; or the name of a file in the steps folder",
+    ):
+        trial_section({"betweenEpisodes": value})
+
+
+# ---- the action that is taken while no key is pressed
+
+
+def idle_remark(*actions: str, **trial: Any) -> str | None:
+    tree = {
+        "project": {"id": "p", "steps": {"1": "hello", "2": "game", "finalStep": "bye"}},
+        "trial": {"game": "x/Y-v0", "actionSpace": list(actions), **trial},
+    }
+    checked = check(tree)
+    assert checked.mistakes == []
+    steps = [StepFiles(key, page) for key, page in checked.project.steps.items()]
+    found = remarks.without_a_key(Config.of(checked, steps))
+    return None if found is None else found.message
+
+
+def test_an_action_that_is_taken_while_no_key_is_pressed_is_named() -> None:
+    text = idle_remark("left", "right", startingFrameRate=50)
+    assert text is not None
+    assert text.startswith('while no key is pressed, the game takes "left", 50 times a second')
+    assert "name it as idleAction" in text
+
+
+def test_an_action_that_looks_idle_is_proposed_as_idle_action() -> None:
+    text = idle_remark("left", "right", "stay")
+    assert text is not None
+    assert "write idleAction: stay, and that is taken instead" in text
+
+
+@pytest.mark.parametrize("given", [{"idleAction": "left"}, {"pace": "turns"}])
+def test_a_study_that_sets_the_idle_behaviour_gets_no_remark(given: dict[str, Any]) -> None:
+    assert idle_remark("left", "right", **given) is None
+
+
+@pytest.mark.parametrize("actions", [(), ("noop", "left"), ("left", "NOOP"), ("nothing", "left")])
+def test_games_whose_first_action_is_idle_get_no_remark(actions: tuple[str, ...]) -> None:
+    assert idle_remark(*actions) is None

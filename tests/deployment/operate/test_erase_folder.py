@@ -1,0 +1,327 @@
+"""`deploy erase --from`: erasing a participant of a study on this machine, who played alone or with others."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import gzip
+import json
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from hippodrome.console.problem import Exit
+from hippodrome.control.limits.rules import ParticipantSlots
+from hippodrome.control.lobby import decisions
+from hippodrome.control.lobby.decisions import Decisions, Unmatched
+from hippodrome.control.model import ids, server
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import Server, ServerState
+from hippodrome.deployment.__main__ import main
+from hippodrome.deployment.operate import folder_eraser
+from hippodrome.deployment.operate.data_folder import DataFolder
+from hippodrome.deployment.operate.folder_eraser import FolderEraser
+from hippodrome.protocol.handover import Handover
+from hippodrome.protocol.keys import handover_key, session_key
+from hippodrome.protocol.session import parse
+from tests.deployment.installation import CommandResult
+from tests.export.data_world import crowd, into_folder
+from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study
+
+LABEL = ids.server_label("maze", ANN)
+
+
+class Machine:
+    """A study's folder with data of `make run`."""
+
+    def __init__(self, tmp: Path, capsys: Any) -> None:
+        self.data, self.tmp, self._capsys = tmp / "data", tmp, capsys
+        self.put = into_folder(self.data)
+
+    def erase(self, *more: str, user: str = ANN) -> CommandResult:
+        return self.run("--project", "maze", "--from", str(self.data), *more, user=user)
+
+    def run(self, *more: str, user: str = ANN) -> CommandResult:
+        self._capsys.readouterr()
+        code = main(["erase", user, *more])
+        printed = self._capsys.readouterr()
+        return CommandResult(code, printed.out, printed.err)
+
+    def contents(self) -> dict[str, bytes]:
+        """Return the contents of every file, with recordings unpacked."""
+        found = {}
+        for path in self.data.rglob("*"):
+            if path.is_file():
+                body = path.read_bytes()
+                found[path.relative_to(self.data).as_posix()] = gzip.decompress(body) if path.suffix == ".gz" else body
+        return found
+
+    def traces(self, user: str = ANN) -> list[str]:
+        told = [user, said(user), ids.server_label("maze", user)]
+        return [k for k, body in self.contents().items() if any(t in k or t.encode() in body for t in told)]
+
+
+@pytest.fixture
+def machine(tmp_path: Path, capsys: Any) -> Machine:
+    return Machine(tmp_path, capsys)
+
+
+def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(machine: Machine) -> None:
+    study(machine.put, machine.tmp)
+    machine.put(f"_servers/{LABEL}.json", b"{}")
+    machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
+    gone = Unmatched(LABEL, ANN, datetime.now(UTC))
+    machine.put(decisions.key("maze"), to_json(Decisions(1, unmatched=(gone,))))
+    machine.put("maze/slots/0.json", to_json(ParticipantSlots((LABEL, "sother"), 3)))
+    theirs = {key: body for key, body in machine.contents().items() if key.startswith(f"maze/users/{BOB}/")}
+    ran = machine.erase("--yes")
+    assert ran.code == Exit.DONE, ran.err
+    assert machine.traces() == []
+    after = machine.contents()
+    assert theirs.items() <= after.items()
+    assert said(BOB).encode() in after[recording_key()]
+    assert [each.user_id for each in parse(after[session_key("maze", SID)]).members] == ["", BOB]
+    assert from_json(after["maze/slots/0.json"], ParticipantSlots) == ParticipantSlots(("sother",), 3)
+    assert from_json(after[decisions.key("maze")], Decisions).unmatched == ()
+    assert not (machine.data / "maze/users" / ANN).exists()
+    again = machine.erase("--yes")
+    assert (again.code, "nothing of this participant" in again.err) == (Exit.DONE, True)
+    assert machine.contents() == after
+
+
+def test_after_all_members_are_erased_the_session_is_deleted(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    machine.put(".erase/.0123456789abcdef.new", b"of a run that was killed")
+    machine.put(f"_servers/{ids.server_label('maze', SID)}.json", b"{}")
+    assert machine.erase("--yes").code == machine.erase("--yes", user=BOB).code == Exit.DONE
+    assert machine.contents() == {}
+
+
+def test_a_participant_of_a_study_without_sessions_is_erased(machine: Machine) -> None:
+    user, other = crowd(machine.put, machine.tmp, 2)
+    kept = {key: body for key, body in machine.contents().items() if f"/{user}/" not in key}
+    assert machine.erase("--yes", user=user).code == Exit.DONE
+    assert machine.contents() == kept
+    assert [key for key in kept if other in key]
+
+
+def test_a_study_that_is_running_is_not_changed(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    lock = machine.tmp / ".hippodrome" / "data.lock"
+    lock.parent.mkdir()
+    with lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        ran = machine.erase("--yes")
+    assert ran.code == Exit.FAILED
+    assert "End `make run` with Ctrl-C" in ran.err
+    assert machine.contents() == before
+    assert machine.erase("--yes").code == Exit.DONE
+
+
+@pytest.mark.parametrize("left", ["a server that runs", "an unfinished recording"])
+def test_erase_first_finishes_what_a_killed_run_has_left(machine: Machine, left: str) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    state = machine.tmp / ".hippodrome" / "data"
+    put = into_folder(state)
+    if left == "a server that runs":
+        task = {"folder": f"maze/sessions/{SID}", "pid": os.getpid(), "stopped": None}
+        put("tasks/s-1.json", json.dumps(task).encode())
+    else:
+        put(f"spool/{recording_key()}.part", b"")
+    ran = machine.erase("--yes")
+    assert (ran.code, "Start `make run` once more" in ran.err) == (Exit.FAILED, True)
+    assert machine.contents() == before
+
+
+def test_documents_of_local_functions_that_name_the_participant_are_reported(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    into_folder(machine.tmp / ".hippodrome" / "data")("queue/1.json", json.dumps({"userId": ANN}).encode())
+    assert ".hippodrome/data/queue/1.json still names them" in machine.erase("--yes").err
+
+
+def test_the_state_of_the_participants_own_server_is_erased(machine: Machine) -> None:
+    put = into_folder(machine.tmp / ".hippodrome" / "data")
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    (machine.tmp / f".hippodrome/data/spool/maze/users/{ANN}/trials").mkdir(parents=True)
+    other = ids.server_label("maze", BOB)
+    for label, user in ((LABEL, ANN), (other, BOB)):
+        put(f"tasks/{label}-1.json", json.dumps({"folder": f"maze/users/{user}"}).encode())
+        put(f"logs/{label}-1.log", b"2026-11-28 INFO the agent is ready")
+    ran = machine.erase("--yes")
+    assert (ran.code, "still names them" in ran.err) == (Exit.DONE, False)
+    state = machine.tmp / ".hippodrome" / "data"
+    assert [path.name for path in sorted(state.rglob("*")) if path.is_file()] == [f"{other}-1.log", f"{other}-1.json"]
+    assert not list(state.rglob(ANN))
+
+
+def test_without_a_project_the_participant_is_erased_in_all_projects_of_the_folder(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands run in another study's folder, such as Hippodrome's."""
+    pair(machine.put, machine.tmp)
+    machine.put(f"trust/users/{ANN}/participant.json", b"{}")
+    machine.put(f"trust/users/{BOB}/participant.json", b"{}")
+    elsewhere = machine.tmp / "elsewhere"
+    into_folder(elsewhere)("config.yml", b"project: {id: another-study}")
+    monkeypatch.chdir(elsewhere)
+    dry = machine.run("--from", str(machine.data), "--dry-run")
+    assert (dry.code, "maze" in dry.out, "trust" in dry.out) == (Exit.CHANGES, True, True)
+    assert machine.run("--from", str(machine.data), "--yes").code == Exit.DONE
+    assert machine.traces() == []
+    assert f"trust/users/{BOB}/participant.json" in machine.contents()
+
+
+def test_an_erasure_in_one_project_says_where_else_the_participant_is(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    machine.put(f"trust/users/{ANN}/participant.json", b"{}")
+    ran = machine.erase("--yes")
+    assert (ran.code, "They are also in trust" in ran.err) == (Exit.DONE, True)
+    assert machine.traces() == [f"trust/users/{ANN}/participant.json"]
+
+
+@pytest.mark.parametrize("data", ["data", "."])
+def test_a_project_or_folder_that_is_not_there_is_no_erasure(machine: Machine, data: str) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    ran = machine.run("--from", str(machine.tmp / data), "--yes", *(["--project", "mase"] if data == "data" else []))
+    told = "holds nothing of a project mase" if data == "data" else "is not a data folder: it holds no project"
+    assert (ran.code, told in ran.err) == (Exit.FAILED, True)
+    assert ("It holds: maze" in ran.err) == (data == "data")
+    assert machine.contents() == before
+
+
+def test_data_that_fresh_has_moved_aside_are_erased_too(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    place = machine.tmp / ".hippodrome" / "earlier" / "data-20261121-144640"
+    into_folder(place / "data")(f"maze/users/{ANN}/answers/1.json", b"{}")
+    into_folder(place / "state")(f"spool/maze/users/{ANN}/trials/s-1/3-trial.jsonl.part", b"")
+    into_folder(place / "state")("queue/1.json", json.dumps({"userId": ANN}).encode())
+    ran = machine.run("--from", str(machine.data), "--yes")
+    assert (ran.code, machine.traces()) == (Exit.DONE, [])
+    assert [path.name for path in place.rglob("*") if path.is_file()] == ["1.json"]
+    assert "state/queue/1.json still names them" in ran.err
+
+
+def test_a_table_in_the_data_folder_that_names_the_participant_is_reported(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    machine.put("tables/answers.csv", f"participant,2.age\n{ANN},33\n".encode())
+    machine.put("tables/of-others.csv", f"participant,2.age\n{ANN}-2,33\n".encode())
+    ran = machine.erase("--yes")
+    assert "tables/answers.csv still names them" in ran.err
+    assert "of-others" not in ran.err
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ("", "1 file deleted"),
+        (", awsSetup: {cpu: 1, memory: 2}", "may be in two places: in data on this machine, and on AWS"),
+    ],
+    ids=["here", "here or on AWS"],
+)
+def test_without_from_the_data_are_those_of_this_machine_only_if_there_can_be_no_others(
+    machine: Machine, keys: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    into_folder(machine.tmp)("config.yml", f"project: {{id: maze{keys}}}".encode())
+    monkeypatch.chdir(machine.tmp)
+    ran = machine.run("--yes")
+    assert told in ran.err
+    assert (machine.traces() == [], ran.code == Exit.DONE) == (not keys, not keys)
+
+
+def test_a_receipt_is_not_promised_for_data_on_this_machine(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    assert "On this machine there is no receipt" in machine.erase("--yes", "--receipt", "r.json").err
+    assert machine.contents() == before
+
+
+class Interruption(BaseException):
+    """The process ends here."""
+
+
+@contextlib.contextmanager
+def interrupt_at(at: int, after: bool) -> Iterator[None]:
+    """End the process before or after the n-th change."""
+    count = [0]
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in ((os, "replace"), (Path, "unlink")):
+            whole = getattr(owner, name)
+
+            def change(*args: Any, whole: Any = whole, **how: Any) -> Any:
+                count[0] += 1
+                if count[0] == at and not after:
+                    raise Interruption
+                answer = whole(*args, **how)
+                if count[0] == at:
+                    raise Interruption
+                return answer
+
+            patch.setattr(owner, name, change)
+        yield
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+def test_a_run_after_an_interruption_at_any_change_finishes(tmp_path: Path, capsys: Any, after: bool) -> None:
+    for at in range(1, 60):
+        machine = Machine(tmp_path / str(at), capsys)
+        machine.tmp.mkdir()
+        study(machine.put, machine.tmp)
+        machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
+        try:
+            with interrupt_at(at, after):
+                FolderEraser(machine.data, "maze", ANN).run()
+            break
+        except Interruption:
+            FolderEraser(machine.data, "maze", ANN).run()
+        assert machine.traces() == [], at
+        assert said(BOB).encode() in machine.contents()[recording_key()]
+        assert [path for path in machine.data.rglob("*") if ".erase" in path.name or path.suffix == ".new"] == []
+    assert 8 < at < 59
+
+
+@pytest.mark.parametrize("owner", [ANN, SID])
+def test_the_record_that_names_a_warm_server_is_erased_last(machine: Machine, owner: str) -> None:
+    machine.put(session_key("maze", SID), session(ANN, "").to_json())
+    now, label = datetime.now(UTC), ids.server_label("maze", "~warm")
+    name = ids.server_name(label, 1)
+    record = Server("maze", owner, 1, ServerState.CLOSED, now, now, "c", warm_server_name=name)
+    machine.put(server.key(record.label), to_json(record))
+    machine.put(server.key(label), to_json(msgspec.structs.replace(record, user_id="~warm", assigned_to=record.label)))
+    machine.put(handover_key("maze", name), Handover(owner, None, name).to_json())
+    for at in range(1, 8):
+        with contextlib.suppress(Interruption), interrupt_at(at, after=True):
+            FolderEraser(machine.data, "maze", ANN).run()
+    assert machine.contents() == {}
+
+
+def test_a_dry_run_and_a_missing_yes_change_nothing(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    before = machine.contents()
+    dry = machine.erase("--dry-run", "--json")
+    assert (dry.code, dry.json["found"]) == (Exit.CHANGES, 7)
+    assert machine.erase().code == Exit.DECLINED
+    assert machine.erase("--everywhere").code == Exit.FAILED
+    assert machine.contents() == before
+    assert main(["erase", ANN, "--project", "maze", "--from", str(machine.tmp / "none")]) == Exit.FAILED
+
+
+def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:
+    folder = DataFolder(tmp_path)
+    (tmp_path / "a.json").write_bytes(b"new")
+    assert not folder.replace("a.json", b"old", b"mine")
+    assert (tmp_path / "a.json").read_bytes() == b"new"
+
+
+def test_erase_and_make_run_agree_on_the_folder_of_the_lock() -> None:
+    from hippodrome.local.__main__ import ROOT
+
+    assert folder_eraser.STATE == ROOT
