@@ -222,7 +222,7 @@ class RunningInstallation(Installed):
         spool.mkdir()
         with (spool / "log").open("w") as log:
             return processes.start(
-                "trial",
+                "hippodrome.trial",
                 cwd=ROOT,
                 env={**env, "SPOOL": str(spool), "LINGER_SECONDS": "0.2"},
                 stdout=subprocess.PIPE,

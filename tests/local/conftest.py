@@ -121,7 +121,7 @@ class Local:
             cat = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file) if self.through_pipe else None
             output = cat.stdin if cat else file
             self.process = processes.start(
-                "local",
+                "hippodrome.local",
                 [str(self.folder), "--port", "0", *options],
                 cwd=self.place,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60"},

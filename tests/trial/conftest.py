@@ -116,7 +116,7 @@ class Running:
         inherited = {k: v for k, v in os.environ.items() if k not in settings and k not in ("SPOOL", "DEADLINE")}
         with self.log.open("ab") as log:
             self.process = processes.start(
-                "trial", cwd=folder, env={**inherited, **settings, **env}, stdout=subprocess.PIPE, stderr=log
+                "hippodrome.trial", cwd=folder, env={**inherited, **settings, **env}, stdout=subprocess.PIPE, stderr=log
             )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
