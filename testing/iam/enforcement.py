@@ -205,7 +205,7 @@ class IamEnforcement:
         with contextlib.ExitStack() as stack:
             for name in self._judge.functions:
                 if name != RENEW:  # needs a certificate authority; its calls are judged in test_enforcement.py
-                    module = importlib.import_module(f"lambdas.{name}")
+                    module = importlib.import_module(f"hippodrome.functions.{name}")
                     stack.enter_context(mock.patch.object(module, "handler", self._as_function(name, module.handler)))
             yield
 

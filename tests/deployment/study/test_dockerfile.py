@@ -75,12 +75,11 @@ def test_the_dockerfile_copies_first_what_changes_least(recipe: Recipe, folder: 
     assert sources == [
         "requirements/trial.txt",
         "requirements/project.txt",
-        "hippodrome/protocol/",
-        "hippodrome/trial/",
+        "hippodrome/",
         "project/",
     ]
     runs = [index for index, (word, _) in enumerate(recipe.steps) if word == "RUN"]
-    assert max(runs) < recipe.steps.index(("COPY", "hippodrome/protocol/ /hippodrome/protocol/"))
+    assert max(runs) < recipe.steps.index(("COPY", "hippodrome/ /hippodrome/hippodrome/"))
     make_bundle(folder).write_folder(tmp_path / "context")
     for source in sources:
         assert (tmp_path / "context" / source).exists()

@@ -95,7 +95,7 @@ def test_parts_of_hippodrome_are_missing_whatever_the_requirements(folder: Path)
     begin(folder, "import hippodrome.control.model.ids")
     (folder / "requirements.txt").write_text("no-such-package-anywhere==1\n")
     (line,) = found(folder)
-    assert line.startswith("agent.py:1: hippodrome is not in the servers' image")
+    assert line.startswith("agent.py:1: hippodrome.control.model.ids is not in the servers' image")
 
 
 def test_imports_during_play_are_reported_beside_requirements_that_are_not_installed_here(folder: Path) -> None:

@@ -208,7 +208,7 @@ def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int
 
 def test_other_processes_of_the_program_stay(tmp_path: Path) -> None:
     (tmp_path / "serve.py").write_text(
-        "import subprocess\nfrom trial import gym as gymie\nchild = subprocess.Popen(['sleep', '300'])\n"
+        "import subprocess\nfrom hippodrome.trial import gym as gymie\nchild = subprocess.Popen(['sleep', '300'])\n"
         "gymie.start('localhost', 0)\nassert child.poll() is None\nchild.kill()\nprint('it ran')\n"
     )
     with subprocess.Popen(
