@@ -1,6 +1,7 @@
 """Definitions that the control plane and trial servers share; both sides import this package.
 
-  trial.py, trial_sections.py, trial_keys.py    the keys of the section `trial` of config.yml
+  section_keys.py        how the keys of config.yml are declared and checked
+  trial.py, trial_sections.py    the keys of the section `trial` of config.yml
   trial_check.py, trial_rules.py, values.py, players.py, key_maps.py    the checks of this section
   environment.py         the environment variables that a server is started with
   handover.py            the document that tells a warm server its participant

@@ -9,15 +9,12 @@ from typing import Any
 
 from hippodrome.protocol import key_maps, values
 from hippodrome.protocol import players as player_checks
-from hippodrome.protocol import trial_keys as keyed
+from hippodrome.protocol import section_keys as keyed
+from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.trial_sections import SceneSection, Ui
 from hippodrome.protocol.values import KeyPath, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
-RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
-"""Words that clients send to the server, so none of the project's own controls can have these names."""
-MAX_OWN_CONTROLS = 32
-OWN_CONTROL = "A control of your own: a button with this name; a press calls feedback(name) of the agent."
 SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
 """Keys of games of several participants (`project.players`). A registration leaves out a key with its default value."""
 MAX_EPISODES = 1_000_000
@@ -50,7 +47,7 @@ def _rate(default: int, meaning: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class TrialSection:
+class TrialSection(Section):
     """The section `trial`: the game and its server."""
 
     action_buffer_lifespan: int = keyed.whole(
@@ -113,24 +110,18 @@ class TrialSection:
         "Whether a recording is written after each episode or once at the end of the trial.",
     )
     s3upload: bool = keyed.flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
-    action_space: tuple[str, ...] = keyed.key(
-        values.items("action", 1000),
-        (),
-        "Names of the actions, in the order of the environment's numbers.",
-        {"type": "array", "items": {"type": "string"}},
-        each=values.action_name,
+    action_space: tuple[str, ...] = keyed.items(
+        "action", 1000, values.action_name, (), "Names of the actions, in the order of the environment's numbers."
     )
     allow_frame_rate_change: bool = keyed.flag(False, "Whether participants may change the frame rate.")
     frame_rate_step_size: int = _rate(5, "Frames per second by which fpsUp and fpsDown change the rate.")
     min_frame_rate: int = _rate(1, "Lowest rate, in frames per second.")
     max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
     starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
-    ui: Ui = keyed.key(
-        values.section("bad: …"),
+    ui: Ui = keyed.section(
+        Ui,
         Ui(left=True, right=True, up=True, down=True, start=True, pause=True),
         "Controls on the game page. Default: left, right, up, down, start, pause.",
-        {"$ref": "#/$defs/Ui"},
-        section=Ui,
     )
     record_observations: bool = keyed.flag(False, "Whether recordings hold the full observations, which can be large.")
     lossless: bool = keyed.flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
@@ -143,12 +134,11 @@ class TrialSection:
         ("none", "watch", "advise"),
         "What programs with the server's token may do at its path /gym: nothing, watch each step, or also advise.",
     )
-    scene: SceneSection | None = keyed.key(
-        values.section("width: 600"),
+    scene: SceneSection | None = keyed.section(
+        SceneSection,
         None,
         "With this section the game is drawn by the objects that render() returns, without it by frames.",
-        {"$ref": "#/$defs/SceneSection"},
-        section=SceneSection,
+        "width: 600",
     )
     players: dict[str, Any] = keyed.key(
         player_checks.players,

@@ -9,18 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from hippodrome.protocol import trial_rules, values
-from hippodrome.protocol.trial import (
-    MAX_OWN_CONTROLS,
-    RATE_CHANGE,
-    RATE_CHANGE_MISSPELT,
-    RESERVED_CONTROLS,
-    TrialSection,
-)
-from hippodrome.protocol.trial_keys import keys, names
-from hippodrome.protocol.trial_sections import SceneSection, Ui
-from hippodrome.protocol.values import MAX_NAME, Check, KeyPath, SectionProblem, checked, is_blank
-
-_CONTROL = values.text("the name of a control", MAX_NAME)
+from hippodrome.protocol.section_keys import UNKNOWN_KEY, check_section
+from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
+from hippodrome.protocol.values import SectionProblem, checked, is_blank
 
 
 def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
@@ -35,11 +26,11 @@ def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
         _, problems = checked(values.section("actionBufferLifespan: …"), section, ())
         return TrialSection(), problems
     section, problems = _with_one_spelling(section)
-    found, wrong = _section(TrialSection, section, ())
-    trial, problems = TrialSection(**found), problems + wrong
-    given = {key.name for key in keys(TrialSection) if key.attribute in found}
+    trial, wrong = check_section(TrialSection, section)
+    problems += [problem for problem in wrong if problem.sentence != UNKNOWN_KEY]
     wrong_keys = {path[0] for path, _, _ in problems}
-    between_keys = [problem for rule in trial_rules.RULES for problem in rule(trial, given)]
+    trial = trial.without(wrong_keys)
+    between_keys = [problem for rule in trial_rules.RULES for problem in rule(trial)]
     return trial, problems + [problem for problem in between_keys if wrong_keys.isdisjoint(problem.compared)]
 
 
@@ -51,55 +42,3 @@ def _with_one_spelling(section: dict[str, Any]) -> tuple[dict[str, Any], list[Se
     if not is_blank(rest.get(RATE_CHANGE)):
         return rest, [SectionProblem((RATE_CHANGE_MISSPELT,), f"{RATE_CHANGE} is given too; keep that one")]
     return rest | {RATE_CHANGE: section[RATE_CHANGE_MISSPELT]}, []
-
-
-def _section(
-    model: type[TrialSection | Ui | SceneSection], section: dict[str, Any], path: KeyPath
-) -> tuple[dict[str, Any], list[SectionProblem]]:
-    """The valid values by attribute, and the problems."""
-    found: dict[str, Any] = {}
-    problems: list[SectionProblem] = []
-    for key in keys(model):
-        value, here = section.get(key.name), (*path, key.name)
-        if is_blank(value) or (key.section is Ui and value == {}):
-            continue
-        value, wrong = checked(key.check, value, here)
-        if key.each and not wrong:
-            value, wrong = _items(key.each, value, here)
-        elif key.entries and not wrong:
-            value, wrong = key.entries(value, here)
-        elif key.section and not wrong:
-            inner, wrong = _section(key.section, value, here)
-            value = key.section(**inner)
-        problems += wrong
-        if not wrong:
-            found[key.attribute] = value
-    if model is Ui:
-        found["own"], wrong = _own_controls(section, path)
-        problems += wrong
-    return found, problems
-
-
-def _own_controls(section: dict[str, Any], path: KeyPath) -> tuple[tuple[str, ...], list[SectionProblem]]:
-    """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
-    found: list[str] = []
-    problems: list[SectionProblem] = []
-    for name in [name for name in section if name not in names(Ui)]:
-        here = (*path, name)
-        shown, wrong = (False, []) if is_blank(section[name]) else checked(values.flag, section[name], here)
-        if shown and name in RESERVED_CONTROLS:
-            wrong = [SectionProblem(here, "the game's server knows this word already; give the control another name")]
-        elif shown:
-            _, wrong = checked(_CONTROL, name, here)
-        if shown and not wrong:
-            found.append(name)
-        problems += wrong
-    if len(found) > MAX_OWN_CONTROLS:
-        sentence = f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"
-        problems.insert(0, SectionProblem(path, sentence))
-    return tuple(found), problems
-
-
-def _items(check_item: Check, items: list[object], path: KeyPath) -> tuple[tuple[Any, ...], list[SectionProblem]]:
-    read = [checked(check_item, item, (*path, index)) for index, item in enumerate(items)]
-    return tuple(value for value, _ in read), [problem for _, wrong in read for problem in wrong]

@@ -1,7 +1,7 @@
 """Rules between the keys of the section `trial`.
 
-A rule gets the section with its defaults, and the names of the keys that the file has. `trial_check.check` drops a
-problem if one of the values that it compares is wrong by itself.
+A rule gets the section with its defaults. `trial_check.check` drops a problem if one of the values that it compares is
+wrong by itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hippodrome.protocol.trial import TrialSection
 from hippodrome.protocol.values import SectionProblem
 
 
-def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProblem]:
+def _frame_rates(trial: TrialSection) -> Iterator[SectionProblem]:
     """minFrameRate ≤ startingFrameRate ≤ maxFrameRate. The problem is at a key that the file has."""
     rates = {
         "minFrameRate": trial.min_frame_rate,
@@ -27,15 +27,15 @@ def _frame_rates(trial: TrialSection, given: set[str]) -> Iterator[SectionProble
     for lower, upper in pairs:
         if rates[lower] <= rates[upper]:
             continue
-        key = next(key for key in (start, low, high) if key in (lower, upper) and key in given)
+        key = next(key for key in (start, low, high) if key in (lower, upper) and trial.given(key))
         other, bound = (upper, "most") if key == lower else (lower, "least")
-        default = "" if other in given else " by default"
+        default = "" if trial.given(other) else " by default"
         hint = f"; set {other} too" if default else ""
         sentence = f"must be at {bound} {other}, which is {rates[other]}{default}, not {rates[key]}{hint}"
         yield SectionProblem((key,), sentence, (lower, upper))
 
 
-def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+def _actions_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
     """`keys` and `labels` name only actions of `actionSpace`, if the file has it."""
     names = [action.lower() for action in trial.action_space]
     if not names:
@@ -50,7 +50,7 @@ def _actions_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[Secti
         yield SectionProblem((section, *path), sentence, ("actionSpace", section))
 
 
-def _players_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+def _players_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
     """`keys` by player and `playerNames` name only players of `players`, if the file has it."""
     known = trial.named_players()
     named = [("keys", player) for player, keys in trial.keys.items() if isinstance(keys, dict)]
@@ -61,7 +61,7 @@ def _players_that_exist(trial: TrialSection, _given: set[str]) -> Iterator[Secti
             yield SectionProblem((section, player), sentence, ("players", section))
 
 
-def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+def _different_actions(trial: TrialSection) -> Iterator[SectionProblem]:
     """`actionSpace` has no name twice."""
     first: dict[str, int] = {}
     for index, action in enumerate(trial.action_space):
@@ -71,7 +71,7 @@ def _different_actions(trial: TrialSection, _given: set[str]) -> Iterator[Sectio
             yield SectionProblem(("actionSpace", index), sentence, ("actionSpace",))
 
 
-def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+def _programs(trial: TrialSection) -> Iterator[SectionProblem]:
     """A program plays only with `gym: advise`."""
     if trial.gym == "advise":
         return
@@ -84,14 +84,14 @@ def _programs(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]
                 return
 
 
-def _substitute(trial: TrialSection, _given: set[str]) -> Iterator[SectionProblem]:
+def _substitute(trial: TrialSection) -> Iterator[SectionProblem]:
     """`afterAbsent: policy` needs `substitute`."""
     if trial.after_absent == "policy" and trial.substitute is None:
         sentence = "missing; afterAbsent: policy needs a policy that takes the place, such as substitute: random"
         yield SectionProblem(("substitute",), sentence, ("afterAbsent", "substitute"))
 
 
-RULES: tuple[Callable[[TrialSection, set[str]], Iterator[SectionProblem]], ...] = (
+RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _frame_rates,
     _different_actions,
     _actions_that_exist,

@@ -6,8 +6,36 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from hippodrome.protocol import trial_keys as keyed
+from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol import values
+from hippodrome.protocol.section_keys import Section
+from hippodrome.protocol.values import MAX_NAME, KeyPath, SectionProblem, checked, is_blank
+
+RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
+"""Words that clients send to the server, so none of the project's own controls can have these names."""
+MAX_OWN_CONTROLS = 32
+
+_CONTROL = values.text("the name of a control", MAX_NAME)
+
+
+def _own_controls(others: dict[str, Any], path: KeyPath) -> tuple[tuple[str, ...], list[SectionProblem]]:
+    """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
+    found: list[str] = []
+    problems: list[SectionProblem] = []
+    for name, value in others.items():
+        here = (*path, name)
+        shown, wrong = (False, []) if is_blank(value) else checked(values.flag, value, here)
+        if shown and name in RESERVED_CONTROLS:
+            wrong = [SectionProblem(here, "the game's server knows this word already; give the control another name")]
+        elif shown:
+            _, wrong = checked(_CONTROL, name, here)
+        if shown and not wrong:
+            found.append(name)
+        problems += wrong
+    if len(found) > MAX_OWN_CONTROLS:
+        sentence = f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"
+        problems.insert(0, SectionProblem(path, sentence))
+    return tuple(found), problems
 
 
 def _control() -> Any:
@@ -15,7 +43,7 @@ def _control() -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Ui:
+class Ui(Section):
     """The section `ui`: the controls that the game page shows. Controls that the section does not name are hidden."""
 
     left: bool = _control()
@@ -33,7 +61,19 @@ class Ui:
     fps_set: bool = _control()
     fps_up: bool = _control()
     fps_down: bool = _control()
-    own: tuple[str, ...] = ()
+    own: tuple[str, ...] = keyed.others(
+        _own_controls,
+        {
+            "additionalProperties": {
+                "type": ["boolean", "null"],
+                "description": "A control of your own: a button with this name; a press calls feedback(name) of the "
+                "agent.",
+            },
+            "patternProperties": {  # and not `properties`, whose names editors propose
+                f"^({'|'.join(sorted(RESERVED_CONTROLS))})$|^.{{{MAX_NAME + 1},}}$": {"enum": [False, None]}
+            },
+        },
+    )
     """The project's own controls: all other keys that are true. A press calls feedback(name) of the agent."""
 
     def shown(self) -> tuple[str, ...]:
@@ -66,7 +106,7 @@ def _pixels(default: int, meaning: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneSection:
+class SceneSection(Section):
     """The section `scene`: the picture of a game that is drawn by objects (docs/objects.md)."""
 
     width: int = _pixels(600, "Width of the picture, in its own pixels; the page makes the picture larger or smaller.")
@@ -82,6 +122,4 @@ class SceneSection:
         "Whether x, y and points are fractions of the picture, from 0 to 1, or its pixels.",
     )
     pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
-    assets: str = keyed.key(
-        _folder, "assets", "The project's folder with the images that sprites show.", {"type": "string"}
-    )
+    assets: str = keyed.text("assets", "The project's folder with the images that sprites show.", _folder)

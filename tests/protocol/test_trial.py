@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from hippodrome.protocol.trial import MAX_OWN_CONTROLS, SESSION_KEYS, TrialSection
+from hippodrome.protocol.trial import SESSION_KEYS, TrialSection
 from hippodrome.protocol.trial_check import check
+from hippodrome.protocol.trial_sections import MAX_OWN_CONTROLS
 from hippodrome.protocol.values import path_text
 
 PLAYERS = {"red": "human", "blue": "policies/blue.onnx", "green": "human"}

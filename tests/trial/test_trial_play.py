@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.protocol.trial_keys import keys
+from hippodrome.protocol.section_keys import keys
 from hippodrome.protocol.trial_sections import Ui
 from hippodrome.trial.settings import STALLED_SECONDS
 from testing.waiting import until

@@ -14,6 +14,7 @@ from hippodrome.control.config.step_files import CLOSING
 from hippodrome.control.config.step_order import resolve_events, step_name
 from hippodrome.control.model.project import number_of_groups
 from hippodrome.control.model.step_types import StepType, type_of
+from hippodrome.protocol.section_keys import document
 from hippodrome.protocol.trial import TrialSection
 
 
@@ -65,11 +66,11 @@ class Config:
 
     def registration(self) -> dict[str, Any]:
         """Return the project's registration: JSON values by the keys of config.yml, with every default filled in."""
-        data = self.project.model_dump(mode="json", by_alias=True, exclude={"ssl"})
+        data = {key: value for key, value in document(self.project).items() if key != "ssl"}
         return data | {
             "name": self.project.name or self.project.id,
             "awsSetup": _sized(self.project.aws_setup),
-            "events": self.events.model_dump(by_alias=True),
+            "events": document(self.events),
             "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
             "texts": self.project.own_texts,
             "gamePages": {each.key: each.variants for each in self.game_pages},
@@ -115,7 +116,7 @@ class Config:
 
 def _sized(setup: AwsSetupKeys) -> dict[str, Any] | None:
     """The section if it has the servers' size, otherwise None."""
-    data = setup.model_dump(by_alias=True)
+    data = document(setup)
     if setup.cpu is None or setup.memory is None:
         return None
     return {key: int(v) if isinstance(v, float) and v.is_integer() else v for key, v in data.items()}

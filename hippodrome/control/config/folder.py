@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,7 +90,7 @@ def read_project(folder: Path) -> Config:
         raise ConfigErrors(in_order(mistakes))
     loaded = _loaded_from(source, steps)
     if loaded:
-        checked.project = checked.project.model_copy(update={"allowed_hosts": loaded})
+        checked.project = replace(checked.project, allowed_hosts=loaded)
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
     return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))

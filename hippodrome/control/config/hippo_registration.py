@@ -11,6 +11,7 @@ from hippodrome.control.config.project_keys import NAMES, STEPS, ProjectKeys
 from hippodrome.control.config.step_order import is_step_key
 from hippodrome.control.model import ids
 from hippodrome.control.model.step_order import ordered
+from hippodrome.protocol.section_keys import document
 from hippodrome.protocol.values import is_blank, number_in, path_text, printable, show
 
 _ONLY_HIPPO = ("ecsTask", "bucket", "team_members")
@@ -84,7 +85,7 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
     remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
-    defaults = ProjectKeys().model_dump(mode="json", by_alias=True)
+    defaults = document(ProjectKeys())
     kept = {key: earlier[key] for key in _UNKNOWN_TO_HIPPO if key not in project and key in earlier}
     kept = {key: value for key, value in kept.items() if value != defaults[key]}
     remarks += [f"project.{key}: {printable(json.dumps(value), _MAX_SHOWN)} {_STAYS}" for key, value in kept.items()]

@@ -9,23 +9,22 @@ of `trial`, because servers also check them.
 from __future__ import annotations
 
 import re
-from typing import Annotated
-
-from pydantic import Field
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 from hippodrome.control.config import fargate
-from hippodrome.control.config.key_types import Model, Rule, items, one_of, whole
 from hippodrome.control.model import ids, step_types
 from hippodrome.control.model.matching import MATCHED_BY, MATCHINGS, SEATS
 from hippodrome.control.model.step_order import FINAL
 from hippodrome.control.model.texts import ENGLISH
+from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol import values
+from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.session import MAX_PLAYERS
 from hippodrome.protocol.similar import did_you_mean
 from hippodrome.protocol.trial import TrialSection
-from hippodrome.protocol.trial_keys import names
-from hippodrome.protocol.trial_sections import SceneSection, Ui
-from hippodrome.protocol.values import KeyPath, Plain, as_text, number_in, show, step_file
+from hippodrome.protocol.values import KeyPath, Plain, SectionProblem, as_text, is_blank, number_in, show, step_file
 
 MAX_STEPS = 500
 MAX_HOSTS = 50
@@ -154,6 +153,12 @@ def page(value: object) -> str:
     return stem
 
 
+def steps_by_number(value: Mapping[str, object], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
+    """Check the map `steps`. Returns the page by the key of the step, and the problems. An empty finalStep is none."""
+    there = {key: name for key, name in value.items() if key != FINAL or not is_blank(name)}
+    return keyed.map_of(step_key, page)(there, path)
+
+
 def who_with_whom(value: object) -> str | dict[str, str]:
     """Check `matching`: one of `MATCHINGS`, or a map such as {same: language}, which names a field of an earlier page.
 
@@ -186,137 +191,204 @@ _OWN_TEXT = values.text('text, in quotes: "…"', MAX_TEXT)
 _MATCHING: dict[str, object] = {
     "anyOf": [
         {"enum": list(MATCHINGS)},
-        *({"type": "object", "properties": {how: {"type": "string"}}, "required": [how]} for how in MATCHED_BY),
+        *({"properties": {how: {"type": "string"}}, "required": [how], "type": "object"} for how in MATCHED_BY),
     ]
 }
-_Flag = Annotated[bool, Rule(values.flag, {"type": "boolean"})]
-_Text = Annotated[str, Rule(values.text())]
-_Region = Annotated[str, Rule(region)]
-_StepName = Annotated[str, Rule(step_name, {"anyOf": [{"type": "integer", "minimum": 1}, {"const": FINAL}]})]
 
 
-class AwsSetupKeys(Model):
+def _step(meaning: str) -> Any:
+    return keyed.key(step_name, None, meaning, {"anyOf": [{"minimum": 1, "type": "integer"}, {"const": FINAL}]})
+
+
+@dataclass(frozen=True, slots=True)
+class AwsSetupKeys(Section):
     """The project's place on AWS, and the size of its servers."""
 
-    bucket: _Text | None = None
-    """HIPPO's name of the S3 bucket. No effect: pages and data lie in the installation's."""
-    region: _Region | None = None
-    """AWS region, such as ca-central-1. Default: the installation's."""
-    root_domain: Annotated[str, Rule(domain)] | None = None
-    """Domain below which each server gets its name; without https://. Default: the installation's."""
-    cpu: Annotated[float, Rule(fargate.cpu, {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]})] | None = None
-    """vCPUs of each participant's server. Needed for AWS."""
-    memory: Annotated[float, Rule(fargate.memory, {"type": "number", "minimum": 0.5, "maximum": 120})] | None = None
-    """Memory of each participant's server in GB; must fit cpu. Needed for AWS."""
+    bucket: str | None = keyed.text(
+        None, "HIPPO's name of the S3 bucket. No effect: pages and data lie in the installation's."
+    )
+    region: str | None = keyed.text(None, "AWS region, such as ca-central-1. Default: the installation's.", region)
+    root_domain: str | None = keyed.text(
+        None,
+        "Domain below which each server gets its name; without https://. Default: the installation's.",
+        domain,
+    )
+    cpu: float | None = keyed.key(
+        fargate.cpu,
+        None,
+        "vCPUs of each participant's server. Needed for AWS.",
+        {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]},
+    )
+    memory: float | None = keyed.key(
+        fargate.memory,
+        None,
+        "Memory of each participant's server in GB; must fit cpu. Needed for AWS.",
+        {"type": "number", "minimum": 0.5, "maximum": 120},
+    )
 
 
-class EventsKeys(Model):
+@dataclass(frozen=True, slots=True)
+class EventsKeys(Section):
     """The steps at which a participant's server starts and stops."""
 
-    start_server_step: _StepName | None = None
-    """The server starts when the participant reaches this step. Default with a game step: 2, or 1 if it is step 1."""
-    stop_server_step: _StepName | None = None
-    """The server stops when the participant reaches this step. Default: the step after the last game step."""
+    start_server_step: str | None = _step(
+        "The server starts when the participant reaches this step. Default with a game step: 2, or 1 if it is step 1."
+    )
+    stop_server_step: str | None = _step(
+        "The server stops when the participant reaches this step. Default: the step after the last game step."
+    )
 
 
-class SslKeys(Model):
+@dataclass(frozen=True, slots=True)
+class SslKeys(Section):
     """HIPPO's section for the servers' certificate. It has no effect."""
 
-    ssl_bucket: _Text | None = None
-    """No effect."""
-    fullchain: _Text | None = None
-    """No effect."""
-    privkey: _Text | None = None
-    """No effect."""
+    ssl_bucket: str | None = keyed.text(None, "No effect.")
+    fullchain: str | None = keyed.text(None, "No effect.")
+    privkey: str | None = keyed.text(None, "No effect.")
 
 
-class ProjectKeys(Model):
+@dataclass(frozen=True, slots=True)
+class ProjectKeys(Section):
     """The study: its researchers, its steps, and its servers."""
 
-    id: Annotated[str, Rule(project_id, {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"})] = ""
-    """The project's id: letters, digits, dashes and underscores; unique in your organization."""
-    name: Annotated[str, Rule(values.text("a name"))] = ""
-    """The name of the study for people. Default: the id."""
-    researcher: _Text = ""
-    """The person who is responsible for the study."""
-    contact: _Text = ""
-    """How participants reach the researchers if something does not work, such as an e-mail address."""
-    team_members: Annotated[
-        tuple[_Text, ...], items("person", 200, single=True), Field(json_schema_extra={"type": ["array", "string"]})
-    ] = ()
-    """The other members of the team: one name or a list."""
-    live: _Flag = True
-    """Whether participants can take part now."""
-    max_runtime: Annotated[int, whole(1, 1440)] = 60
-    """Minutes after which a server is stopped, whatever happens."""
-    use_aws: _Flag = Field(default=False, alias="useAWS")
-    """Whether the study runs on AWS; false keeps it on one machine. Default: on AWS as soon as it is deployed."""
-    aws_setup: AwsSetupKeys = AwsSetupKeys()
-    """The size of the servers, and their place on AWS; needed for AWS."""
-    events: EventsKeys = EventsKeys()
-    """The steps at which the participant's server starts and stops."""
-    ssl: SslKeys = SslKeys()
-    """No effect: servers get the installation's certificate. HIPPO's configurations have this section."""
-    steps: dict[Annotated[str, Rule(step_key)], Annotated[str, Rule(page)]] = Field(
-        default={},
-        json_schema_extra={
+    id: str = keyed.key(
+        project_id,
+        "",
+        "The project's id: letters, digits, dashes and underscores; unique in your organization.",
+        {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"},
+        needed=True,
+    )
+    name: str = keyed.text("", "The name of the study for people. Default: the id.", values.text("a name"))
+    researcher: str = keyed.text("", "The person who is responsible for the study.")
+    contact: str = keyed.text(
+        "", "How participants reach the researchers if something does not work, such as an e-mail address."
+    )
+    team_members: tuple[str, ...] = keyed.items(
+        "person", 200, values.text(), (), "The other members of the team: one name or a list.", single=True
+    )
+    live: bool = keyed.flag(True, "Whether participants can take part now.")
+    max_runtime: int = keyed.whole(1, 1440, 60, "Minutes after which a server is stopped, whatever happens.")
+    use_aws: bool = keyed.flag(
+        False,
+        "Whether the study runs on AWS; false keeps it on one machine. Default: on AWS as soon as it is deployed.",
+        name="useAWS",
+    )
+    aws_setup: AwsSetupKeys = keyed.section(
+        AwsSetupKeys, AwsSetupKeys(), "The size of the servers, and their place on AWS; needed for AWS."
+    )
+    events: EventsKeys = keyed.section(
+        EventsKeys, EventsKeys(), "The steps at which the participant's server starts and stops."
+    )
+    ssl: SslKeys = keyed.section(
+        SslKeys,
+        SslKeys(),
+        "No effect: servers get the installation's certificate. HIPPO's configurations have this section.",
+    )
+    steps: dict[str, str] = keyed.key(
+        values.section("1: consent"),
+        {},
+        "The study's steps in order: 1, 2, 3 … and finalStep. Each is a file of the steps folder, or game.",
+        {
+            "additionalProperties": False,
             "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
             "properties": {FINAL: {"type": ["string", "null"]}},
-            "additionalProperties": False,
+            "type": "object",
         },
+        needed=True,
+        entries=steps_by_number,
     )
-    """The study's steps in order: 1, 2, 3 … and finalStep. Each is a file of the steps folder, or game."""
-    cluster: Annotated[str, one_of("installation", "participant")] = "installation"
-    """One ECS cluster for the installation, or one for each participant as in HIPPO."""
-    subdomain: Annotated[str, one_of("hash", "userId")] = "hash"
-    """The name of a server: a hash, which keeps ids private, or the userId as in HIPPO."""
-    plain_clients: _Flag = False
-    """Whether HIPPO's front end plays without a token. Anybody who knows an id can then play as that participant."""
-    front_end: Annotated[
-        tuple[Annotated[str, Rule(page_origin)], ...],
-        items("https:// address", 5, single=True),
-        Field(json_schema_extra={"type": ["array", "string"]}),
-    ] = ()
-    """Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients."""
-    allowed_hosts: Annotated[tuple[Annotated[str, Rule(origin)], ...], items("https:// address", MAX_HOSTS)] = ()
-    """https:// origins from which step pages may load images, media, frames and scripts."""
-    record_headers: Annotated[tuple[Annotated[str, Rule(header)], ...], items("name of a header", MAX_HEADERS)] = (
-        "user-agent",
-        "accept-language",
+    cluster: str = keyed.choice(
+        ("installation", "participant"),
+        "One ECS cluster for the installation, or one for each participant as in HIPPO.",
     )
-    """Headers of a participant's first request that are kept. user-agent names browser and device."""
-    max_participants: Annotated[int, whole(1, 100_000)] | None = None
-    """The largest number of participants. Later ones are told that the study is full. Default: no limit."""
-    max_servers: Annotated[int, whole(1, 10_000)] | None = None
-    """The largest number of servers that run at once. Default: no limit."""
-    max_server_hours: Annotated[int, whole(1, 1_000_000)] | None = None
-    """Hours that all servers together may run. Default: no limit."""
-    warm_servers: Annotated[int, whole(0, 100)] = 0
-    """Servers that are started ahead, so that participants need not wait. Each waiting server costs money."""
-    signed_links: _Flag = False
-    """Whether participants need a link that `deploy links` has signed."""
-    players: Annotated[int, whole(1, MAX_PLAYERS)] = 1
-    """The number of participants who play together in one environment. With 1 each plays alone, on their own server."""
-    matching: Annotated[str | dict[str, str], Rule(who_with_whom, _MATCHING)] = "arrival"
-    """Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py."""
-    seats: Annotated[str, one_of(*SEATS)] = "lot"
-    """Who plays which player: by lot, in the order of the groups, or in the order in which match returns them."""
-    patience: Annotated[float, Rule(values.number(10, 3600), {"type": "number", "minimum": 10, "maximum": 3600})] = 300
-    """Seconds for which a participant waits in the lobby for others."""
-    after_patience: Annotated[str, one_of("unmatched", "policies")] = "unmatched"
-    """What follows when patience is over: the next step, or a game with policies (trial.substitute) in empty places."""
-
-    texts: dict[Annotated[str, Rule(text_name)], Annotated[str, Rule(own_text)]] = Field(
-        default={},
-        json_schema_extra={
+    subdomain: str = keyed.choice(
+        ("hash", "userId"), "The name of a server: a hash, which keeps ids private, or the userId as in HIPPO."
+    )
+    plain_clients: bool = keyed.flag(
+        False,
+        "Whether HIPPO's front end plays without a token. Anybody who knows an id can then play as that participant.",
+    )
+    front_end: tuple[str, ...] = keyed.items(
+        "https:// address",
+        5,
+        page_origin,
+        (),
+        "Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients.",
+        single=True,
+    )
+    allowed_hosts: tuple[str, ...] = keyed.items(
+        "https:// address",
+        MAX_HOSTS,
+        origin,
+        (),
+        "https:// origins from which step pages may load images, media, frames and scripts.",
+    )
+    record_headers: tuple[str, ...] = keyed.items(
+        "name of a header",
+        MAX_HEADERS,
+        header,
+        ("user-agent", "accept-language"),
+        "Headers of a participant's first request that are kept. user-agent names browser and device.",
+    )
+    max_participants: int | None = keyed.whole(
+        1,
+        100_000,
+        None,
+        "The largest number of participants. Later ones are told that the study is full. Default: no limit.",
+    )
+    max_servers: int | None = keyed.whole(
+        1, 10_000, None, "The largest number of servers that run at once. Default: no limit."
+    )
+    max_server_hours: int | None = keyed.whole(
+        1, 1_000_000, None, "Hours that all servers together may run. Default: no limit."
+    )
+    warm_servers: int = keyed.whole(
+        0,
+        100,
+        0,
+        "Servers that are started ahead, so that participants need not wait. Each waiting server costs money.",
+    )
+    signed_links: bool = keyed.flag(False, "Whether participants need a link that `deploy links` has signed.")
+    players: int = keyed.whole(
+        1,
+        MAX_PLAYERS,
+        1,
+        "The number of participants who play together in one environment. With 1 each plays alone, on their own "
+        "server.",
+    )
+    matching: str | dict[str, str] = keyed.key(
+        who_with_whom,
+        "arrival",
+        "Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py.",
+        _MATCHING,
+    )
+    seats: str = keyed.choice(
+        tuple(SEATS),
+        "Who plays which player: by lot, in the order of the groups, or in the order in which match returns them.",
+    )
+    patience: float = keyed.seconds(
+        3600, 300, "Seconds for which a participant waits in the lobby for others.", least=10
+    )
+    after_patience: str = keyed.choice(
+        ("unmatched", "policies"),
+        "What follows when patience is over: the next step, or a game with policies (trial.substitute) in empty "
+        "places.",
+    )
+    texts: dict[str, str] = keyed.key(
+        values.section('start: "Los"'),
+        {},
+        "The study's own words for Hippodrome's texts (docs/texts.md). Default: English.",
+        {
+            "additionalProperties": False,
             "properties": {
                 name: {"type": ["string", "null"], "description": text, "maxLength": MAX_TEXT}
                 for name, text in ENGLISH.items()
             },
-            "additionalProperties": False,
+            "type": "object",
         },
+        entries=keyed.map_of(text_name, own_text),
     )
-    """The study's own words for Hippodrome's texts (docs/texts.md). Default: English."""
 
     @property
     def keeps_off_aws(self) -> bool:
@@ -339,26 +411,17 @@ class ProjectKeys(Model):
         return {name: text for name, text in self.texts.items() if text}
 
 
-class Root(Model):
-    project: ProjectKeys = ProjectKeys()
+@dataclass(frozen=True, slots=True)
+class ConfigFile(Section):
+    """config.yml: a study, its servers and its game."""
+
+    trial: TrialSection = keyed.section(TrialSection, TrialSection(), "")
+    project: ProjectKeys = keyed.section(ProjectKeys, ProjectKeys(), "", needed=True)
 
 
-SECTIONS: dict[KeyPath, type[Model]] = {
-    ("project",): ProjectKeys,
-    ("project", "awsSetup"): AwsSetupKeys,
-    ("project", "events"): EventsKeys,
-    ("project", "ssl"): SslKeys,
-}
-TRIAL_SECTIONS: dict[KeyPath, type[TrialSection | Ui | SceneSection]] = {
-    ("trial",): TrialSection,
-    ("trial", "ui"): Ui,
-    ("trial", "scene"): SceneSection,
-}
-NAMES: dict[KeyPath, frozenset[str]] = {
-    **{path: names(section) for path, section in TRIAL_SECTIONS.items()},
-    **{path: model.names() for path, model in SECTIONS.items()},
-    (): frozenset({"project", "trial"}),
-}
+SECTIONS = keyed.sections_in(ConfigFile)
+"""The sections of the file, by path."""
+NAMES = {path: keyed.names(section) for path, section in SECTIONS.items()}
 """The keys of each section, as they stand in the file."""
 STEPS: KeyPath = ("project", "steps")
 TEXTS: KeyPath = ("project", "texts")

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
-
-from pydantic import ValidationError
+from dataclasses import dataclass
+from typing import Any
 
 from hippodrome.control.config import project_keys, sessions
 from hippodrome.control.config.config import Config, StepFiles
 from hippodrome.control.config.consistency import check
 from hippodrome.control.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
-from hippodrome.control.config.each_value import message_of
-from hippodrome.control.config.key_types import Model, Rule, whole
 from hippodrome.control.config.project_keys import STEPS
 from hippodrome.control.model.project import STEPS_FOLDER, number_of_groups
 from hippodrome.control.model.step_order import FINAL, ordered, visited
 from hippodrome.control.model.step_types import type_of
 from hippodrome.control.ports import PORTS
+from hippodrome.protocol import section_keys as keyed
+from hippodrome.protocol import values
+from hippodrome.protocol.section_keys import Section, check_section
+from hippodrome.protocol.values import checked as checked_value
 from hippodrome.protocol.values import path_text
 
 MESSAGE = "message"  # stands in the place of a file name in the mistakes of a registration
@@ -28,10 +29,11 @@ _OURS = ("taskDefinition", "serverPort", "pageFolder", "gamePages")  # keys that
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
-class _Step(Model):
-    key: Annotated[str, Rule(project_keys.step_key)] = ""
-    page: Annotated[str, Rule(project_keys.page)] = ""
-    variants: Annotated[int, whole(0, LIMIT_VARIANTS)] = 0
+@dataclass(frozen=True, slots=True)
+class _Step(Section):
+    key: str = keyed.text("", "", project_keys.step_key)
+    page: str = keyed.text("", "", project_keys.page)
+    variants: int = keyed.whole(0, LIMIT_VARIANTS, 0, "")
 
 
 def parse_registration(data: object) -> dict[str, Any]:
@@ -97,12 +99,10 @@ def _steps_in(data: object) -> tuple[list[_Step], list[Mistake]]:
     mistakes: list[Mistake] = []
     for index, item in enumerate(data):
         path = (*STEPS, index)
-        try:
-            step = _Step.model_validate(item)
-        except ValidationError as error:
-            for detail in error.errors(include_url=False):
-                message = "unknown key" if detail["type"] == "extra_forbidden" else message_of(detail, path)
-                mistakes.append(Mistake((*path, *detail["loc"]), message))
+        fields, wrong = checked_value(values.section("key: value"), item, path)
+        step, wrong = check_section(_Step, fields, path) if not wrong else (_Step(), wrong)
+        if wrong:
+            mistakes += [Mistake(problem.path, problem.sentence) for problem in wrong]
             continue
         if not step.key or not step.page:
             mistakes.append(Mistake(path, "must have key and page"))

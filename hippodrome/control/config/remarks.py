@@ -11,7 +11,7 @@ from hippodrome.control.config.config import Config
 from hippodrome.control.config.diagnostics import Diagnostic, Remark
 from hippodrome.control.config.folder import ConfigSource, read_source
 from hippodrome.control.config.hippo import SSL_NO_EFFECT
-from hippodrome.control.config.project_keys import STEPS
+from hippodrome.control.config.project_keys import STEPS, SslKeys
 from hippodrome.protocol import keyboard
 from hippodrome.protocol.values import KeyPath, printable
 
@@ -131,7 +131,7 @@ def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[R
 def _names_a_certificate(config: Config) -> bool:
     """Whether a study that may run on AWS has the section `ssl`."""
     project = config.project
-    return not project.keeps_off_aws and any(value is not None for value in project.ssl.model_dump().values())
+    return not project.keeps_off_aws and project.ssl != SslKeys()
 
 
 def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:

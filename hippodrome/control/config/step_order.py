@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from hippodrome.control.config import project_keys
 from hippodrome.control.config.project_keys import EventsKeys
@@ -60,9 +61,8 @@ def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]
     if games:
         start = default_start(games) if start is None else start
         stop = default_stop(games) if stop is None else stop
-    return events.model_copy(
-        update={
-            "start_server_step": None if start is None else keys[start],
-            "stop_server_step": None if stop is None else keys[stop],
-        }
+    return replace(
+        events,
+        start_server_step=None if start is None else keys[start],
+        stop_server_step=None if stop is None else keys[stop],
     )

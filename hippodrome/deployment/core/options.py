@@ -22,7 +22,7 @@ def project_id(given: str | None) -> str | None:
     """Return the id in `--project`, or the id of the folder that it names. Raises `Problem` if that has none."""
     if given is None or not is_folder(given):
         return given
-    from hippodrome.deployment.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is named
+    from hippodrome.deployment.core.project_folder import id_in  # noqa: PLC0415 - the checks of config.yml, only where a folder is named
 
     found = id_in(Path(given))
     if found is None:

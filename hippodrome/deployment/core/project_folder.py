@@ -15,6 +15,7 @@ from hippodrome.control.config import Config, ConfigErrors, Diagnostic, layout, 
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.model.project import MIN_RUNTIME_MARGIN, Project
 from hippodrome.deployment.aws.account import Installation
+from hippodrome.protocol.section_keys import document
 from hippodrome.protocol.values import KeyPath
 
 
@@ -132,7 +133,7 @@ def _lacking_for_aws(config: Config) -> Iterator[tuple[KeyPath, str]]:
 def _contradictions(config: Config, installation: Installation) -> Iterator[tuple[KeyPath, str]]:
     """Yield the project's values that this installation does not allow."""
     project = config.project
-    given = project.aws_setup.model_dump(by_alias=True)
+    given = document(project.aws_setup)
     for key, here in _aws_setup_of(installation).items():
         if key != "bucket" and given[key] is not None and given[key] != here:
             yield (

@@ -33,7 +33,7 @@ def selected(given: str | None) -> StudySelection:
 
     Raises `Problem` if there is none, or if its id is not well formed.
     """
-    from hippodrome.deployment.core.project_folder import id_in  # noqa: PLC0415 - pydantic, only where a folder is read
+    from hippodrome.deployment.core.project_folder import id_in  # noqa: PLC0415 - the checks of config.yml, only where a folder is read
 
     folder: Path | None = Path(".")
     if given is not None and options.is_folder(given):
@@ -55,7 +55,7 @@ def local_data(study: StudySelection) -> Path | None:
     Where config.yml leaves that open (it has awsSetup and no useAWS), the data are here if the folder `data` exists.
     Raises `Problem` if it runs on this machine, and the folder does not exist.
     """
-    from hippodrome.deployment.core.project_folder import may_use_aws, uses_aws  # noqa: PLC0415 - pydantic, only where a folder is read
+    from hippodrome.deployment.core.project_folder import may_use_aws, uses_aws  # noqa: PLC0415 - the checks of config.yml, only where a folder is read
 
     if study.folder is None or uses_aws(study.folder):
         return None

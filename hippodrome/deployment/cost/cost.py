@@ -91,7 +91,7 @@ def command(
 
 def _read(folder: Path) -> Config:
     """Read the config.yml in a folder. Raises `Problem` with every mistake in it."""
-    from hippodrome.control.config import ConfigErrors, read_project  # noqa: PLC0415 - pydantic, only needed for this
+    from hippodrome.control.config import ConfigErrors, read_project  # noqa: PLC0415 - the checks of config.yml, only needed for this
 
     try:
         return read_project(folder)

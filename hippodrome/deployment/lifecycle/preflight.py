@@ -147,7 +147,7 @@ def _servers(checked: AccountCheck) -> Iterator[Finding]:
 
 def _builds(checked: AccountCheck) -> Iterator[Finding]:
     """Check whether the image of a study with a game can be built, by Docker here or by CodeBuild."""
-    from hippodrome.deployment.study.image import docker  # noqa: PLC0415 - pydantic, needed only before a first installation
+    from hippodrome.deployment.study.image import docker  # noqa: PLC0415 - the checks of config.yml, needed only before a first installation
 
     account, study = checked
     if (study and not study.plays) or docker.available():

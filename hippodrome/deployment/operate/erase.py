@@ -140,7 +140,7 @@ def _data_here(project: str | None) -> Path | None:
 
     Raises `Problem` if the participant may be in both places, since then neither may count as all of their data.
     """
-    from hippodrome.deployment.core.project_folder import may_use_aws  # noqa: PLC0415 - pydantic, only where a folder is read
+    from hippodrome.deployment.core.project_folder import may_use_aws  # noqa: PLC0415 - the checks of config.yml, only where a folder is read
     from hippodrome.deployment.core.study_selection import DATA, local_data, selected  # noqa: PLC0415 - the same
 
     study = selected(project)

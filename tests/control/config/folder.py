@@ -95,7 +95,6 @@ def mistakes(folder: Path, text: str | bytes) -> list[str]:
         read_project(folder)
     lines = str(caught.value).splitlines()
     assert lines == [str(problem) for problem in caught.value.diagnostics]
-    assert not any(word in line.lower() for line in lines for word in ("pydantic", "input should", "value error"))
     return lines
 
 

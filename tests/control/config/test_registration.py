@@ -28,7 +28,7 @@ from hippodrome.control.config import (
 from hippodrome.control.config.__main__ import main
 from hippodrome.control.model.project import Project
 from hippodrome.deployment.core.project_folder import may_use_aws
-from hippodrome.protocol import trial, trial_keys
+from hippodrome.protocol import section_keys, trial
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -197,7 +197,9 @@ def registrations(draw: st.DrawFn) -> dict[str, Any]:
             "minFrameRate": rates[0],
             "startingFrameRate": rates[1],
             "maxFrameRate": rates[2],
-            "ui": draw(st.dictionaries(st.sampled_from(sorted(trial_keys.names(trial.Ui))), st.booleans(), min_size=1)),
+            "ui": draw(
+                st.dictionaries(st.sampled_from(sorted(section_keys.names(trial.Ui))), st.booleans(), min_size=1)
+            ),
             "options": draw(
                 st.dictionaries(words, words | st.integers(-(2**53), 2**53) | st.lists(st.booleans()), max_size=4)
             ),
@@ -279,10 +281,10 @@ json_values = st.recursive(
 )
 known_keys = st.sampled_from(
     sorted(
-        project_keys.ProjectKeys.names()
+        section_keys.names(project_keys.ProjectKeys)
         | {"trial"}
-        | trial_keys.names(trial.TrialSection)
-        | project_keys.AwsSetupKeys.names()
+        | section_keys.names(trial.TrialSection)
+        | section_keys.names(project_keys.AwsSetupKeys)
         | {"1", "2", "finalStep"}
     )
 )
@@ -435,9 +437,7 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
 
 def test_the_reference_has_every_key() -> None:
     text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = (project_keys.ProjectKeys, project_keys.AwsSetupKeys, project_keys.EventsKeys, project_keys.SslKeys)
-    keys = frozenset().union(
-        *(section.names() for section in sections), trial_keys.names(trial.TrialSection), trial_keys.names(trial.Ui)
-    )
+    sections = {path: names for path, names in project_keys.NAMES.items() if path and path[-1] != "scene"}
+    keys = frozenset().union(*sections.values())
     missing = [key for key in keys if f"`{key}`" not in text]
     assert not missing

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hippodrome.control.config import ConfigErrors, parse_registration, remarks
 from hippodrome.control.config.config import Config, StepFiles
 from hippodrome.control.config.consistency import check
-from hippodrome.protocol import trial, trial_check, trial_keys
+from hippodrome.protocol import section_keys, trial, trial_check
 from hippodrome.protocol.values import Plain
 from hippodrome.trial.settings import SettingsError, trial_section
 
@@ -88,7 +88,7 @@ def started(section: dict[str, Any]) -> trial.TrialSection | str:
 
 
 def test_these_tests_try_every_key() -> None:
-    assert set(KEYS) | {"game"} == trial_keys.names(trial.TrialSection) | {trial.RATE_CHANGE_MISSPELT}
+    assert set(KEYS) | {"game"} == section_keys.names(trial.TrialSection) | {trial.RATE_CHANGE_MISSPELT}
 
 
 @given(SECTIONS)

@@ -200,7 +200,7 @@ def _wanted(context: CheckContext, given: str | None) -> Project | None:
     registered = participants.registered_projects(context.platform.documents, [])
     if not options.is_folder(given):
         return participants.choose(registered, given)[0]
-    from hippodrome.deployment.core import project_folder  # noqa: PLC0415 - pydantic and YAML
+    from hippodrome.deployment.core import project_folder  # noqa: PLC0415 - the checks of config.yml
 
     project_id = project_folder.read(Path(given)).id
     found = next((one for one in registered if one.id == project_id), None)
