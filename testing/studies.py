@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from hippodrome.control.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import MASTER_LIST, AwsSetup, Events, MasterList, Project, step_key
 from hippodrome.control.model.records import to_json
 from hippodrome.control.storage.secret import KEY, Secret
 from testing.fake_platform import FakePlatform

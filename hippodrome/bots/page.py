@@ -37,6 +37,12 @@ class VisitedPage:
         return html.unescape(found[1]) if found else ""
 
     @property
+    def end(self) -> str:
+        """The end before the last step that the page shows; "" if it shows none."""
+        found = re.search(r'<body[^>]*\bdata-end="([^"]*)"', self.text)
+        return html.unescape(found[1]) if found else ""
+
+    @property
     def is_last(self) -> bool:
         """Whether this is the study's last page."""
         return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None

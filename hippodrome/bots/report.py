@@ -40,6 +40,7 @@ class BotReport:
     stage: str = "waits for its turn"  # what the bot is doing now
     finished: bool = False  # the bot came to the study's last page
     ended: str = ""  # the step on whose page the bot ended, since no button there can be pressed
+    end: str = ""  # the end before the last step that the bot reached
     answers: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)  # by step: the fields that it has sent
     plays: list[PlayedStep] = field(default_factory=list)
     final_page: str = ""  # the HTML of the last page

@@ -132,11 +132,19 @@ def verify(
     return found
 
 
+def _without_marks(answers: Any) -> Any:
+    """The answers of a check without what the function adds when it has judged them."""
+    if not isinstance(answers, dict) or "passed" not in answers:
+        return answers
+    return {name: value for name, value in answers.items() if name not in ("passed", "tries")}
+
+
 def _look_at_answers(found: Verification, report: BotReport, folder: Path) -> None:
     """Compare the stored answers to pages with the answers that the bot has sent."""
     for step, sent in report.answers.items():
         found.answers_sent += 1
-        if _same(document(folder / "answers" / f"{step}.json").get("answers"), sent):
+        stored = document(folder / "answers" / f"{step}.json").get("answers")
+        if _same(stored, sent) or _same(_without_marks(stored), sent):
             found.answers += 1
         else:
             found.missing.append(f"{report.user_id}: the answers of step {step} are not what was sent")

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 from hippodrome.control.model.project import Project
 from hippodrome.export import scrub
+from hippodrome.export.design_columns import Design, assignment_in, is_answer
+from hippodrome.export.keys import ENDED
 from hippodrome.export.page_fields import FieldKind
 from hippodrome.export.recording_columns import as_number, as_whole, when
 from hippodrome.export.scrub import clean
@@ -78,16 +80,21 @@ class StudyAnswers:
         self._state = state
         self._project = project
         self._apart = apart
-        self._present_pages = {step.key: step.page for step in project.steps} if project else {}
+        self._runs = {step.key: step for step in project.all_runs} if project else {}
+        self._present_pages = {key: step.page for key, step in self._runs.items() if "{" not in step.page}
+        self.design = Design.of(project)
         self.scrubbed = 0
         self.finished = 0
         self.in_sessions = False
+        self.has_tries = False
         fields: dict[tuple[str, str], Field] = {}
         links: dict[str, int] = {}
         steps: set[str] = set()
         pages: dict[str, Counter[str]] = {}
-        versioned = {step.key for step in project.steps if step.variants} if project else set()
-        for participant, found in self._participants():
+        versioned = {key for key, step in self._runs.items() if step.variants}
+        for participant, documents in self.all_documents():
+            found = {step: document for step, document in documents.items() if is_answer(step)}
+            self.has_tries = self.has_tries or any("." in step for step in documents)
             self.in_sessions = self.in_sessions or bool(participant.membership)
             for step, answers in found.items():
                 steps.add(step)
@@ -122,6 +129,14 @@ class StudyAnswers:
 
     def _participants(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
         """The participants with the documents of their answers; with `apart`, without identities."""
+        for participant, documents in self.all_documents():
+            yield participant, {step: found for step, found in documents.items() if is_answer(step)}
+
+    def all_documents(self) -> Iterator[tuple[ExportedParticipant, dict[str, Mapping[str, Any]]]]:
+        """Yield the participants with the documents of their answers, tries, assignment and end, by step.
+
+        With `apart` they are without identities.
+        """
         for participant, found in self._state.answers():
             if not self._apart:
                 yield participant, found
@@ -145,13 +160,21 @@ class StudyAnswers:
 
     def _in_order(self, steps: set[str]) -> list[str]:
         """All steps in the study's order; steps that the study does not have any more come last."""
-        known = [step.key for step in self._project.steps] if self._project else []
+        known = list(self._runs)
         rest = sorted(steps - set(known), key=lambda step: (not step.isdigit(), step.zfill(64)))
         return [*known, *rest]
 
     def _finished(self, found: Mapping[str, Any]) -> bool | None:
         """Whether every step before the last has an answer; None if the study's steps are not known."""
-        return all(step.key in found for step in self._project.steps[:-1]) if self._project else None
+        if self._project is None:
+            return None
+        own = self._project.own(assignment_in(found))
+        return ENDED not in found and all(step.key in found for step in own.steps[:-1])
+
+    def label(self, step: str) -> str:
+        """Return the name of a step in columns: `trust.cec` for the run `trust-cec`."""
+        run = self._runs.get(step)
+        return ".".join((run.name, *run.levels.values())) if run and run.name else step
 
     @property
     def columns(self) -> list[Column]:
@@ -161,29 +184,32 @@ class StudyAnswers:
             Column("group", "whole"),
             Column("arrived", "time"),
             Column("finished", "truth"),
+            *self.design.columns,
             *(_MEMBERSHIP if self.in_sessions else ()),
             *([] if self._apart else [Column("completionCode")]),
             *([] if self._apart else [Column(clean(name)) for name in self.links]),
-            *(Column(f"{step}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
+            *(Column(f"{self.label(step)}.{clean(name)}", found.type) for (step, name), found in self.fields.items()),
             *(Column(f"page.{moved.step}") for moved in self.moved),
             *(Column(f"group.{step}", "whole") for step in self.versioned),
-            *(Column(f"answered.{step}", "time") for step in self._answerable),
+            *(Column(f"answered.{self.label(step)}", "time") for step in self._answerable),
             *([Column("other")] if self.crowded else []),
         )
 
     def rows(self) -> Iterator[list[Any]]:
         """Yield the rows of the wide table: one per participant."""
         self.scrubbed = self.finished = 0
-        for participant, found in self._participants():
+        for participant, documents in self.all_documents():
+            found = {step: document for step, document in documents.items() if is_answer(step)}
             fields = {step: _fields(answers) for step, answers in found.items()}
             link = scrub.columns(participant.document)
-            finished = self._finished(found)
+            finished = self._finished(documents)
             self.finished += bool(finished)
             row: list[Any] = [
                 participant.number,
                 as_whole(participant.document.get("group")),
                 when(participant.document.get("arrived")),
                 finished,
+                *self.design.values(documents, finished),
             ]
             row += _membership(participant) if self.in_sessions else ()
             if not self._apart:

@@ -14,6 +14,9 @@ from hippodrome.protocol.keys import NAME, SERVER_NAME, sessions_folder
 from hippodrome.protocol.session import is_session_id
 
 RESERVED = {"answered", "header", "link", "page"}  # the tables have own columns with these names before a dot
+ASSIGNED, ENDED = "_assignment", "_end"
+"""Stand for a participant's assignment and end among the documents of their answers. No step has such a name."""
+_TRY = re.compile(r"[1-9][0-9]{0,3}")
 _RECORDING = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64}?)-(?P<rest>(?:trial|episode-[0-9]{1,9})(?:-[0-9]{1,4})?)")
 _END = ".jsonl.gz"
 
@@ -27,6 +30,14 @@ class KeyKind(StrEnum):
     MEMBERSHIP = "membership"  # names a participant's session
     SESSION = "session"  # a session's document
     FOREIGN = "foreign"  # a file that Hippodrome does not write
+
+
+_OWN = {
+    "participant.json": (KeyKind.PARTICIPANT, ""),
+    "session.json": (KeyKind.MEMBERSHIP, ""),
+    "assignment.json": (KeyKind.ANSWER, ASSIGNED),
+    "end.json": (KeyKind.ANSWER, ENDED),
+}
 
 
 class Listed(NamedTuple):
@@ -75,13 +86,13 @@ def read(project: str, listed: Listed) -> Item:
     if listed.key.endswith((".part", ".new")):
         return foreign("it was still being written")
     match parts[1:]:
-        case [("participant.json" | "session.json") as name]:
-            return Item(KeyKind.PARTICIPANT if name == "participant.json" else KeyKind.MEMBERSHIP, listed, user)
+        case [name] if name in _OWN:
+            return Item(_OWN[name][0], listed, user, _OWN[name][1])
         case ["answers", name] if name.endswith(".json"):
-            step = name.removesuffix(".json")
-            if not NAME.fullmatch(step) or step in RESERVED:
+            step, dot, number = name.removesuffix(".json").partition(".")
+            if not NAME.fullmatch(step) or step in RESERVED or (dot and not _TRY.fullmatch(number)):
                 return foreign("no step can have that name")
-            return Item(KeyKind.ANSWER, listed, user, step)
+            return Item(KeyKind.ANSWER, listed, user, f"{step}{dot}{number}")
         case ["trials", server, name] if name.endswith(_END):
             return _recording(listed, user, server, name) or foreign("no recording has that name")
     return foreign("Hippodrome writes no such file")

@@ -22,7 +22,7 @@ import msgspec
 from hippodrome.console import screen
 from hippodrome.console.problem import Problem
 from hippodrome.control.model.project import MASTER_LIST, Project, read_list
-from hippodrome.export import fetch, keys, listing, manifest, table_files, tables
+from hippodrome.export import fetch, keys, listing, manifest, runs, table_files, tables
 from hippodrome.export.answers import StudyAnswers
 from hippodrome.export.fetch import Fetcher
 from hippodrome.export.listing import Tally, Wanted
@@ -211,6 +211,7 @@ def _run(
         columns = answers.columns
         written += table_files.write(folder / "answers", columns, answers.rows(), style)
         finished, scrubbed = answers.finished, answers.scrubbed
+        written += runs.write(folder, answers, project, style)
         if options.long:
             written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), style)
         if options.wanted.recordings:
@@ -288,7 +289,7 @@ def _sound_minari(folder: Path) -> bool:
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Remove the tables of an earlier run that this run did not write, and half-written tables."""
-    for name in ("answers", "answers-long", "episodes", "callbacks", "presence", "problems"):
+    for name in ("answers", "answers-long", "runs", "runs-*", "tries", "episodes", "callbacks", "presence", "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:
                 path.unlink()

@@ -294,10 +294,10 @@ def _without_ids(key: str, participant: ExportedParticipant | None, project: str
         return "(somewhere in users/)"
     parts = key.split("/")
     match parts[1:]:
-        case ["participant.json" | "session.json"]:
+        case ["participant.json" | "session.json" | "assignment.json" | "end.json"]:
             rest = parts[1]
         case ["answers", name] if (
-            re.fullmatch(r"[A-Za-z0-9_-]{1,64}\.json", name) and name != f"{participant.user}.json"
+            re.fullmatch(r"[A-Za-z0-9_-]{1,64}(\.[0-9]{1,4})?\.json", name) and name != f"{participant.user}.json"
         ):
             rest = f"answers/{name}"
         case ["trials", _, name] if _RECORDED.fullmatch(name):

@@ -37,6 +37,8 @@ MATCHING = "MATCHING"
 
 TRIAL = "TRIAL"
 """The `trial` section as JSON. Without it, the server reads ./config.yml."""
+ASSIGNMENT = "ASSIGNMENT"
+"""`on` if the participants' games differ: the server reads their assignment (`protocol/assignment.py`)."""
 CREDENTIAL = "CREDENTIAL"
 """A secret. The server sends it to the address in STORE."""
 DEADLINE = "DEADLINE"

@@ -67,6 +67,12 @@ class TrialSettings:
     """The number of seats for participants."""
     members: tuple[Member, ...] = ()
     """The session's members, from its document. Empty until the document was read, and if one participant plays."""
+    condition: Mapping[str, str] = field(default_factory=dict)
+    """The levels of the factors between people; empty before they are known."""
+    levels: Mapping[str, Any] = field(default_factory=dict)
+    """Of a trial: the levels of the factors within people, and the `position` of this run; empty outside of blocks."""
+    has_assignment: bool = False
+    """Whether an assignment says which games are played here (`protocol/assignment.py`)."""
     match: bool = False
     """The function `match` of agent.py decides who plays with whom, and this server calls it."""
     host: str = "0.0.0.0"  # noqa: S104 - the container's only purpose is to be reached
@@ -150,6 +156,7 @@ class TrialSettings:
             group=None if warm_server or session else _group(env.get(variables.GROUP, "").strip()),
             warm_server=warm_server,
             session=session,
+            has_assignment=_switch(env, variables.ASSIGNMENT, False),
             match=env.get(variables.MATCHING, "").strip() == "match",
             host=env.get(variables.HOST) or "0.0.0.0",  # noqa: S104
             port=int(port),

@@ -67,6 +67,14 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:GetObject steps": {NEXT},
     "s3:GetObject participant.json": {NEXT},
     "s3:PutObject participant.json": {NEXT},
+    # Studies with a design: the cells of a study, each participant's levels, and the end that they have reached. A
+    # function that starts a server again looks at the participant's own path.
+    "s3:GetObject assignment.json": {NEXT, START, TASK, SEND_START, SIGN},
+    "s3:PutObject assignment.json": {NEXT},
+    "s3:GetObject end.json": {NEXT},
+    "s3:PutObject end.json": {NEXT},
+    "s3:GetObject _cells": {NEXT},
+    "s3:PutObject _cells": {NEXT},
     # Servers have no role: sign_requests presigns the requests with which they read and create documents, and may do no
     # more.
     "s3:GetObject answers": {NEXT, SIGN},

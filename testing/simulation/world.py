@@ -11,8 +11,9 @@ import msgspec
 
 from hippodrome.control.limits.rules import SERVER_SLOTS
 from hippodrome.control.model import ids, server
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import KeepWarm, to_message
-from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Project, Step
+from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
 from hippodrome.control.model.warm_pool import POOLS

@@ -20,7 +20,8 @@ import pytest
 from websockets.sync.server import serve
 from websockets.typing import Subprotocol
 
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.participants import frame, pages
 from testing.processes import ROOT
 from testing.waiting import until

@@ -12,7 +12,8 @@ import pytest
 
 from hippodrome.control.http import Request
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Step, step_key
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, step_key
 from hippodrome.control.model.records import to_json
 from hippodrome.control.participants.journey import Journey
 from hippodrome.control.ports import Platform

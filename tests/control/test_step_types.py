@@ -10,7 +10,8 @@ from hippodrome.control import http
 from hippodrome.control.config import read_project
 from hippodrome.control.http import Response
 from hippodrome.control.model import step_types
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.step_types import PAGE, RESERVED, StepType
 from hippodrome.control.participants import steps
 from hippodrome.control.participants.forms import PostedForm
@@ -28,7 +29,7 @@ def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
     assert set(steps.HANDLERS) == {kind.name for kind in (PAGE, *RESERVED.values())}
     for name, handler in steps.HANDLERS.items():
         assert handler.__module__ == f"hippodrome.control.participants.steps.{name}"
-    shared = {"services", "sources", "visit", "shared_game"}
+    shared = {"services", "sources", "visit", "shared_game", "end"}
     assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, *shared, "__init__"}
 
 

@@ -57,7 +57,7 @@ def erase(world: Installed) -> None:
             | {"ListSchedules": 2, "ListObjectsV2": 2, "GetObject": 2, "DescribeStacks": 1, "GetCallerIdentity": 1}
             | {"StopTask": 1, "ChangeResourceRecordSets": 1, "DeleteSchedule": 1}
             # their documents, their sessions' documents, and their entries in the lobby
-            | {"ListObjectVersions": 20, "ListMultipartUploads": 3, "DeleteObjects": 1},
+            | {"ListObjectVersions": 23, "ListMultipartUploads": 3, "DeleteObjects": 1},
         ),
     ],
 )

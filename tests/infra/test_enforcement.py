@@ -323,11 +323,43 @@ def matched_by_a_function(world: MotoWorld) -> None:
     study.settle()
 
 
+DESIGN = {
+    "conditions": [{"name": "ghosts", "levels": {"slow": "slow", "fast": "fast"}}],
+    "ends": [{"name": "declined", "when": ['answers["1"].adult == "no"']}],
+}
+
+
+def designed(world: MotoWorld) -> None:
+    """A study with conditions and an end: assigned, played, lost, without capacity, declined."""
+    study = StudyOnMoto(world, **DESIGN)
+    alice, bob, carol = (Person(study, f"R_{name}") for name in ("alice", "bob", "carol"))
+    alice.to_the_game()
+    assert relay(send_start_server_message.handler, alice.user, alice.hidden) == 202
+    study.deliver()
+    served(world, alice.user, ("GET", "{folder}/assignment.json"))
+    study.lose(study.living()[0])
+    study.deliver()
+    bob.to_the_game()
+    full = {"tasks": [], "failures": [{"reason": "Capacity is unavailable at this time."}]}
+    world.answer("ecs:RunTask", full, times=2)
+    study.deliver("start")
+    study.deliver()
+    carol.look()
+    carol.answer(adult="no")
+    assert study.stored(f"{PROJECT}/users/R_carol/end.json")["end"] == "declined"
+    carol.look()
+    for person in (alice, bob):
+        person.play()
+        person.answer(fun="5")
+    study.settle()
+
+
 WALKS: dict[str, Callable[[MotoWorld], None]] = {
     "a study of pairs": together,
     "a study with a function that matches": matched_by_a_function,
     "a study with warm servers": waiting,
     "a study with limits": limited,
+    "a study with a design": designed,
     "everything, in the installation's cluster": lambda world: walk(world, "installation"),
     "everything, in a cluster for each participant": lambda world: walk(world, "participant"),
 }

@@ -10,7 +10,8 @@ from html.parser import HTMLParser
 from typing import Any
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from testing import studies
 from testing.fake_platform import FakePlatform
 

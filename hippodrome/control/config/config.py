@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from hippodrome.control.config.design import Design
 from hippodrome.control.config.diagnostics import Diagnostic
 from hippodrome.control.config.each_value import Checked
 from hippodrome.control.config.project_keys import AwsSetupKeys, EventsKeys, ProjectKeys
 from hippodrome.control.config.step_files import CLOSING
 from hippodrome.control.config.step_order import resolve_events, step_name
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.project import number_of_groups
 from hippodrome.control.model.step_types import StepType, type_of
 from hippodrome.protocol.section_keys import document
@@ -29,6 +33,8 @@ class StepFiles:
     page: str
     variants: int = 0
     files: tuple[Path, ...] = ()
+    step: Step | None = None
+    """What the study's design says of the step; None for a page that a game shows."""
 
     @property
     def type(self) -> StepType:
@@ -50,6 +56,7 @@ class Config:
     game_pages: tuple[StepFiles, ...] = ()
     """The pages that the game page shows; the key of each is the key of `trial` that names it."""
     remarks: tuple[Diagnostic, ...] = ()
+    design: Design = field(default_factory=Design)
 
     @classmethod
     def of(
@@ -60,18 +67,19 @@ class Config:
         remarks: Iterable[Diagnostic] = (),
     ) -> Config:
         """Return the project with these checked values, which have no mistakes."""
-        project = checked.project
-        events = resolve_events(project.events, [step.key for step in steps], project.steps)
-        return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks))
+        project, repeated = checked.project, {step.key for step in checked.design.steps if step.block is not None}
+        events = resolve_events(project.events, [step.key for step in steps], project.steps, repeated)
+        return cls(project, checked.trial, tuple(steps), events, tuple(game_pages), tuple(remarks), checked.design)
 
     def registration(self) -> dict[str, Any]:
         """Return the project's registration: JSON values by the keys of config.yml, with every default filled in."""
-        data = {key: value for key, value in document(self.project).items() if key != "ssl"}
+        data = {key: value for key, value in document(self.project).items() if key not in ("ssl", "conditions", "ends")}
         return data | {
             "name": self.project.name or self.project.id,
             "awsSetup": _sized(self.project.aws_setup),
             "events": document(self.events),
-            "steps": [{"key": step.key, "page": step.page, "variants": step.variants} for step in self.steps],
+            "steps": [_registered(step) for step in self.steps],
+            **_registered_design(self.design),
             "texts": self.project.own_texts,
             "gamePages": {each.key: each.variants for each in self.game_pages},
             "trial": self.trial.registered(),
@@ -112,6 +120,18 @@ class Config:
         if not self.project.live:
             parts.append("not live")
         return ", ".join(parts)
+
+
+def _registered(step: StepFiles) -> dict[str, Any]:
+    """A step as a registration stores it: what its design says, with its page and the number of its versions."""
+    known = msgspec.to_builtins(step.step) if step.step else {}
+    return {**known, "key": step.key, "page": step.page, "variants": step.variants}
+
+
+def _registered_design(design: Design) -> dict[str, Any]:
+    """The factors, blocks and ends of a study as a registration stores them; empty for a study without any."""
+    found = {name: msgspec.to_builtins(getattr(design, name)) for name in ("conditions", "blocks", "ends")}
+    return {name: value for name, value in found.items() if value}
 
 
 def _sized(setup: AwsSetupKeys) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from hippodrome.control.config import fargate, sessions, texts
@@ -19,18 +19,20 @@ from hippodrome.protocol.environment import PLAIN_ORIGINS
 from hippodrome.protocol.values import KeyPath
 
 
-def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
+def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = (), named: Mapping[str, str] | None = None) -> Checked:
     """Check each value of a file's sections by itself, and then the values against each other.
 
     Returns the valid values and all mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
+    `named` are the pages of steps with names, which a registration has checked already.
     """
-    checked = check_values(sections, invalid)
+    checked = check_values(sections, invalid, named)
     checks = (
         _missing,
         _aws,
         _step_numbers,
         _game_step,
         _event_steps,
+        _together,
         _hours,
         _warm,
         _plain_clients,
@@ -123,6 +125,8 @@ def _aws(checked: Checked) -> Iterator[Mistake]:
 def _keys_known(checked: Checked) -> bool:
     """Whether there are steps, and all their keys are valid."""
     invalid = [path[2:] for path in checked.invalid if path[:2] == STEPS]
+    if checked.design.is_named:
+        return bool(checked.step_keys) and not checked.design.mistakes
     return bool(checked.step_keys) and all(rest and rest[0] in checked.step_keys for rest in invalid)
 
 
@@ -153,7 +157,7 @@ def _json(value: object) -> str:
 
 def _step_numbers(checked: Checked) -> Iterator[Mistake]:
     """The numbers of steps have no gaps."""
-    if not _keys_known(checked):
+    if not _keys_known(checked) or checked.design.is_named:
         return
     numbers = [int(key) for key in checked.step_keys if key != FINAL]
     for before, number in itertools.pairwise([0, *(numbers or [2])]):  # with finalStep alone, step 1 is missing
@@ -167,8 +171,16 @@ def _game_step(checked: Checked) -> Iterator[Mistake]:
     """The last step is no game step."""
     last = checked.project.steps.get(checked.step_keys[-1]) if checked.step_keys else None
     if last and type_of(last).on_server:
-        path = (*STEPS, checked.step_keys[-1])
+        path = checked.design.paths.get(checked.step_keys[-1], (*STEPS, checked.step_keys[-1]))
         yield Mistake(path, "the game cannot be the last step; add a page after it, which stops the server")
+
+
+def _together(checked: Checked) -> Iterator[Mistake]:
+    """Games of several participants have no factors and no settings of their own yet: a session has one `trial`."""
+    design = checked.design
+    if checked.project.has_sessions and (design.conditions or design.blocks or any(design.own_trial.values())):
+        why = "a study with conditions, each, or games with settings of their own is for one player in each game"
+        yield Mistake(("project", "players"), f"must be 1: {why}")
 
 
 _START: KeyPath = ("project", "events", "startServerStep")

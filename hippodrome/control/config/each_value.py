@@ -6,15 +6,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from hippodrome.control.config import design
+from hippodrome.control.config.design import Design
 from hippodrome.control.config.diagnostics import Mistake
 from hippodrome.control.config.project_keys import NAMES, SECTIONS, STEPS, ConfigFile, ProjectKeys
 from hippodrome.control.config.step_order import is_step_key
 from hippodrome.control.config.unknown_keys import explain, meant_for
-from hippodrome.control.model.step_order import ordered
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.step_order import ordered, visited
 from hippodrome.control.model.step_types import type_of
 from hippodrome.protocol.section_keys import UNKNOWN_KEY, check_section, others_of
 from hippodrome.protocol.trial import RATE_CHANGE_MISSPELT, TrialSection
@@ -31,6 +34,7 @@ class Checked:
     project: ProjectKeys
     step_keys: list[str]
     has_project: bool
+    design: Design = field(default_factory=Design)
     trial: TrialSection = field(default_factory=TrialSection)
     mistakes: list[Mistake] = field(default_factory=list)
     invalid: list[KeyPath] = field(default_factory=list)
@@ -47,17 +51,43 @@ class Checked:
         )
 
 
-def check_values(sections: dict[str, Any], invalid: Iterable[KeyPath] = ()) -> Checked:
+def check_values(
+    sections: dict[str, Any], invalid: Iterable[KeyPath] = (), named: Mapping[str, str] | None = None
+) -> Checked:
     """Check each value of a file's sections by itself.
 
     Returns the valid values and the mistakes. Paths in `invalid` have mistakes already, and yield no further ones.
+    `named` are the pages of steps with names, which a registration has checked already.
     """
+    project = sections.get("project")
+    found = design.read(project, sections.get("trial"))
+    if named is not None:
+        found.is_named, found.steps = True, [Step(key, page) for key, page in named.items()]
+    if found.is_named and isinstance(project, dict):
+        sections = {**sections, "project": {key: value for key, value in project.items() if key != "steps"}}
     steps = _at(sections, STEPS)
     keys = [key for key in steps if is_step_key(key)] if isinstance(steps, dict) else []
-    checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, invalid=list(invalid))
+    checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, found, invalid=list(invalid))
     _check_project({key: value for key, value in sections.items() if key != "trial"}, checked)
-    _check_trial(sections.get("trial"), checked)
+    _check_trial(found.first_trial, checked)
+    _check_design(checked)
     return checked
+
+
+def _check_design(checked: Checked) -> None:
+    """Take over the steps of the design, and check each game with what it has for itself."""
+    found = checked.design
+    if found.is_named:
+        checked.step_keys = list(found.pages)
+        checked.project = replace(checked.project, steps=found.pages)
+    else:
+        pages = checked.project.steps
+        found.steps = [Step(key, pages[key]) for key in visited(ordered(pages), pages)]
+        found.paths = {key: (*STEPS, key) for key in pages}
+    if checked.valid(("trial",)) and not found.mistakes:
+        found.steps = design.with_sections(found, checked.trial)
+    for mistake in found.mistakes:
+        _note(checked, mistake.path, mistake.message)
 
 
 def _check_project(sections: dict[str, Any], checked: Checked) -> None:

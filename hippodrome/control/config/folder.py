@@ -15,7 +15,8 @@ from hippodrome.control.config.each_value import Checked
 from hippodrome.control.config.hippo import CLOSING_PAGE, Adapted, adapt
 from hippodrome.control.config.layout import AGENT, Layout, find
 from hippodrome.control.config.project_keys import STEPS
-from hippodrome.control.config.step_files import CLOSING, StepFileError, open_folder
+from hippodrome.control.config.step_files import CLOSING, StepFileError, StepFolder, open_folder
+from hippodrome.control.model.design import Step, cells, fill
 from hippodrome.control.model.project import number_of_groups
 from hippodrome.control.model.step_order import ordered, visited
 from hippodrome.control.model.step_types import type_of
@@ -147,14 +148,33 @@ def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[M
         pages_folder = open_folder(folder) if own else None
     except StepFileError as error:
         return [], [Mistake(STEPS, str(error))]
+    known = {step.key: step for step in checked.design.steps}
     for key in visited(ordered(pages), pages):
         page = pages[key]
         try:
-            variants, files = pages_folder.find(page) if pages_folder and page in own else (0, ())
-            steps.append(StepFiles(key, page, variants, (CLOSING,) if page == CLOSING_PAGE else files))
+            variants, files = (
+                _files_of(pages_folder, page, checked, known.get(key)) if pages_folder and page in own else (0, ())
+            )
+            own_files = (CLOSING,) if page == CLOSING_PAGE else files
+            steps.append(StepFiles(key, page, variants, own_files, known.get(key)))
         except StepFileError as error:
-            mistakes.append(Mistake((*STEPS, key), str(error)))
+            mistakes.append(Mistake(checked.design.paths.get(key, (*STEPS, key)), str(error)))
     return steps, mistakes
+
+
+def _files_of(folder: StepFolder, page: str, checked: Checked, step: Step | None) -> tuple[int, tuple[Path, ...]]:
+    """The number of versions of a page, and its files; of a page with `{factor}` the file of each level.
+
+    Raises StepFileError.
+    """
+    if "{" not in page or step is None:
+        return folder.find(page)
+    design = checked.design
+    within = design.blocks[step.block].factors if step.block is not None else ()
+    named = [factor for factor in (*design.conditions, *within) if f"{{{factor.name}}}" in page]
+    if not named:
+        raise StepFileError(f"there is no factor of the name in {page}")
+    return 0, tuple(file for levels in cells(named) for file in folder.find(fill(page, levels))[1])
 
 
 def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:

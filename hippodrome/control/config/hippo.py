@@ -358,8 +358,8 @@ def _unknown(adapted: Adapted) -> None:
 
 
 _CONDITIONS = (
-    "the conditions of an experiment are groups, and those come from versions of a page, such as consent-0.html and "
-    "consent-1.html (docs/pages.md#groups)"
+    "conditions between people go under project.conditions, and those within people into a block with each "
+    "(docs/designs.md)"
 )
 _OF_CONDITIONS = frozenset(
     [

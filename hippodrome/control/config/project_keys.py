@@ -40,6 +40,7 @@ _HERE = re.compile(rf"http://(({_LABEL}\.)*localhost|127\.0\.0\.1)(:[0-9]{{1,5}}
 _REGION = re.compile(r"[a-z]{2,4}(-[a-z]+){1,2}-[0-9]{1,2}")
 _HEADER = re.compile(r"[a-z0-9-]{1,64}")
 _SECRET_HEADERS = ("authorization", "cookie", "proxy-authorization")
+_STEP_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
 _STEP_NUMBER = re.compile(r"[1-9][0-9]{0,2}")
 _CERTIFICATES = "SSL"  # servers may not write into this folder (infra/template.yml), so a study there keeps no answers
 _DNS_ROOM = 253 - 64  # characters of a DNS name without the server's own label and its dot
@@ -132,10 +133,23 @@ def step_key(value: object) -> str:
     raise ValueError(f"a step's key is 1, 2, 3 … or {FINAL}")
 
 
+def any_step_key(value: object) -> str:
+    """Check the key of a step in a registration: a number from 1, finalStep, or a name."""
+    return value if isinstance(value, str) and _STEP_NAME.fullmatch(value) else step_key(value)
+
+
+def designed_page(value: object) -> str:
+    """Check the page of a step in a registration, which may hold `{factor}`."""
+    if isinstance(value, str) and "{" in value:
+        step_file(re.sub(r"\{[A-Za-z]\w*\}", "x", value))
+        return value
+    return page(value)
+
+
 def step_name(value: object) -> str:
-    """Check the step that an event names: a number, or finalStep."""
-    if isinstance(value, str) and value.strip() == FINAL:
-        return FINAL
+    """Check the step that an event names: a number, finalStep, or the name of a step."""
+    if isinstance(value, str) and (value.strip() == FINAL or _STEP_NAME.fullmatch(value.strip())):
+        return value.strip()
     found = number_in(value)
     if found is None or found != int(found) or not 0 < found <= MAX_STEPS + 1:
         raise ValueError(f"must be the number of a step or {FINAL}, not {show(value)}")
@@ -198,6 +212,34 @@ _MATCHING: dict[str, object] = {
 
 def _step(meaning: str) -> Any:
     return keyed.key(step_name, None, meaning, {"anyOf": [{"minimum": 1, "type": "integer"}, {"const": FINAL}]})
+
+
+def _apart(_value: object) -> dict[str, Any]:
+    """Leave a key to `config/design.py`, which reads it."""
+    return {}
+
+
+_LEVELS: dict[str, Any] = {"anyOf": [{"type": "array"}, {"type": "integer", "minimum": 2}, {"type": "object"}]}
+_FACTORS: dict[str, Any] = {"type": "object", "additionalProperties": _LEVELS}
+_NUMBERED: dict[str, Any] = {
+    "additionalProperties": False,
+    "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
+    "properties": {FINAL: {"type": ["string", "null"]}},
+    "type": "object",
+}
+_BLOCK: dict[str, Any] = {
+    "type": "object",
+    "required": ["each", "steps"],
+    "properties": {
+        "each": _FACTORS,
+        "order": {"enum": ["latin", "random", "fixed"]},
+        "take": {"type": "integer", "minimum": 1},
+        "steps": {"type": "array", "items": {"type": ["string", "object"]}},
+    },
+    "additionalProperties": False,
+}
+_NAMED_STEP: dict[str, Any] = {"type": "object", "minProperties": 1, "maxProperties": 1}
+_NAMED: dict[str, Any] = {"type": "array", "items": {"anyOf": [{"type": "string"}, _NAMED_STEP, _BLOCK]}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,15 +330,25 @@ class ProjectKeys(Section):
     steps: dict[str, str] = keyed.key(
         values.section("1: consent"),
         {},
-        "The study's steps in order: 1, 2, 3 … and finalStep. Each is a file of the steps folder, or game.",
-        {
-            "additionalProperties": False,
-            "patternProperties": {"^[1-9][0-9]{0,2}$": {"type": ["string", "integer"]}},
-            "properties": {FINAL: {"type": ["string", "null"]}},
-            "type": "object",
-        },
+        "The study's steps in order: a list of names with settings (docs/designs.md), or 1, 2, 3 … and finalStep. "
+        "Each is a file of the steps folder, or game.",
+        {"anyOf": [_NUMBERED, _NAMED]},
         needed=True,
         entries=steps_by_number,
+    )
+    conditions: dict[str, Any] = keyed.key(
+        _apart,
+        {},
+        "Factors between people, each with its levels: everybody gets one cell of their product, in balance "
+        "(docs/designs.md).",
+        _FACTORS,
+    )
+    ends: dict[str, Any] = keyed.key(
+        _apart,
+        {},
+        'Ends before the last step, each with its rule, such as declined: answers.consent.agree == "no" '
+        "(docs/designs.md).",
+        {"type": "object"},
     )
     cluster: str = keyed.choice(
         ("installation", "participant"),

@@ -10,8 +10,10 @@ from typing import Any
 from hippodrome.control.config import project_keys, sessions
 from hippodrome.control.config.config import Config, StepFiles
 from hippodrome.control.config.consistency import check
+from hippodrome.control.config.design import RegisteredDesign, read_registered
 from hippodrome.control.config.diagnostics import ConfigErrors, Diagnostic, Mistake, in_order
 from hippodrome.control.config.project_keys import STEPS
+from hippodrome.control.model.design import Step as DesignedStep
 from hippodrome.control.model.project import STEPS_FOLDER, number_of_groups
 from hippodrome.control.model.step_order import FINAL, ordered, visited
 from hippodrome.control.model.step_types import type_of
@@ -26,13 +28,15 @@ MESSAGE = "message"  # stands in the place of a file name in the mistakes of a r
 LIMIT_VARIANTS = 1000
 
 _OURS = ("taskDefinition", "serverPort", "pageFolder", "gamePages")  # keys that no config.yml may have
+_DESIGN = ("conditions", "blocks", "ends")
+_OF_A_DESIGN = frozenset(DesignedStep.__struct_encode_fields__) - {"key", "page", "variants"}
 _TASK_DEFINITION = re.compile(r"[A-Za-z0-9:/_.-]{1,255}")
 
 
 @dataclass(frozen=True, slots=True)
 class _Step(Section):
-    key: str = keyed.text("", "", project_keys.step_key)
-    page: str = keyed.text("", "", project_keys.page)
+    key: str = keyed.text("", "", project_keys.any_step_key)
+    page: str = keyed.text("", "", project_keys.designed_page)
     variants: int = keyed.whole(0, LIMIT_VARIANTS, 0, "")
 
 
@@ -45,10 +49,13 @@ def parse_registration(data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigErrors([Diagnostic(MESSAGE, None, "", "a registration must be a JSON object")])
     steps, mistakes = _steps_in(data.get("steps"))
-    project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS)}
-    if not mistakes:
-        project["steps"] = {step.key: step.page for step in steps}
-    checked = check({"project": project, "trial": data.get("trial")})
+    project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS, *_DESIGN)}
+    pages = {step.key: step.page for step in steps}
+    named = any(key != FINAL and not key.isdecimal() for key in pages)
+    if not mistakes and not named:
+        project["steps"] = pages
+    checked = check({"project": project, "trial": data.get("trial")}, named=pages if named else None)
+    registered = _design_in(data, mistakes)
     if mistakes:
         checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
     task = {key: data[key] for key in _OURS if key in data}
@@ -59,9 +66,26 @@ def parse_registration(data: object) -> dict[str, Any]:
     if checked.mistakes:
         order = {step.key: index for index, step in enumerate(steps)}
         raise ConfigErrors(in_order(_diagnostic(mistake, order) for mistake in checked.mistakes))
+    assert registered is not None
+    checked.design.steps = registered.steps
+    checked.design.conditions, checked.design.blocks = registered.conditions, registered.blocks
+    checked.design.ends = registered.ends
+    known = {step.key: step for step in registered.steps}
     shown = visited(checked.step_keys, checked.project.steps)
-    config = Config.of(checked, [StepFiles(s.key, s.page, s.variants) for s in steps if s.key in shown])
+    own = [StepFiles(s.key, s.page, s.variants, step=known.get(s.key)) for s in steps if s.key in shown]
+    config = Config.of(checked, own)
     return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
+
+
+def _design_in(data: Mapping[str, Any], mistakes: list[Mistake]) -> RegisteredDesign | None:
+    """The design of a registration; None after a mistake, which is added to `mistakes`."""
+    if mistakes:
+        return None
+    try:
+        return read_registered(data)
+    except ValueError as error:
+        mistakes.append(Mistake(STEPS, str(error)))
+        return None
 
 
 def _task_mistakes(task: Mapping[str, Any]) -> Iterator[Mistake]:
@@ -99,7 +123,8 @@ def _steps_in(data: object) -> tuple[list[_Step], list[Mistake]]:
     mistakes: list[Mistake] = []
     for index, item in enumerate(data):
         path = (*STEPS, index)
-        fields, wrong = checked_value(values.section("key: value"), item, path)
+        plain = {key: item[key] for key in item if key not in _OF_A_DESIGN} if isinstance(item, dict) else item
+        fields, wrong = checked_value(values.section("key: value"), plain, path)
         step, wrong = check_section(_Step, fields, path) if not wrong else (_Step(), wrong)
         if wrong:
             mistakes += [Mistake(problem.path, problem.sentence) for problem in wrong]
@@ -110,6 +135,6 @@ def _steps_in(data: object) -> tuple[list[_Step], list[Mistake]]:
             mistakes.append(Mistake(path, "is a game step, so it cannot have variants; leave them out"))
         steps.append(step)
     keys = [step.key for step in steps]
-    if not mistakes and keys != ordered(set(keys)):
+    if not mistakes and (len(set(keys)) < len(keys) or keys != ordered(keys)):
         mistakes.append(Mistake(STEPS, f"must be in order, 1, 2, 3 … and perhaps {FINAL}, each once"))
     return steps, mistakes

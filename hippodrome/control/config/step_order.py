@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from hippodrome.control.config import project_keys
@@ -20,12 +20,14 @@ def is_step_key(key: str) -> bool:
 
 
 def step_name(key: str) -> str:
-    """Return the step's name for messages: "step 3", or "finalStep"."""
-    return key if key == FINAL else f"step {key}"
+    """Return the step's name for messages: "step 3", "finalStep", or its own name."""
+    return f"step {key}" if key.isdecimal() else key
 
 
 def step_range(keys: list[str]) -> str:
     """Return the steps in words: "1 to 4 and finalStep"."""
+    if not all(key == FINAL or key.isdecimal() for key in keys):
+        return ", ".join(keys)
     numbered = [key for key in keys if key != FINAL]
     words = f"{numbered[0]} to {numbered[-1]}" if len(numbered) > 1 else "".join(numbered)
     return words if numbered == keys else f"{words} and {FINAL}"
@@ -54,13 +56,16 @@ def _was(page: str | None) -> str:
     return "(new)" if page is None else f"(was {page})"
 
 
-def resolve_events(events: EventsKeys, keys: list[str], pages: Mapping[str, str]) -> EventsKeys:
-    """Return the checked events as keys of steps, with defaults filled in."""
+def resolve_events(
+    events: EventsKeys, keys: list[str], pages: Mapping[str, str], repeated: Collection[str] = ()
+) -> EventsKeys:
+    """Return the checked events as keys of steps, with defaults filled in. `repeated` are the steps of blocks."""
     start, stop = (position(key, keys) for key in (events.start_server_step, events.stop_server_step))
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if games:
         start = default_start(games) if start is None else start
-        stop = default_stop(games) if stop is None else stop
+        if stop is None:
+            stop = next(at for at in range(default_stop(games), len(keys)) if keys[at] not in repeated)
     return replace(
         events,
         start_server_step=None if start is None else keys[start],

@@ -155,7 +155,8 @@ class Lobby:
         """
         if self._repository.membership(project.id, user_id) is not None:
             return
-        if self._repository.progress(project.id, user_id).answered.keys() >= set(project.game_steps):
+        progress = self._repository.progress(project.id, user_id)
+        if progress.has_ended or progress.answered.keys() >= set(project.game_steps):
             return
         label = ids.server_label(project.id, user_id)
         way = lobby_entries.way_key(project.id, label)

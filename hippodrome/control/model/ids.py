@@ -109,12 +109,14 @@ def group(project_id: str, user_id: str, variants: int) -> int:
     return int.from_bytes(digest[:16], "big") % variants
 
 
-def ticket(secret: str, user_id: str, step: str) -> str:
+def ticket(secret: str, user_id: str, step: str, shown: str = "") -> str:
     """Return the ticket in a page's form, which proves that this participant was shown this step.
 
-    It is 32 hex digits of an HMAC with the project's `secret`.
+    `shown` says more of the showing, if that matters: the number of the try and the time. The ticket is 32 hex digits
+    of an HMAC with the project's `secret`.
     """
-    return hmac.new(secret.encode(), f"ticket\0{user_id}\0{step}".encode(), hashlib.sha256).hexdigest()[:32]
+    text = "\0".join(("ticket", user_id, step, *filter(None, [shown])))
+    return hmac.new(secret.encode(), text.encode(), hashlib.sha256).hexdigest()[:32]
 
 
 def link_signature(secret: str, project_id: str, user_id: str) -> str:

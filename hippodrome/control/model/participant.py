@@ -15,14 +15,16 @@ from typing import Any
 import msgspec
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import Record
 from hippodrome.control.ports import Entry
 from hippodrome.protocol.answer import FAILED, Answer
-from hippodrome.protocol.keys import participant_folder
+from hippodrome.protocol.keys import ASSIGNMENT, answer_key, participant_folder
 
 REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
 MAX_HEADER = 512  # characters of a header's value
+PARTICIPANT, END = "participant.json", "end.json"
 MAX_COMPARED = 10  # the most answers with which such a form is compared; each costs a read
 
 
@@ -38,26 +40,53 @@ class Participant(Record, frozen=True):
     headers: Mapping[str, str] = msgspec.field(default_factory=dict)  # those of the first request that the study keeps
 
 
+class Ended(Record, frozen=True):
+    """`end.json`: the end that a participant has reached before the last step. Written once.
+
+    `code` is the completion code that they were shown.
+    """
+
+    end: str
+    ended: datetime
+    code: str = ""
+    link: str = ""
+
+
 @dataclass(frozen=True)
 class Progress:
-    """A participant's progress: whether `participant.json` exists, and when each step was answered."""
+    """A participant's progress: when they arrived, when each step was answered, and which other records exist.
+
+    `tries` has the number of the last try of each check.
+    """
 
     has_arrived: bool = False
     answered: Mapping[str, datetime] = field(default_factory=dict)
+    arrived: datetime | None = None
+    tries: Mapping[str, int] = field(default_factory=dict)
+    is_assigned: bool = False
+    has_ended: bool = False
 
     @classmethod
     def from_listing(cls, folder: str, entries: Iterable[Entry]) -> Progress:
         """Read a listing of `folder` in the order of keys. Answers come before participant.json, recordings after."""
-        has_arrived, answered = False, {}
+        answered: dict[str, datetime] = {}
+        tries: dict[str, int] = {}
+        arrived, others = None, set()
         for entry in entries:
             name = entry.key.removeprefix(folder)
-            if name > "participant.json":
+            if name > PARTICIPANT:
                 break
-            if name == "participant.json":
-                has_arrived = True
+            if name == PARTICIPANT:
+                arrived = entry.modified
+            elif name in (ASSIGNMENT, END):
+                others.add(name)
             elif name.startswith("answers/") and name.endswith(".json"):
-                answered[name.removeprefix("answers/").removesuffix(".json")] = entry.modified
-        return cls(has_arrived, answered)
+                step, _, number = name.removeprefix("answers/").removesuffix(".json").partition(".")
+                if not number:
+                    answered[step] = entry.modified
+                elif number.isdecimal():
+                    tries[step] = max(tries.get(step, 0), int(number))
+        return cls(arrived is not None, answered, arrived, tries, ASSIGNMENT in others, END in others)
 
     def due_step(self, project: Project) -> Step:
         """Return the step that is due: the first without an answer, or the final one."""
@@ -86,6 +115,16 @@ def participant_key(project_id: str, user_id: str) -> str:
     return f"{participant_folder(project_id, user_id)}participant.json"
 
 
+def end_key(project_id: str, user_id: str) -> str:
+    """Return the key of the record of the end that a participant has reached."""
+    return f"{participant_folder(project_id, user_id)}{END}"
+
+
+def try_key(project_id: str, user_id: str, step: str, number: int) -> str:
+    """Return the key of a try at a check: a document like an answer."""
+    return answer_key(project_id, user_id, f"{step}.{number}")
+
+
 def new_participant(
     project: Project, user_id: str, link: Mapping[str, str], now: datetime, headers: Mapping[str, str] | None = None
 ) -> Participant:
@@ -104,6 +143,16 @@ def new_participant(
         link=link,
         headers={name: text.encode("utf-8", "replace").decode()[:MAX_HEADER] for name, text in sent.items()},
     )
+
+
+def device(user_agent: str) -> str:
+    """Return the kind of device that a browser names itself after: desktop, tablet or phone; "" if it names none."""
+    text = user_agent.lower()
+    if "ipad" in text or "tablet" in text or ("android" in text and "mobile" not in text):
+        return "tablet"
+    if "mobi" in text or "iphone" in text:
+        return "phone"
+    return "desktop" if text else ""
 
 
 def new_answer(project: Project, user_id: str, step: Step, answers: Mapping[str, Any], now: datetime) -> Answer:
@@ -131,12 +180,6 @@ def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
-def following_step(project: Project, step: Step) -> Step | None:
-    """Return the next step; None after the last."""
-    at = project.index(step.key)
-    return project.steps[at + 1] if at is not None and at + 1 < len(project.steps) else None
-
-
 def starts_server(project: Project, step: Step) -> bool:
     """Return whether the participant's server is started when this step is reached."""
     return step.key == project.events.start_server_step
@@ -160,12 +203,3 @@ def is_past_server(project: Project, step: Step) -> bool:
     """Return whether the participant needs no server any more at this step: it is the stop step or a later one."""
     at, last = project.index(step.key), project.index(project.events.stop_server_step)
     return at is not None and last is not None and at >= last
-
-
-def reached_without_post(project: Project, step: Step) -> bool:
-    """Return whether this step follows a game step.
-
-    The trial stores the answer to a game step, so no POST has published the messages of the step after it.
-    """
-    at = project.index(step.key)
-    return project.steps[at - 1].type.on_server if at else False

@@ -7,10 +7,10 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from hippodrome.control.model import hippo_entry, ids
+from hippodrome.control.model import design, hippo_entry, ids
+from hippodrome.control.model.design import Assignment, Block, End, Factor, Step
 from hippodrome.control.model.matching import MATCH
 from hippodrome.control.model.records import Record, from_data, from_json, to_json
-from hippodrome.control.model.step_types import StepType, type_of
 
 MASTER_LIST = "project_master_list.json"
 STEPS_FOLDER: Literal["steps"] = "steps"
@@ -18,28 +18,6 @@ GAME_PAGES = ("instructions", "betweenEpisodes")
 """The keys of `trial` that may name a page."""
 DEFAULT_PORT = 5000  # HIPPO's port, for registrations that name none; also the trial's default
 MIN_RUNTIME_MARGIN = 60  # minutes; with warmServers, the installation's maxRuntime is at least this plus the project's
-
-
-class Step(Record, frozen=True):
-    """One step of the study. `page` is a step file's name without `.html`, or `game`.
-
-    `variants` is the number of the files `{page}-0.html`, `{page}-1.html` …; 0 if the page has no variants.
-    """
-
-    key: str
-    page: str
-    variants: int = 0
-
-    @property
-    def type(self) -> StepType:
-        return type_of(self.page)
-
-    @property
-    def files(self) -> list[str]:
-        """The names of the step files of all groups, without `.html`; none for a game."""
-        if not self.type.has_files:
-            return []
-        return [f"{self.page}-{number}" for number in range(self.variants)] or [self.page]
 
 
 class Events(Record, frozen=True):
@@ -80,6 +58,9 @@ class Project(Record, frozen=True):
 
     id: str
     steps: list[Step]
+    conditions: tuple[Factor, ...] = ()  # factors between people
+    blocks: tuple[Block, ...] = ()  # of steps that are repeated for factors within people; on a path there are none
+    ends: tuple[End, ...] = ()
     name: str = ""
     researcher: str = ""
     contact: str = ""  # how participants reach the researchers
@@ -125,14 +106,56 @@ class Project(Record, frozen=True):
 
     @property
     def game_steps(self) -> list[str]:
-        """The keys of the steps that are played on a server, whose trial stores their answers."""
-        return [step.key for step in self.steps if step.type.on_server]
+        """The keys of the steps that are played on a server, whose trial stores their answers: of all runs."""
+        return [step.key for step in self.all_runs if step.type.on_server]
+
+    @property
+    def all_runs(self) -> list[Step]:
+        """The steps, with all runs of each block, also those that only some participants have."""
+        whole = tuple(msgspec.structs.replace(block, take=None) for block in self.blocks)
+        return design.own_steps(self.steps, whole, None) if whole else self.steps
+
+    @property
+    def assigns(self) -> bool:
+        """Whether participants get an assignment: the study has factors, or a game with keys of `trial` of its own."""
+        return bool(self.conditions or self.blocks or any(step.sections for step in self.steps))
+
+    def own(self, assignment: Assignment | None) -> Project:
+        """Return the project with the path of a participant who has this assignment, or none yet."""
+        if not self.assigns:
+            return self
+        steps = design.own_steps(self.steps, self.blocks, assignment)
+        first = next((step.key for step in steps if step.step_name == self.events.start_server_step), None)
+        events = msgspec.structs.replace(self.events, start_server_step=first)
+        return msgspec.structs.replace(self, steps=steps, blocks=(), events=events)
+
+    def at_game(self, step: Step, assignment: Assignment | None) -> Project:
+        """Return the project with the section `trial` that this game has on the participant's path."""
+        game = assignment.games.get(step.key) if assignment else None
+        own_keys = game.trial if game else {}
+        if not own_keys:
+            return self
+        variants = {key: number for key, number in self.game_pages.items() if key not in own_keys}
+        return msgspec.structs.replace(self, trial={**self.trial, **own_keys}, game_pages=variants)
 
     @property
     def pages_in_game(self) -> list[Step]:
         """The pages that game steps show, each as a `Step` with the key of `trial` that names the page."""
         pages = {key: self.trial.get(key) for key in GAME_PAGES} if self.game_steps else {}
         return [Step(key, page, self.game_pages.get(key, 0)) for key, page in pages.items() if isinstance(page, str)]
+
+    @property
+    def all_pages(self) -> list[Step]:
+        """Every page that a participant may see, as a `Step` whose page has no `{factor}` any more."""
+        at_levels = [page for step in self.all_runs for page in design.pages_of(step, self.conditions)]
+        own = [
+            Step(f"{step.key}.{key}", page)
+            for step in self.steps
+            for section in step.sections
+            for key in GAME_PAGES
+            if isinstance(page := section.trial.get(key), str)
+        ]
+        return [*at_levels, *self.pages_in_game, *own, *(Step(end.name, end.page) for end in self.ends if end.page)]
 
     @property
     def size(self) -> AwsSetup:
@@ -191,13 +214,16 @@ class Project(Record, frozen=True):
         return next((i for i, step in enumerate(self.steps) if step.key == key), None)
 
     def step(self, key: str | None) -> Step | None:
-        """Return the step with this key; None if the project has no such step."""
-        return next((step for step in self.steps if step.key == key), None)
+        """Return the step with this key, or the run of a step; None if the project has none."""
+        return next((step for step in self.all_runs if step.key == key), None)
 
-    def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None) -> Step | None:
-        """Return the step with this key, if the ticket proves that this participant was shown that step; else None."""
+    def step_of_ticket(self, user_id: str, key: str | None, ticket: str | None, shown: str = "") -> Step | None:
+        """Return the step with this key, if the ticket proves that this participant was shown that step; else None.
+
+        `shown` is what the page's form says of its showing (`ids.ticket`).
+        """
         step = self.step(key)
-        proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key))
+        proven = step and ticket and ids.secrets_equal(ticket, ids.ticket(self.secret, user_id, step.key, shown))
         return step if proven else None
 
     def group(self, user_id: str, step: Step | None = None) -> int | None:

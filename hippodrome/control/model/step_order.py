@@ -8,7 +8,10 @@ FINAL = "finalStep"
 
 
 def ordered(keys: Iterable[str]) -> list[str]:
-    """Return the keys of steps in the order of their numbers, finalStep last."""
+    """Return the keys of steps in the order of their numbers, finalStep last; names stay as they are."""
+    keys = list(keys)
+    if not all(key == FINAL or key.isdecimal() for key in keys):
+        return keys
     return sorted(keys, key=lambda key: (key == FINAL, 0 if key == FINAL else int(key)))
 
 
@@ -28,7 +31,7 @@ def position(key: str | None, keys: list[str]) -> int | None:
     """
     if key in keys:
         return keys.index(key)
-    numbers = [int(number) for number in keys if number != FINAL]
+    numbers = [int(number) for number in keys if number.isdecimal()]
     return len(keys) - 1 if key in (FINAL, str(max(numbers, default=0) + 1)) else None
 
 

@@ -55,6 +55,14 @@ _PAGES = {
     ),
     "copy": "Copy",
     "copied": "Copied",
+    "wrongOne": "One answer is not right yet.",
+    "wrongSome": "{number} answers are not right yet.",
+    "triesOne": "You have one try left.",
+    "triesSome": "You have {number} tries left.",
+    "endTitle": "Thank you",
+    "endText": "The study ends here for you.",
+    "endCode": "Your code:",
+    "endLink": "Finish",
 }
 _WAITING = {
     "waitingForGame": "Waiting for the game",

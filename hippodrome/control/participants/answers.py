@@ -14,9 +14,9 @@ import msgspec
 
 from hippodrome.control.log import logger
 from hippodrome.control.model import participant
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.participant import Progress
-from hippodrome.control.model.project import Project, Step
-from hippodrome.control.participants.events import publish_events
+from hippodrome.control.model.project import Project
 from hippodrome.control.ports import Conflict, Platform
 from hippodrome.protocol.answer import answers_in
 from hippodrome.protocol.keys import answer_key
@@ -29,19 +29,21 @@ class Answers:
         self._platform = platform
 
     def store(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any]) -> None:
-        """Store the answers to a step, which moves the participant on. An answer that the step has already stays.
+        """Store the answers to a step, which moves the participant on. An answer that the step has already stays."""
+        if self._create(project, user_id, step, answers, answer_key(project.id, user_id, step.key)):
+            logger.info("answered", extra={"project": project.id, "step": step.key})
 
-        The messages of the following step are published first, so a crash in between repeats them but never loses them.
-        """
-        if following := participant.following_step(project, step):
-            publish_events(self._platform, project, user_id, following)
+    def store_try(self, project: Project, user_id: str, step: Step, number: int, answers: Mapping[str, Any]) -> None:
+        """Store the answers of a try at a check. Each try is stored once, so going back gives no further try."""
+        self._create(project, user_id, step, answers, participant.try_key(project.id, user_id, step.key, number))
+
+    def _create(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any], key: str) -> bool:
         record = participant.new_answer(project, user_id, step, answers, self._platform.now())
-        body = msgspec.json.format(msgspec.json.encode(record), indent=1)
         try:
-            self._platform.documents.create(answer_key(project.id, user_id, step.key), body)
+            self._platform.documents.create(key, msgspec.json.format(msgspec.json.encode(record), indent=1))
         except Conflict:
-            return
-        logger.info("answered", extra={"project": project.id, "step": step.key})
+            return False
+        return True
 
     def read(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
         """Return the participant's answers at a step; empty if there are none, or if the document holds no answers."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
 from hippodrome.control.http import Refusal, Request
@@ -16,7 +17,8 @@ MAX_FIELDS = 2_000
 MAX_DEPTH = 20  # levels of lists and objects in JSON: stored documents are indented, so each level makes lines longer
 FORM = "application/x-www-form-urlencoded"
 JSON = "application/json"
-STEP, TICKET, ACTION = "hippodrome-step", "hippodrome-ticket", "hippodrome-action"  # the hidden fields
+_WHOLE = re.compile(r"[0-9]{1,12}")
+STEP, TICKET, SHOWN, ACTION = (f"hippodrome-{name}" for name in ("step", "ticket", "shown", "action"))  # hidden fields
 
 
 class BadForm(Refusal):
@@ -42,6 +44,23 @@ class PostedForm:
     step: str | None = None
     ticket: str | None = None
     action: str | None = None
+    shown: str | None = None  # which try the page showed, and when: see `Showing`
+
+
+class Showing(NamedTuple):
+    """A showing of a page whose tries or time are limited: the number of the try, and the time in seconds."""
+
+    number: int
+    at: int
+
+    @classmethod
+    def read(cls, text: str | None) -> Showing | None:
+        """Read the text in a form; None if it is none of a showing."""
+        number, _, at = (text or "").partition(" ")
+        return cls(int(number), int(at)) if _WHOLE.fullmatch(number) and _WHOLE.fullmatch(at) else None
+
+    def __str__(self) -> str:
+        return f"{self.number} {self.at}"
 
 
 def read(request: Request) -> PostedForm:
@@ -65,8 +84,8 @@ def read_query(query: Iterable[tuple[str, str]]) -> PostedForm:
 
 
 def _form(fields: dict[str, Any]) -> PostedForm:
-    step, ticket, action = (_text(fields.pop(name, None)) for name in (STEP, TICKET, ACTION))
-    return PostedForm(fields, step, ticket, action)
+    step, ticket, action, shown = (_text(fields.pop(name, None)) for name in (STEP, TICKET, ACTION, SHOWN))
+    return PostedForm(fields, step, ticket, action, shown)
 
 
 def _urlencoded(body: bytes) -> dict[str, Any]:

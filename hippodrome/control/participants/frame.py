@@ -16,7 +16,8 @@ from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
 
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.texts import IN_ENGLISH, Texts, is_right_to_left
 from hippodrome.control.participants import scripts
 from hippodrome.control.participants.texts import in_script, in_template
@@ -38,8 +39,11 @@ class Html(str):
     __slots__ = ()
 
 
-def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
-    """Return a page with a title and a text, such as an error."""
+def message_page(
+    title: str, text: str, *, lang: str = IN_ENGLISH.language, more: Html | None = None, end: str = ""
+) -> Page:
+    """Return a page with a title and a text, such as an error. That of an `end` looks like a step, with `more` HTML."""
+    body = "message" if more is None else "step"
     nonce = secrets.token_urlsafe(16)
     page = fill(
         "frame.html",
@@ -47,11 +51,11 @@ def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> P
         dir=_direction(lang),
         title=title,
         head=Html(),
-        style=Html(style("message") + _of_direction(lang)),
-        body="message",
-        data=Html(),
+        style=Html(style(body) + _of_direction(lang)),
+        body=body,
+        data=fill("end", end=end) if end else Html(),
         header=Html(),
-        main=fill("message", title=title, text=text),
+        main=fill("message", title=title, text=text, more=more or Html()),
         footer=Html(),
         script=Html(),
     )
@@ -65,7 +69,7 @@ def form_message(title: str, text: str, *, step: str = "", ticket: str = "", als
     response to it is the page of the due step.
     """
     fields = fill("named", step=step, ticket=ticket)
-    return fields + also + fill("message", title=title, text=text)
+    return fields + also + fill("message", title=title, text=text, more=Html())
 
 
 def frame(
@@ -167,6 +171,7 @@ _PARTS = {
     "progress": '<label class="progress">TEXT.step <progress max="$all" value="$done"></progress></label>',
     "footer": "<footer><p>TEXT.studyBy</p></footer>",
     "data": ' data-project="$project" data-user="$user" data-step="$step"',
+    "end": ' data-end="$end"',
     "named": """<input type="hidden" name="hippodrome-step" value="$step">
 <input type="hidden" name="hippodrome-ticket" value="$ticket">
 """,
@@ -182,7 +187,11 @@ $content
     "action": '<input type="hidden" name="hippodrome-action" value="$action">\n',
     "over": '<p><button type="submit" name="hippodrome-action" value="$action">$text</button></p>\n',
     "report": "<p>$text</p>\n",
-    "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n</div>',
+    "message": '<div class="page">\n<h1>$title</h1>\n<p>$text</p>\n$more</div>',
+    "endCode": '<p>$text</p>\n<p class="code">$code</p>\n',
+    "endLink": '<p><a class="button" href="$link">$text</a></p>\n',
+    "wrong": '<p class="problem" role="alert">$text</p>\n',
+    "shown": '<input type="hidden" name="hippodrome-shown" value="$shown">\n',
     "reading": """
 <section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>
 <p id="reading-score"></p>

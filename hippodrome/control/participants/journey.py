@@ -1,14 +1,16 @@
 """`next_step`: shows the step that is due, and stores the answers that participants send.
 
-A POST answers one step. A GET moves no participant on, except a participant who was not matched with others: that GET
-stores the answer of each game step. If project and pages are in the cache, a GET makes one listing (and at a game step
-a read of the server's record), and a POST one conditional write (and publishes a message if the next step is one of the
-project's `events`). With sessions there are more calls (`lobby/lobby.py`).
+A POST stores the answers to one step, and decides nothing. A GET finds out what follows (`path.py`) and shows it; at
+the steps that the project's `events` name it publishes their messages, each time, since a repeated message changes
+nothing. If project and pages are in the cache, a GET makes one listing (and at a game step a read of the server's
+record; in a study with factors another read), and a POST one conditional write. With sessions there are more calls
+(`lobby/lobby.py`).
 """
 
 from __future__ import annotations
 
 import secrets
+from dataclasses import replace
 from typing import Any
 
 from hippodrome.control import http
@@ -16,7 +18,9 @@ from hippodrome.control.http import Request, Response
 from hippodrome.control.limits.slots import Slots
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, participant
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.participant import Progress
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.texts import ENGLISH, IN_ENGLISH, Texts
 from hippodrome.control.participants import forms, previews
 from hippodrome.control.participants.answers import Answers
@@ -24,10 +28,13 @@ from hippodrome.control.participants.events import publish_events
 from hippodrome.control.participants.files import Files
 from hippodrome.control.participants.link_fields import IDS, OUR_FIELDS, respelled
 from hippodrome.control.participants.page_error import PROJECT_NOT_FOUND, REFUSED, PageError
+from hippodrome.control.participants.path import Paths, Stop
 from hippodrome.control.participants.previews import PreviewKind
 from hippodrome.control.participants.steps import HANDLERS
+from hippodrome.control.participants.steps.end import EndPage
 from hippodrome.control.participants.steps.services import StepServices
 from hippodrome.control.participants.steps.shared_game import SharedGame, StepAnswered
+from hippodrome.control.participants.steps.sources import NeedsAssignment
 from hippodrome.control.participants.steps.visit import Visit
 from hippodrome.control.participants.waiting import ServerStates
 from hippodrome.control.ports import Platform
@@ -55,6 +62,8 @@ class Journey:
         waiting = ServerStates(platform.settings, self._secrets)
         self._services = StepServices(platform, self._project_cache, self._repository, self._answers, waiting)
         self._shared_game = SharedGame(self._services)
+        self._paths = Paths(platform, self._repository, self._answers)
+        self._ends = EndPage(self._services)
         self._steps = {name: handler(self._services) for name, handler in HANDLERS.items()}
 
     def respond(self, request: Request) -> Response:
@@ -118,30 +127,36 @@ class Journey:
     # Reading
 
     def _get(self, request: Request, project: Project, user_id: str) -> Response:
-        try:
-            return self._show(request, project, user_id)
-        except StepAnswered:  # by this very request, since the participant was not matched with others
-            return self._show(request, project, user_id)
-
-    def _show(self, request: Request, project: Project, user_id: str) -> Response:
         progress = self._repository.progress(project.id, user_id)
-        step = progress.due_step(project)
         if not progress.has_arrived:
-            self._arrive(request, project, user_id, step)
-        elif participant.reached_without_post(project, step):
-            publish_events(self._platform, project, user_id, step)
-        return self._steps[step.type.name].show(Visit(request, project, user_id, progress, step))
+            progress = self._arrive(request, project, user_id, progress)
+        stop = self._paths.next(project, user_id, progress)
+        try:
+            return self._show(request, user_id, stop)
+        except NeedsAssignment:
+            standing = self._paths.assigned(project, user_id, stop.standing)
+            return self._show(request, user_id, replace(stop, standing=standing))
+        except StepAnswered:  # by this very request, since the participant was not matched with others
+            progress = self._repository.progress(project.id, user_id)
+            return self._show(request, user_id, self._paths.next(project, user_id, progress))
 
-    def _arrive(self, request: Request, project: Project, user_id: str, step: Step) -> None:
-        """Handle a first visit. The message is published before the record is written, so no crash loses it."""
+    def _show(self, request: Request, user_id: str, stop: Stop) -> Response:
+        """Return the page of a step, after the messages of that step; or the page of an end."""
+        if stop.ended is not None:
+            return self._ends.show(request, user_id, stop)
+        publish_events(self._platform, stop.project, user_id, stop.step)
+        return self._steps[stop.step.type.name].show(Visit.at(request, user_id, stop))
+
+    def _arrive(self, request: Request, project: Project, user_id: str, progress: Progress) -> Progress:
+        """Handle a first visit, and return the progress after it."""
         if not self._slots.admit(project, user_id):
             logger.warning("the study is full", extra={"project": project.id})
             raise PageError.of(Texts(project.texts), 200, "studyFull")
-        publish_events(self._platform, project, user_id, step)
         link = {k: v[:256] for k, v in request.query or () if k not in OUR_FIELDS and len(k) <= 64}
         record = participant.new_participant(project, user_id, link, self._platform.now(), request.headers)
         if self._repository.create_participant(record):
             logger.info("arrived", extra={"project": project.id})
+        return replace(progress, has_arrived=True, arrived=record.arrived)
 
     # Answering
 
@@ -168,13 +183,15 @@ class Journey:
         without one may only answer the step that is due. If it names no step and repeats answers of the last minute, it
         is the same form sent again (`Answers.repeats`), and answers none.
         """
-        shown = project.step_of_ticket(user_id, form.step, form.ticket)
+        shown = project.step_of_ticket(user_id, form.step, form.ticket, form.shown or "")
         if shown is not None:
             return shown
         progress = self._repository.progress(project.id, user_id)
-        current = progress.due_step(project)
-        if not progress.has_arrived or form.step not in (None, current.key):
+        current = progress.due_step(self._repository.own_project(project, user_id, progress))
+        if not progress.has_arrived or progress.has_ended or form.step not in (None, current.key):
             return None
+        if current.is_limited:
+            return None  # only a form with a ticket says which try it is, and when its page was shown
         may_repeat = form.step is None and not current.type.on_server
         repeated = may_repeat and self._answers.repeats(project, user_id, progress, form.answers)
         return None if repeated else current

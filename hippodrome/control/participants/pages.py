@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.texts import Texts
 from hippodrome.control.participants import fragments, game_modules
 from hippodrome.control.participants.fragments import Fragment
@@ -43,6 +44,10 @@ class StepView:
     action: str  # the address to which the form is sent: the page's own
     final: bool  # whether it is the last step
     answered: bool = False  # whether it is a final step whose form was sent before
+    shown: str = ""  # of a check, or a page with minSeconds: which try it is, and when it was shown
+    wrong: tuple[str, ...] = ()  # of a check: the fields that were not right
+    tries_left: int = 0  # of a check; 0: as many as are needed
+    end: str = ""  # of the page of an end: the end's name
     files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 
 
@@ -78,7 +83,7 @@ def step_page(view: StepView) -> Page:
             "form",
             action=view.action,
             named=_step_fields(view),
-            content=content,
+            content=Html(_wrong(view, texts) + content),
             button=Html() if filled.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
         )
     elif is_asked:
@@ -95,7 +100,7 @@ def step_page(view: StepView) -> Page:
         title=filled.title,
         lang=filled.lang,
         heading=not filled.has_heading,
-        data=Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html(),
+        data=_done(view, is_asked),
     )
     return Page(text, headers(view.project, nonce))
 
@@ -106,7 +111,8 @@ def fragment(view: StepView) -> str:
     The hidden fields that name the step come first. The program sends them with the form: HIPPO's front end posts all
     named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
     """
-    return _step_fields(view) + _prepare(view.project, view.source, view.files).render(view.values)
+    wrong = _wrong(view, Texts(view.project.texts))
+    return _step_fields(view) + wrong + _prepare(view.project, view.source, view.files).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -196,7 +202,32 @@ def game_message(view: GameView) -> str:
 
 def _step_fields(view: StepView) -> Html:
     """The hidden fields that name the step which a form answers, with the ticket that proves it."""
-    return fill("named", step=view.step.key, ticket=view.ticket)
+    shown = fill("shown", shown=view.shown) if view.shown else Html()
+    return Html(fill("named", step=view.step.key, ticket=view.ticket) + shown)
+
+
+def _done(view: StepView, is_asked: bool) -> Html:
+    """The attributes of the body of a page after which nothing is asked any more."""
+    if view.end:
+        return fill("end", end=view.end)
+    return Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html()
+
+
+def _wrong(view: StepView, texts: Texts) -> Html:
+    """The sentence on how many answers of a check are not right yet."""
+    if not view.wrong:
+        return Html()
+    number = len(view.wrong)
+    parts = [texts["wrongOne"] if number == 1 else texts.say("wrongSome", number=number)]
+    if view.tries_left:
+        parts.append(texts["triesOne"] if view.tries_left == 1 else texts.say("triesSome", number=view.tries_left))
+    return fill("wrong", text=" ".join(parts))
+
+
+def end_code(texts: Texts, code: str, link: str) -> Html:
+    """Return the code of an end, and the link that leads back to the recruiter; empty without them."""
+    parts = fill("endCode", text=texts["endCode"], code=code) if code else Html()
+    return Html(parts + fill("endLink", text=texts["endLink"], link=link)) if link else parts
 
 
 _REFRESH = Html('<noscript><meta http-equiv="refresh" content="5"></noscript>\n')

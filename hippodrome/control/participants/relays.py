@@ -93,7 +93,9 @@ class Relays:
         record = self._repository.server_of(project.id, owner)
         self._authorize(project, user_id, form, record)
         progress = self._repository.progress(project.id, user_id)
-        if not progress.has_arrived or not participant.may_have_server(project, progress.due_step(project)):
+        own = self._repository.own_project(project, user_id, progress)
+        is_due = progress.has_arrived and not progress.has_ended
+        if not is_due or not participant.may_have_server(own, progress.due_step(own)):
             raise Refusal(409, "No server is due at this step.")
         if record is None:
             attempt = 1

@@ -18,7 +18,8 @@ LIMIT = 2_000_000  # characters of a rendered page
 ROUNDS = 100_000  # of all loops over range() in a page
 READING = frozenset({"copy", "get", "items", "keys", "values"})
 """The methods of Python's dictionaries that a page may call, unless the dictionary has a value of that name."""
-VALUES_READ = frozenset({"participant", "answers"})  # the values that cost reads of the participant's documents
+VALUES_READ = frozenset({"participant", "answers", "condition", "order"})
+"""The values that cost reads of the participant's documents."""
 
 
 class FragmentError(Exception):

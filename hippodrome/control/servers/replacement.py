@@ -68,4 +68,5 @@ class Replacement:
 
     def _has_finished(self, project: Project, user_id: str) -> bool:
         progress = self._services.repository.progress(project.id, user_id)
-        return all(step in progress.answered for step in project.game_steps)
+        own = self._services.repository.own_project(project, user_id, progress)
+        return progress.has_ended or all(step in progress.answered for step in own.game_steps)

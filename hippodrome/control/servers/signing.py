@@ -41,6 +41,7 @@ from hippodrome.control.storage.secret import SecretCache
 from hippodrome.protocol.keys import (
     QUESTION_ID,
     answer_key,
+    assignment_key,
     groups_folder,
     groups_key,
     handover_key,
@@ -201,7 +202,11 @@ class ServerAccess:
             return True
         if self.is_of_session and key == session_key(self.project_id, self.user_id):
             return True
-        return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key))
+        return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key) or key == self._assignment_key)
+
+    @property
+    def _assignment_key(self) -> str:
+        return assignment_key(self.project_id, self.user_id)
 
     def _is_answer(self, key: str) -> bool:
         players = self.members if self.is_of_session else (self.user_id,)

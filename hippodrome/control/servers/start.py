@@ -201,6 +201,7 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
     return {
         **_owner_environment(project, record, settings),
         **({environment.MATCHING: MATCH} if project.asks_match else {}),
+        **({environment.ASSIGNMENT: "on"} if project.assigns else {}),
         **_plain_environment(project, record, settings),
         environment.PROJECT_ID: record.project_id,
         environment.SERVER: record.name,

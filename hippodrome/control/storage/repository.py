@@ -7,17 +7,19 @@ from dataclasses import dataclass
 
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, memberships, participant, server
+from hippodrome.control.model.design import Assignment
 from hippodrome.control.model.memberships import Membership
-from hippodrome.control.model.participant import Participant, Progress
+from hippodrome.control.model.participant import Ended, Participant, Progress
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
 from hippodrome.control.ports import Conflict, Documents
 from hippodrome.control.storage.errors import RetryLater
 from hippodrome.protocol import session
-from hippodrome.protocol.keys import membership_key, participant_folder, session_key
+from hippodrome.protocol.keys import assignment_key, membership_key, participant_folder, session_key
 from hippodrome.protocol.session import SessionDocument
 
+CACHED_ASSIGNMENTS = 500
 TRIES = 8  # for one change; after that the queue delivers the message again
 
 
@@ -37,6 +39,7 @@ class Repository:
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
+        self._assignments: dict[str, Assignment] = {}
 
     # Participants
 
@@ -56,8 +59,44 @@ class Repository:
 
     def create_participant(self, record: Participant) -> bool:
         """Write the record of a participant's first visit; return False if there is one already."""
+        return self._created(participant.participant_key(record.project_id, record.user_id), to_json(record))
+
+    def assignment(self, project_id: str, user_id: str) -> Assignment | None:
+        """Return the participant's levels and orders; None if none were drawn. They never change, so they are cached.
+
+        Raises ValueError if the document cannot be read.
+        """
+        key = assignment_key(project_id, user_id)
+        if key not in self._assignments:
+            found = self._documents.get(key)
+            if found is None:
+                return None
+            if len(self._assignments) >= CACHED_ASSIGNMENTS:
+                self._assignments.clear()
+            self._assignments[key] = from_json(found.body, Assignment)
+        return self._assignments[key]
+
+    def create_assignment(self, project_id: str, user_id: str, record: Assignment) -> bool:
+        """Write the participant's levels and orders; return False if there are some already."""
+        return self._created(assignment_key(project_id, user_id), to_json(record))
+
+    def ended(self, project_id: str, user_id: str) -> Ended | None:
+        """Return the record of the end that the participant has reached; None if there is none."""
+        found = self._documents.get(participant.end_key(project_id, user_id))
+        return from_json(found.body, Ended) if found else None
+
+    def create_ended(self, project_id: str, user_id: str, record: Ended) -> bool:
+        """Write the record of the end that a participant has reached; return False if there is one already."""
+        return self._created(participant.end_key(project_id, user_id), to_json(record))
+
+    def own_project(self, project: Project, user_id: str, progress: Progress) -> Project:
+        """Return the project with the participant's own path. AWS calls: one read, if they have an assignment."""
+        has_one = project.assigns and progress.is_assigned
+        return project.own(self.assignment(project.id, user_id) if has_one else None)
+
+    def _created(self, key: str, body: bytes) -> bool:
         try:
-            self._documents.create(participant.participant_key(record.project_id, record.user_id), to_json(record))
+            self._documents.create(key, body)
         except Conflict:
             return False
         return True

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 
 import msgspec
 
-from hippodrome.control.model.project import STEPS_FOLDER, Project, Step, step_key
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import STEPS_FOLDER, Project, step_key
 from hippodrome.control.ports import Documents
 
 

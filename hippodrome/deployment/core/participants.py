@@ -28,6 +28,7 @@ class ParticipantCounts:
     participants: int = 0
     by_step: dict[str, int] = field(default_factory=dict)  # step → participants at it, in the order of the steps
     finished: int = 0  # participants at the last step
+    ended: int = 0  # participants at another end
     arrived_today: int = 0
     last_arrival: datetime | None = None
 
@@ -81,6 +82,7 @@ def count_participants(
     `today` is the beginning of the day. `advance` gets the number of participants counted up to now. Folders without a
     participant's record, and ids that are not well formed, are not counted.
     """
+    own = project.own(None)  # nobody's assignment is read: in a block, people are counted as if in the file's order
     found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in folders(documents, project.id):
         arrived: datetime | None = None
@@ -92,10 +94,13 @@ def count_participants(
                 break
         if arrived is None:
             continue
-        at = Progress.from_listing(participant_folder(project.id, user_id), listed).due_step(project)
+        progress = Progress.from_listing(participant_folder(project.id, user_id), listed)
+        at = progress.due_step(own)
         found.participants += 1
-        found.by_step[at.key] += 1
-        found.finished += at.key == project.final.key
+        found.ended += progress.has_ended
+        if not progress.has_ended:
+            found.by_step[at.step_name] += 1
+            found.finished += at.key == project.final.key
         found.arrived_today += arrived >= today
         found.last_arrival = max(arrived, found.last_arrival or arrived)
         if advance:

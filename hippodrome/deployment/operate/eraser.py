@@ -36,6 +36,7 @@ from hippodrome.deployment.core.captured_log import functions_log
 from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of
 from hippodrome.deployment.core.stages import Executor, PlanStep, step
+from hippodrome.deployment.operate.cells_eraser import CellsEraser
 from hippodrome.deployment.operate.lobby_eraser import LobbyEraser
 from hippodrome.deployment.operate.receipt import ProjectReceipt
 from hippodrome.deployment.operate.session_eraser import FoundSession, SessionEraser
@@ -116,6 +117,7 @@ class Eraser:
         self._warm_servers = frozenset[str]()  # names of warm servers that were assigned to the participant
         self._sessions = SessionEraser(self._bucket, project, user)
         self._lobby = LobbyEraser(self._bucket, project, user)
+        self._cells = CellsEraser(self._bucket, project, user)
 
     def run(self, advance: Callable[[int], None] = lambda _: None) -> FoundOfParticipant:
         """Erase until a look finds nothing, in `ROUNDS` rounds at most. Return what the last look found.
@@ -138,7 +140,7 @@ class Eraser:
         if own_name and own_name not in left.dns_records and self._is_in_zone(own_name):
             left.dns_records.append(own_name)
         found = FoundOfParticipant(
-            documents=sum(1 for _ in itertools.chain(self._lobby.look(), *self._documents())),
+            documents=sum(1 for _ in itertools.chain(self._lobby.look(), self._cells.look(), *self._documents())),
             record=record,
             resources=left,
             draining=self._draining(left.clusters),
@@ -169,7 +171,12 @@ class Eraser:
 
     def unreadable(self) -> list[str]:
         """Return the keys of documents that may name this participant, but cannot be read."""
-        return [*self._slots().unreadable(self.project), *self._sessions.unreadable, *self._lobby.unreadable]
+        return [
+            *self._slots().unreadable(self.project),
+            *self._sessions.unreadable,
+            *self._lobby.unreadable,
+            *self._cells.unreadable,
+        ]
 
     # -- looking
 
@@ -287,6 +294,7 @@ class Eraser:
 
     def _leave_lobby(self, advance: Callable[[int], None]) -> None:
         self._lobby.erase(self._noting(advance))
+        self._cells.erase(self._noting(advance))
 
     def _noting(self, advance: Callable[[int], None]) -> Callable[[Sequence[Version]], None]:
         def note(versions: Sequence[Version]) -> None:

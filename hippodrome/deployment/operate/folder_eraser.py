@@ -26,6 +26,7 @@ from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
 from hippodrome.deployment.aws.versions import Version
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of
+from hippodrome.deployment.operate.cells_eraser import CellsEraser
 from hippodrome.deployment.operate.data_folder import DataFolder
 from hippodrome.deployment.operate.lobby_eraser import LobbyEraser
 from hippodrome.deployment.operate.session_eraser import FoundSession, SessionEraser
@@ -59,10 +60,11 @@ class FolderEraser:
         self._label = ids.server_label(project, user)
         self._sessions = SessionEraser(self._folder, project, user)
         self._lobby = LobbyEraser(self._folder, project, user)
+        self._cells = CellsEraser(self._folder, project, user)
 
     def look(self) -> tuple[list[Version], list[FoundSession]]:
         """Find the participant's own files, the lobby's files that name them, and their sessions."""
-        return [*self._own(), *self._lobby.look()], self._sessions.sessions()
+        return [*self._own(), *self._lobby.look(), *self._cells.look()], self._sessions.sessions()
 
     def run(self) -> Erased:
         """Erase the participant. Raises `Problem` if `make run` runs, or left a server or an unfinished recording."""
@@ -79,6 +81,7 @@ class FolderEraser:
                     self._folder.delete(self._of_server(ids.server_label(self.project, found.id)), note)
                 self._sessions.leave(found, note)
             self._lobby.erase(note)
+            self._cells.erase(note)
             self._release_slot()
             self._delete_state(note)
             self._folder.delete(self._own(), note)
@@ -89,7 +92,7 @@ class FolderEraser:
     @property
     def unreadable(self) -> list[str]:
         """Return the documents that may name the participant and cannot be read."""
-        return [*self._sessions.unreadable, *self._lobby.unreadable]
+        return [*self._sessions.unreadable, *self._lobby.unreadable, *self._cells.unreadable]
 
     def _own(self) -> list[Version]:
         return [

@@ -19,7 +19,7 @@ from hippodrome.local.check.wording import short
 from hippodrome.protocol.answer import UNMATCHED
 from hippodrome.protocol.similar import did_you_mean
 
-VALUES = ("answers", "completion_code", "group", "participant", "project")
+VALUES = ("answers", "completion_code", "condition", "group", "order", "participant", "project", "run", "wrong")
 """The values that a page may use (docs/pages.md)."""
 
 
@@ -161,6 +161,19 @@ def _values(config: Config | None, group: int | None) -> dict[str, Any]:
         "group": group,
         "completion_code": "ABCDEF",
         "answers": {},
+        "wrong": [],
+        **_levels(config),
+    }
+
+
+def _levels(config: Config | None) -> dict[str, Any]:
+    """`condition`, `order` and `run`, for a participant with the first level of each factor."""
+    conditions, blocks = (config.design.conditions, config.design.blocks) if config else ((), ())
+    within = [factor for block in blocks for factor in block.factors]
+    return {
+        "condition": {factor.name: next(iter(factor.levels)) for factor in (*conditions, *within)},
+        "order": {factor.name: list(factor.levels) for factor in within},
+        "run": {"position": 1},
     }
 
 

@@ -15,8 +15,8 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Annotated
@@ -56,13 +56,21 @@ class Crowd:
     at_once: int
     patience: float
     ramp: float
+    right: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # the right answers of checks, by step
 
 
 async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
     """Send the crowd through the study, and return the bots' reports. If this is cancelled, all bots end."""
     run, width = secrets.token_hex(3), len(str(crowd.bots))
     bots = [
-        Bot(link, f"bot-{run}-{number:0{width}}", Random(f"{run}{number}"), play=crowd.play, patience=crowd.patience)  # noqa: S311
+        Bot(
+            link,
+            f"bot-{run}-{number:0{width}}",
+            Random(f"{run}{number}"),  # noqa: S311 - bots
+            play=crowd.play,
+            patience=crowd.patience,
+            right=crowd.right,
+        )
         for number in range(1, crowd.bots + 1)
     ]
     return await walk(bots, at_once=crowd.at_once, ramp=crowd.ramp, watch=watch)
@@ -247,7 +255,14 @@ def main(
             fine = _rehearse_and_report(
                 folder,
                 config,
-                Crowd(bots, play=play, at_once=max(at_once, config.project.players), patience=patience, ramp=ramp),
+                Crowd(
+                    bots,
+                    play=play,
+                    at_once=max(at_once, config.project.players),
+                    patience=patience,
+                    ramp=ramp,
+                    right={step.key: step.step.right for step in config.steps if step.step and step.step.right},
+                ),
                 link=study.link if study else str(link),
                 data=place,
                 study=study,

@@ -53,7 +53,7 @@ def report(
     troubles = [f"{bot.user_id}: {trouble}" for bot in reports for trouble in bot.troubles]
     if troubles:
         table.add_row("troubles got over", str(len(troubles)))
-    if not any(bot.finished for bot in reports) and not errors:
+    if not any(bot.finished or bot.end for bot in reports) and not errors:
         errors = ["no bot came to the last page"]
     bad = errors + (found.missing if found else []) + (left.words() if left else [])
     failures = [crash.words() for crash in crashes]
@@ -82,6 +82,9 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
     rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
     for step, count in sorted(Counter(bot.ended for bot in reports if bot.ended).items()):
         rows.append(("ended before", f"{count} at step {step}, whose page had no button for them to press"))
+    ends = Counter(bot.end for bot in reports if bot.end)
+    if ends:
+        rows.append(("other ends reached", ", ".join(f"{end} {count}" for end, count in sorted(ends.items()))))
     rows += _together(reports)
     games = _games(reports)
     if stopped := sum(any(each.stopped for each in game) for game in games):

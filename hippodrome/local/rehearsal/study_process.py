@@ -160,6 +160,16 @@ def _owner(variables: Mapping[str, str], data: Path) -> str | None:
     return None
 
 
+class _AsWritten(yaml.SafeLoader):
+    """Leaves words such as `no` and `on` as they are written, since a level or a right answer may be one."""
+
+
+_AsWritten.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool" or first in "tTfF"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
 def copy_of(project: Path, folder: Path) -> list[str]:
     """Copy the project to `folder`, by links, and change the copy so that bots can end the game.
 
@@ -171,7 +181,7 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     for path in project.iterdir():
         if path != config and path.name not in ("data", TRIED) and not path.name.startswith("."):
             (folder / path.name).symlink_to(path.resolve())
-    tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+    tree = yaml.load(config.read_text(encoding="utf-8"), _AsWritten)  # noqa: S506 - a SafeLoader
     _copy_policies(project, folder, tree.get("trial") or {})
     project_id = source.adapted.at(("project", "id"))  # it may come from the folder's name, and the copy has another
     if isinstance(project_id, str):
@@ -206,7 +216,9 @@ def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> Non
     Local mode reports the mistakes in `players` and `substitute`.
     """
     named = {key: trial.get(key) for key in ("players", "substitute")}
-    for top in {Path(file).parts[0] for _, file in who.files(named) if (project / file).is_file()}:
+    for top in {Path(file).parts[0] for _, file in who.files(named) if "{" in file or (project / file).is_file()}:
+        if not (folder / top).is_symlink():
+            continue
         (folder / top).unlink()
         if (project / top).is_dir():
             shutil.copytree(project / top, folder / top)

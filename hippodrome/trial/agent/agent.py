@@ -184,6 +184,7 @@ class AgentAdapter:
         self._env_methods: dict[str, Callable[..., Any]] = {}  # methods of the environment that the agent lacks
         self._feedback: tuple[Callable[..., Any], bool] | None = None  # the agent's method; whether it takes the player
         self._word = signatures.NO_WORD  # the newest word of feedback since the last step
+        self._options: dict[str, Any] | None = None
         self._env_reports_action = False
         self.action_space: tuple[str, ...] = self.configured_actions
         """The names of the actions, by their numbers; without names in config.yml, empty until `name_actions`."""
@@ -279,7 +280,7 @@ class AgentAdapter:
             signatures.ACTION: action,
             signatures.WORD: self._word,
             signatures.SEED: seed,
-            signatures.OPTIONS: None,
+            signatures.OPTIONS: self._options,
             signatures.MODE: "rgb_array",
             signatures.PLAYER: player,
         }
@@ -287,6 +288,10 @@ class AgentAdapter:
             self._word = signatures.NO_WORD
         function = self._env_methods.get(method) or getattr(self._agent, method)
         return self._signatures[method].call(function, given)
+
+    def set_options(self, options: Mapping[str, Any]) -> None:
+        """Give `reset` these options from now on, if it takes options: those of the game that is played."""
+        self._options = dict(options) or None
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
         """Begin an episode. Return its first observation, its info, and whether `reset` took the seed.

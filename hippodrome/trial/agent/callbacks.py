@@ -68,6 +68,10 @@ class Session:
     """The end of the episode: terminated, truncated, reset, stopped, failed or turnSeconds; None while it goes on."""
     replaying: bool
     """Whether steps of an earlier server are taken again. Then `record` does nothing: that recording has the values."""
+    condition: Mapping[str, str]
+    """The levels of the study's factors between people, by factor."""
+    run: Mapping[str, Any]
+    """The levels of the factors within people, by factor, and the `position` of this run; empty outside of blocks."""
     env: Any
     record: Record
     """`record(name, value)` writes the value into the recording, under this name."""
@@ -82,6 +86,8 @@ class TrialFacts:
     group: int | None = None
     players: tuple[str, ...] = (PLAYER,)
     humans: tuple[str, ...] = (PLAYER,)
+    condition: Mapping[str, str] = field(default_factory=dict)
+    run: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -254,6 +260,8 @@ class Callbacks:
             scores=dict(now.scores),
             why=now.why,
             replaying=self.replaying,
+            condition=facts.condition,
+            run=facts.run,
             env=self._env(),
             record=_discard if self.replaying else call.record,
         )

@@ -104,6 +104,10 @@ class JointAdapter:
         """The imported agent.py, as in `AgentAdapter.agent_module`."""
         return self._adapter.agent_module
 
+    def set_options(self, options: Mapping[str, Any]) -> None:
+        """Give `reset` these options from now on, as in `AgentAdapter.set_options`."""
+        self._adapter.set_options(options)
+
     def reset(self, seed: int) -> tuple[Joint, bool]:
         """Begin an episode. Return its first observations and infos, and whether `reset` took the seed.
 

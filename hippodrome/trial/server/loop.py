@@ -79,7 +79,8 @@ class TrialLoop:
         )
         self.ready = asyncio.Event()
         """An event that is set once there is a first frame, or the trial is over without one."""
-        self._settings = settings
+        self.settings = settings
+        """The server's settings, with what this game has for itself."""
         self._hide = partial(without, settings.private) if settings.session else str
         """A function that removes members' ids from a text, since a session's recording belongs to all members."""
         self._worker = worker
@@ -219,15 +220,15 @@ class TrialLoop:
 
         In a session, both hold members' answers by the members' ids.
         """
-        if not self._settings.session:
+        if not self.settings.session:
             return await self._recorder.earlier_answers(), {}
         answers = await self._recorder.members_answers()
-        over = bool(answers) and len(answers) == len(self._settings.seats)
+        over = bool(answers) and len(answers) == len(self.settings.seats)
         return (answers, {}) if over else (None, answers)
 
     async def _players_of(self, started: StartedAgent) -> TrialPlayers | None:
         """Return who plays in this trial; None if the policies cannot be loaded, which is logged."""
-        settings = self._settings
+        settings = self.settings
         try:
             return await self._worker.call(lambda: started.players_of(settings), limit=settings.start_seconds)
         except (PlayersError, PolicyError) as error:
@@ -237,7 +238,8 @@ class TrialLoop:
         return None
 
     def _calls_of(self, started: StartedAgent, playing: TrialPlayers) -> Calls:
-        stamp, config = self._recorder.stamp, self._settings.trial
+        stamp, config = self._recorder.stamp, self.settings.trial
+        started.agent.set_options(config.options)
         if isinstance(started.agent, JointAdapter):
             return JointCalls(
                 started.agent,
@@ -305,7 +307,7 @@ class TrialLoop:
 
     def _use_callbacks(self, started: StartedAgent, players: Sequence[Player]) -> None:
         """If the agent has callbacks, call them from now on."""
-        settings, agent = self._settings, started.agent
+        settings, agent = self.settings, started.agent
         if not started.callbacks:
             return
         self.core.callbacks = True
@@ -317,6 +319,8 @@ class TrialLoop:
                 settings.group,
                 tuple(player.name for player in players),
                 tuple(player.name for player in players if player.human),
+                settings.condition,
+                settings.levels,
             ),
             lambda: agent.env,
             seconds=settings.trial.callback_seconds,
@@ -396,7 +400,7 @@ class TrialLoop:
         task.add_done_callback(saved)
 
     def _log_agent_error(self, effect: LogAgentError) -> None:
-        text = report(effect.error, self._settings.agent_dir, self._settings.private)
+        text = report(effect.error, self.settings.agent_dir, self.settings.private)
         if text in self._logged:
             log.warning("the agent failed again, in the same way")
         else:

@@ -13,6 +13,7 @@ import json
 import logging
 import os
 from collections.abc import AsyncIterator, Coroutine
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from hippodrome.protocol import exits
+from hippodrome.protocol import assignment, exits
+from hippodrome.protocol.keys import assignment_key
 from hippodrome.trial.agent import match
 from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.tracebacks import report
@@ -31,7 +33,7 @@ from hippodrome.trial.core.messages import BadMessage, CloseConnection, CommandR
 from hippodrome.trial.core.players import PlayersError
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.recordings.spool import Spool, store_file
-from hippodrome.trial.recordings.store import Store, open_store
+from hippodrome.trial.recordings.store import Store, open_store, short_error
 from hippodrome.trial.server import watch
 from hippodrome.trial.server.admission import NOT_ASSIGNED, Admission, first_of
 from hippodrome.trial.server.assignment import AssignmentDocument, Search, set_environment
@@ -43,7 +45,7 @@ from hippodrome.trial.server.loop import TrialLoop
 from hippodrome.trial.server.matching import Matching
 from hippodrome.trial.server.private_log import IdFilter
 from hippodrome.trial.server.started import StartedAgent
-from hippodrome.trial.settings import TrialSettings
+from hippodrome.trial.settings import TrialSettings, trial_section
 from hippodrome.trial.wire import round_trips
 from hippodrome.trial.wire.connection import Connection
 from hippodrome.trial.wire.inbound import Inbound
@@ -79,6 +81,7 @@ class TrialServer:
         self._failure = 1  # the exit status if an error ends the server
         self._trials: list[TrialLoop] = []  # in their order, also ended ones, whose policies or callbacks may still run
         self._finished_steps: set[str] = set()
+        self._assigned: assignment.Assigned | None = None
         self._search: Search
         self._admission: Admission
         self._connections: dict[Connection, asyncio.Task[None]] = {}
@@ -229,12 +232,13 @@ class TrialServer:
             return
         hello = await self._admission.admit(websocket)
         self._listener.authenticated(websocket)
+        await self._learn_games()
         trial = self._trial_of(hello.step)
         drawing = self._drawing
         connection = Connection(
             websocket,
             decodes=hello.decodes,
-            lossless=self.settings.trial.lossless,
+            lossless=trial.settings.trial.lossless,
             stalled_seconds=self.settings.stalled_seconds,
             assets=drawing.assets,
             draw=drawing.draw,
@@ -303,7 +307,7 @@ class TrialServer:
         if not self.settings.session:
             yield
             return
-        report, samples = partial(trial.round_trip, human), self.settings.trial.ping_samples
+        report, samples = partial(trial.round_trip, human), trial.settings.trial.ping_samples
         measuring = asyncio.create_task(round_trips.measure(connection.websocket, samples, report))
         try:
             yield
@@ -313,7 +317,7 @@ class TrialServer:
     async def _receive(self, trial: TrialLoop, connection: Connection) -> None:
         """Receive a client's messages until its connection is closed. Raises CloseConnection and ConnectionClosed."""
         loop = asyncio.get_running_loop()
-        inbound = Inbound(connection.window if connection.binary else None, messages.words_of(self.settings.trial))
+        inbound = Inbound(connection.window if connection.binary else None, messages.words_of(trial.settings.trial))
         async for data in connection.websocket:
             try:
                 message = inbound.read(data, loop.time())
@@ -347,7 +351,7 @@ class TrialServer:
         if trial is not None and not trial.core.played:
             raise CloseConnection(4404, "another step's game is still going on")
         trial = TrialLoop(
-            self.settings,
+            self._settings_of(step),
             step,
             worker=self._worker,
             store=self._store,
@@ -358,6 +362,32 @@ class TrialServer:
         self._trials.append(trial)
         trial.begin(asyncio.shield(self._agent_ready)).add_done_callback(partial(self._trial_done, trial))
         return trial
+
+    async def _learn_games(self) -> None:
+        """Read once which games are played here, if the participants' games differ. Raises CloseConnection."""
+        settings = self.settings
+        if not settings.has_assignment or self._assigned is not None:
+            return
+        owner = settings.session or settings.user_id
+        try:
+            body = await asyncio.to_thread(self._store.get, assignment_key(settings.project_id, owner))
+            found = assignment.parse(body) if body is not None else None
+        except Exception as error:
+            log.warning("cannot read the assignment (%s)", short_error(error))
+            raise CloseConnection(1013, NOT_ASSIGNED) from error
+        if found is None or not found.games.keys() <= set(settings.game_steps):
+            raise CloseConnection(1013, NOT_ASSIGNED)
+        if self._assigned is None:
+            self._assigned, self.settings = found, replace(self.settings, game_steps=tuple(found.games))
+
+    def _settings_of(self, step: str) -> TrialSettings:
+        """The settings of the trial of this step: with the keys of `trial` that the game has for itself."""
+        game = self._assigned.games.get(step) if self._assigned else None
+        if self._assigned is None or game is None:
+            return self.settings
+        section = trial_section({**self.settings.trial.document(), **game.trial})
+        levels = {**game.levels, "position": game.position} if game.levels else {}
+        return replace(self.settings, trial=section, condition=self._assigned.condition, levels=levels)
 
     def _next_step(self) -> str:
         steps = self.settings.game_steps

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.agent import starting
 from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.joint import JointAdapter
@@ -55,7 +56,7 @@ class StartedAgent:
         started = cls(settings, agent, agent.callbacks)
         groups: Iterable[int | None] = () if settings.assigned else config.groups()
         for group in groups or (settings.group,):
-            started._loaded[started._key(group)] = started._load(group)
+            started._loaded[started._key(group)] = started._load(config, group)
         return started
 
     def _key(self, group: int | None) -> int | None:
@@ -67,7 +68,9 @@ class StartedAgent:
 
         `settings` are the present settings: since its start, a server may have been assigned to a group and a session.
         """
-        playing = self._loaded.pop(self._key(settings.group), None) or self._load(settings.group)
+        same = settings.trial == self.settings.trial  # a game of a study with factors may have players of its own
+        loaded = self._loaded.pop(self._key(settings.group), None) if same else None
+        playing = loaded or self._load(settings.trial, settings.group)
         return self._with_members(playing, settings) if settings.session else playing
 
     def _with_members(self, playing: TrialPlayers, settings: TrialSettings) -> TrialPlayers:
@@ -98,8 +101,8 @@ class StartedAgent:
             {name: policy for name, policy in stand_ins.items() if name not in vacant},
         )
 
-    def _load(self, group: int | None) -> TrialPlayers:
-        config, agent = self.settings.trial, self.agent
+    def _load(self, config: TrialSection, group: int | None) -> TrialPlayers:
+        agent = self.agent
         if not isinstance(agent, JointAdapter):
             return TrialPlayers(who_plays(config, {PLAYER: agent.action_space}, group), {})
         players = who_plays(config, {name: agent.action_spaces[name] for name in agent.players}, group)

@@ -340,7 +340,6 @@ def test_other_unknown_keys_have_no_effect_as_in_hippo(folder: Path, project: st
 @pytest.mark.parametrize(
     ("where", "more"),
     [
-        ("conditions", {"": "conditions: [a, b]\n"}),
         ("project.groups", {"project": "groups: 2\n"}),
         ("project.between_subjects", {"project": "between_subjects: {help: [yes, no]}\n"}),
         ("trial.treatment", {"trial": "treatment: a\n"}),
@@ -350,7 +349,7 @@ def test_a_key_for_conditions_says_how_they_are_made(folder: Path, where: str, m
     sections = {name: text for name, text in more.items() if name}
     (remark,) = remarks(read(folder, game(**sections) + more.get("", "")))
     assert remark.startswith(f"{where}: ")
-    assert "come from versions of a page, such as consent-0.html and consent-1.html (docs/pages.md#groups)" in remark
+    assert "conditions between people go under project.conditions" in remark
 
 
 def test_an_unknown_section_has_no_effect(folder: Path) -> None:

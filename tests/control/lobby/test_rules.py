@@ -14,7 +14,8 @@ from msgspec.structs import replace
 from hippodrome.control.lobby import decisions, matchmaking, rules, servers_ahead
 from hippodrome.control.lobby.decisions import Decisions, Formed, Matched, OpenSession, Proposal, Unmatched
 from hippodrome.control.lobby.entries import Entries, Waiting, milliseconds
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from tests.control.lobby.waiting_room import pairs
 

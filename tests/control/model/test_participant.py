@@ -4,8 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.control.model import ids, participant
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.participant import Progress
-from hippodrome.control.model.project import Events, Step
+from hippodrome.control.model.project import Events
 from hippodrome.control.ports import Entry
 from hippodrome.protocol.keys import answer_key, participant_folder
 from testing.studies import SECRET, study
@@ -133,14 +134,8 @@ def test_two_forms_are_the_same_in_any_order_of_their_fields() -> None:
 def test_the_steps_at_which_something_happens() -> None:
     project = study()
     steps = {step.key: step for step in project.steps}
-    following = [participant.following_step(project, step) for step in project.steps]
-    assert [step and step.key for step in following] == ["2", "3", "4", "finalStep", None]
-    assert participant.following_step(project, Step("unknown", "x")) is None
     assert [key for key, step in steps.items() if participant.starts_server(project, step)] == ["2"]
     assert [key for key, step in steps.items() if participant.stops_server(project, step)] == ["4"]
-    assert [key for key, step in steps.items() if participant.reached_without_post(project, step)] == ["4"]
-    game_first = study(steps=[Step("1", "game"), Step("finalStep", "debrief")])
-    assert [participant.reached_without_post(game_first, step) for step in game_first.steps] == [False, True]
 
 
 def test_without_a_stop_step_a_server_is_wanted_to_the_end() -> None:

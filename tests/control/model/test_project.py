@@ -6,7 +6,8 @@ import msgspec
 import pytest
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import AwsSetup, Events, MasterList, Project, Step, step_key
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import AwsSetup, Events, MasterList, Project, step_key
 from hippodrome.control.model.records import from_json, to_json
 from testing.studies import SECRET, study
 
@@ -80,6 +81,9 @@ def test_fields_that_a_registration_leaves_out_have_their_defaults() -> None:
     assert msgspec.structs.asdict(from_json(b'{"id": "maze", "steps": []}', Project)) == {
         "id": "maze",
         "steps": [],
+        "conditions": (),
+        "blocks": (),
+        "ends": (),
         "name": "",
         "researcher": "",
         "contact": "",

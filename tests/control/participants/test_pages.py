@@ -19,7 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Reason
 from hippodrome.control.model.texts import ENGLISH, IN_ENGLISH, SAID
 from hippodrome.control.participants import frame, pages, scripts
@@ -272,7 +273,8 @@ def test_clients_with_their_own_frame_get_the_researchers_page_with_the_step_and
 
 def test_pages_without_expressions_do_not_import_jinja() -> None:
     code = (
-        "import sys; from hippodrome.control.participants import pages; from hippodrome.control.model.project import Project, Step;"
+        "import sys; from hippodrome.control.participants import pages; "
+        "from hippodrome.control.model.design import Step; from hippodrome.control.model.project import Project;"
         "p = Project(id='a', steps=[Step('1', 'x'), Step('2', 'y')]);"
         "pages.step_page(pages.StepView(p, p.steps[0], 'u', '<p>x</p>', {}, 't', '/', False));"
         "print('jinja2' in sys.modules, 'html.parser' in sys.modules)"

@@ -9,8 +9,9 @@ from dataclasses import replace
 import pytest
 
 from hippodrome.control.model import ids, messages, server
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskChanged
-from hippodrome.control.model.project import MASTER_LIST, MasterList, Project, Step
+from hippodrome.control.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Reason, Server, ServerState
 from hippodrome.control.ports import DnsRecord, RefusedDnsRecords, ServiceBusy

@@ -6,7 +6,8 @@ import msgspec
 import pytest
 
 from hippodrome.control.model import server
-from hippodrome.control.model.project import Events, Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Events, Project
 from hippodrome.control.model.server import Reason, Server, next_attempt, requestable_attempt
 from hippodrome.control.ports import Conflict, Topic
 from hippodrome.control.servers.replacement import Replacement

@@ -12,7 +12,8 @@ import pytest
 
 from hippodrome.control.http import Request
 from hippodrome.control.model import ids, server
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Reason, Server
 from hippodrome.control.servers.signing import (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from hippodrome.control.model import ids, server
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import StartServer
-from hippodrome.control.model.project import AwsSetup, Project, Step
+from hippodrome.control.model.project import AwsSetup, Project
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Server
 from hippodrome.control.ports import TaskRequest

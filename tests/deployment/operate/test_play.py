@@ -20,7 +20,8 @@ import yaml
 from hippodrome.console.problem import Exit
 from hippodrome.control.lobby import decisions
 from hippodrome.control.lobby.decisions import Decisions, OpenSession
-from hippodrome.control.model.project import MASTER_LIST, MasterList, Step, UnreadableEntry, read_list, write_list
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import MASTER_LIST, MasterList, UnreadableEntry, read_list, write_list
 from hippodrome.control.model.records import to_json
 from hippodrome.control.model.server import ServerState
 from hippodrome.control.storage.project_cache import FRESH

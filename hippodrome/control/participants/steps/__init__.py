@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from hippodrome.control.http import Response
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.participants.forms import PostedForm
 from hippodrome.control.participants.steps.game import GameStep
 from hippodrome.control.participants.steps.page import PageStep

@@ -10,8 +10,9 @@ from typing import Any
 from hippodrome.control import http
 from hippodrome.control.http import Response
 from hippodrome.control.model import ids, participant, server
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import StartServer, StopServer, to_message
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server, ServerState, may_go_without, next_attempt, requestable_attempt
 from hippodrome.control.participants import frame, pages
 from hippodrome.control.participants.forms import PostedForm
@@ -100,9 +101,10 @@ class GameStep:
             if may_go_without(record):
                 self._services.answers.store(project, user_id, step, participant.failed_game(project, user_id))
         elif (attempt := requestable_attempt(record)) is not None:
-            due = repository.progress(project.id, user_id).due_step(project)
-            if participant.may_have_server(project, due):  # the ticket of a game that is over stays valid
-                self._request_server(project, owner, attempt)
+            progress = repository.progress(project.id, user_id)
+            own = repository.own_project(project, user_id, progress)
+            if not progress.has_ended and participant.may_have_server(own, progress.due_step(own)):
+                self._request_server(project, owner, attempt)  # the ticket of a game that is over stays valid
 
     def _state_alone(self, visit: Visit) -> dict[str, Any]:
         """The state of the participant's own server.
@@ -142,9 +144,8 @@ class GameStep:
         if not participant.may_have_server(project, step):
             return None
         if record is None:
-            since = visit.progress.reached_at(project, step)
-            overdue = visit.progress.has_arrived if since is None else now - since > ASK_AGAIN
-            return 1 if overdue else None
+            since = visit.progress.reached_at(project, step)  # None: at the first step, each load sends the message
+            return 1 if since is not None and now - since > ASK_AGAIN else None
         full = server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else next_attempt(record)

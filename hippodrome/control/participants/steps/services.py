@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from hippodrome.control.model.project import Project, Step
+from hippodrome.control.model.design import Step
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
 from hippodrome.control.participants.answers import Answers
 from hippodrome.control.participants.waiting import ServerStates

@@ -9,13 +9,18 @@ from typing import Any
 
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.memberships import Membership
-from hippodrome.control.model.project import Step
+from hippodrome.control.model.place import values_of
 from hippodrome.control.model.texts import Texts
 from hippodrome.control.participants.page_error import CONTENT_NOT_FOUND, PageError
 from hippodrome.control.participants.sandbox import FragmentError, records_mentioned
 from hippodrome.control.participants.steps.services import StepServices
 from hippodrome.control.participants.steps.visit import Visit
+
+
+class NeedsAssignment(Exception):
+    """The page shows the participant's levels or orders, which are not drawn yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +59,17 @@ def rendering(visit: Visit, *sources: PageSource) -> Iterator[None]:
 
 def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapping[str, Any]:
     """The values that a page may use. Records are read only if the page mentions them."""
-    project, user_id, repository = visit.project, visit.user_id, services.repository
+    project, user_id, repository, standing = visit.project, visit.user_id, services.repository, visit.standing
     mentioned = records_mentioned(text)
+    if standing.assignment is None and project.assigns and mentioned & {"condition", "order"}:
+        raise NeedsAssignment
     values: dict[str, Any] = {
         "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
         "participant": {"userId": user_id},
         "group": project.group(user_id, page),
         "completion_code": ids.completion_code(project.secret, user_id),
+        "wrong": list(visit.wrong),
+        **values_of(project, standing.assignment, visit.step),
     }
     if "participant" in mentioned:
         known = repository.participant(project.id, user_id)
@@ -73,6 +82,7 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
         games = [services.answers.read(project.id, user_id, key) for key in visit.progress.answered_games(project)]
         codes = (str(game["completionCode"]) for game in games if "completionCode" in game)
         values["completion_code"] = next(codes, values["completion_code"])
-    named = [key for key in visit.progress.answered if "answers" in mentioned or f"answers.{key}" in mentioned]
-    values["answers"] = {key: services.answers.read(project.id, user_id, key) for key in named}
+    names = dict.fromkeys(step.step_name for step in project.steps if step.key in visit.progress.answered)
+    named = [name for name in names if "answers" in mentioned or f"answers.{name}" in mentioned]
+    values["answers"] = {name: standing.answers_to(name, visit.step) for name in named}
     return values

@@ -18,8 +18,9 @@ from hippodrome.control.limits.rules import ParticipantSlots, ServerSlots
 from hippodrome.control.lobby import decisions
 from hippodrome.control.lobby.decisions import Decisions
 from hippodrome.control.model import server, warm_pool
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.participant import Participant, participant_key
-from hippodrome.control.model.project import Project, Step, UnreadableEntry
+from hippodrome.control.model.project import Project, UnreadableEntry
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.warm_pool import Pool
 from hippodrome.control.participants import pages

@@ -1,0 +1,312 @@
+"""What participants meet in studies with a design: checks, ends, conditions, and steps that are repeated."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from hippodrome.control.model.design import latin_rows
+from hippodrome.control.ports import Topic
+from testing.designed import DesignedStudy, write
+from testing.fake_platform import FakePlatform
+from testing.visitors import Browser
+
+PAGES = {
+    "consent": "<h1>Consent</h1><input name='agree'><button>Go on</button>",
+    "quiz": "<h1>Quiz</h1><p>{{ wrong | join(' ') }}</p><input name='soups'><input name='late'><button>Go on</button>",
+    "rate": "<h1>Rate</h1><p>look {{ condition.look }} run {{ run.position }}</p><input name='q1'><button>Go on</button>",
+    "debrief": "<h1>Thanks</h1>{{ completion_code }} {{ condition.partner }} {{ order.look | join(',') }}",
+}
+SOUP = """
+project:
+  id: soup
+  conditions: {partner: [helpful, lazy], advice: [on, off]}
+  steps:
+    - consent
+    - quiz: {right: {soups: 3, late: no}, tries: 2}
+    - game
+    - debrief
+  ends:
+    declined: answers.consent.agree == "no"
+    screenedOut: {when: not answers.quiz.passed, code: CS1, link: "https://example.org/back"}
+    late: {minutes: 60}
+trial:
+  game: kitchen
+  players: {human: human, partner: "policies/{partner}.onnx"}
+  options: {advice: "{advice}", fixed: 1}
+"""
+LOOKS = """
+project:
+  id: looks
+  steps:
+    - consent
+    - each: {look: [plain, face, voice]}
+      steps: [game: {options: {look: "{look}"}, maxEpisodes: 2}, rate]
+    - debrief
+trial: {game: kitchen, maxEpisodes: 5}
+"""
+
+
+@pytest.fixture
+def platform() -> FakePlatform:
+    from hippodrome.functions import installed
+
+    made = FakePlatform()
+    installed.use(made)
+    return made
+
+
+def study(config: str, tmp_path: Path, platform: FakePlatform) -> DesignedStudy:
+    folder = write(tmp_path / "study", config, PAGES)
+    (folder / "policies").mkdir()
+    for name in ("helpful", "lazy"):
+        (folder / "policies" / f"{name}.onnx").touch()
+    return DesignedStudy(folder, platform)
+
+
+def heading(page: str) -> str:
+    found = re.search(r"<h1[^>]*>(.*?)</h1>", page)
+    assert found, page
+    return found[1]
+
+
+def topics(platform: FakePlatform) -> list[Topic]:
+    return [topic for topic, _ in platform.bus.sent]
+
+
+# Ends
+
+
+def test_who_declines_is_asked_nothing_more_and_gets_no_server(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    alice = soup.visitor("alice")
+    alice.answer(alice.get(), agree="no")
+    page = alice.get()
+    assert heading(page) == "Thank you"
+    end = soup.stored("alice", "end")
+    assert (end["end"], end["code"] in page) == ("declined", True)
+    assert topics(platform) == [Topic.STOP], "no server was requested"
+    alice.post(agree="yes")
+    assert heading(alice.get()) == "Thank you"
+    assert soup.answers("alice") == {"consent": {"agree": "no"}}
+
+
+def test_who_fails_the_check_twice_gets_the_ends_code_and_link(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    alice = soup.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    first = alice.get()
+    alice.answer(first, soups="2", late="no")
+    page = alice.get()
+    assert "One answer is not right yet. You have one try left." in page
+    assert "<p>soups</p>" in page, "the page may say which"
+    alice.answer(first, soups="3", late="no")
+    assert "One answer is not right yet." in alice.get(), "going back gives no further try"
+    alice.answer(page, soups="4", late="yes")
+    page = alice.get()
+    assert "CS1" in page
+    assert 'href="https://example.org/back"' in page
+    assert soup.answers("alice")["quiz"] == {"soups": "4", "late": "yes", "passed": False, "tries": 2}
+    assert soup.answers("alice")["quiz.1"] == {"soups": "2", "late": "no"}
+
+
+def test_who_is_right_goes_on(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    alice = soup.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.answer(alice.get(), soups=" 3", late="NO")
+    assert "queued" in alice.get()
+    assert soup.answers("alice")["quiz"]["passed"] is True
+    assert "3" not in "".join(PAGES["quiz"]), "the right answers stand in config.yml only"
+
+
+def test_time_runs_out_between_steps_and_not_in_a_game(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    alice, bob = soup.visitor("alice"), soup.visitor("bob")
+    for person in (alice, bob):
+        person.answer(person.get(), agree="yes")
+    bob.answer(bob.get(), soups="3", late="no")
+    bob.get()
+    platform.wait(seconds=61 * 60)
+    assert heading(alice.get()) == "Thank you"
+    assert soup.stored("alice", "end")["end"] == "late"
+    bob.get()
+    assert soup.stored("bob", "end") is None, "the game goes on"
+    soup.play("bob", "game")
+    assert heading(bob.get()) == "Thanks", "whoever has come to the last step has finished"
+
+
+# Conditions
+
+
+def through_soup(soup: DesignedStudy, user: str) -> Any:
+    person = soup.visitor(user)
+    person.answer(person.get(), agree="yes")
+    person.answer(person.get(), soups="3", late="no")
+    person.get()
+    return soup.stored(user, "assignment")
+
+
+def test_cells_fill_evenly_whatever_the_ids(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    cells = Counter(tuple(through_soup(soup, f"P{number}")["condition"].values()) for number in range(42))
+    assert len(cells) == 4
+    assert max(cells.values()) - min(cells.values()) <= 1
+
+
+def test_an_assignment_says_what_the_game_has_for_itself(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    seen = [through_soup(soup, f"P{number}") for number in range(8)]
+    for assignment in seen:
+        condition, game = assignment["condition"], assignment["games"]["game"]
+        trial = {**soup.project.trial, **game.get("trial", {})}
+        assert trial["players"] == {"human": "human", "partner": f"policies/{condition['partner']}.onnx"}
+        assert trial["options"] == {"advice": condition["advice"], "fixed": 1}
+
+
+def test_who_has_left_for_an_hour_is_not_counted(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    for number in range(8):
+        through_soup(soup, f"gone{number}")
+    finished = through_soup(soup, "done")["condition"]
+    soup.play("done", "game")
+    soup.visitor("done").get()
+    platform.wait(seconds=2 * 3600)
+    cells = [through_soup(soup, f"P{number}")["condition"] for number in range(7)]
+    counted = Counter(json.dumps(cell) for cell in [*cells, finished])
+    assert set(counted.values()) == {2}, "the one who finished counts, the eight who left do not"
+
+
+def test_a_repeated_assignment_is_the_same(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    first = through_soup(soup, "alice")
+    del platform.documents.kept["soup/users/alice/assignment.json"]
+    soup.visitor("alice").get()
+    assert soup.stored("alice", "assignment") == first
+    assert sum(json.loads(platform.documents.kept["_cells/soup.json"][0])["people"].values()) == 1
+
+
+# Blocks
+
+
+def through_looks(looks: DesignedStudy, user: str) -> list[str]:
+    """Take part up to the end; return the levels in the order in which they came."""
+    person, order = looks.visitor(user), []
+    person.answer(person.get(), agree="yes")
+    for position in range(1, 4):
+        assert "queued" in person.get() or position
+        (due,) = [key for key in looks.stored(user, "assignment")["games"] if key not in looks.answers(user)][:1]
+        looks.play(user, due, score=position)
+        page = person.get()
+        found = re.search(r"look (\w+) run (\d)", page)
+        assert found
+        assert (f"game-{found[1]}", found[2]) == (due, str(position))
+        order.append(found[1])
+        person.answer(page, q1=str(position))
+    assert ",".join(order) in person.get()
+    return order
+
+
+def test_each_level_comes_once_and_the_orders_are_those_of_a_williams_square(
+    tmp_path: Path, platform: FakePlatform
+) -> None:
+    looks = study(LOOKS, tmp_path, platform)
+    orders = [through_looks(looks, f"P{number}") for number in range(6)]
+    levels = ["plain", "face", "voice"]
+    assert sorted(orders) == sorted([levels[place] for place in row] for row in latin_rows(3))
+    answers = looks.answers("P0")
+    assert set(answers) == {"consent", *(f"{step}-{level}" for step in ("game", "rate") for level in levels)}
+    games = looks.stored("P0", "assignment")["games"]
+    for level in levels:
+        assert games[f"game-{level}"]["trial"]["maxEpisodes"] == 2
+        assert {**looks.project.trial, **games[f"game-{level}"]["trial"]}["options"] == {"look": level}
+    assert list(games) == [f"game-{level}" for level in orders[0]]
+
+
+@pytest.mark.parametrize("order", ["random", "fixed"])
+def test_the_other_orders(tmp_path: Path, platform: FakePlatform, order: str) -> None:
+    looks = study(LOOKS.replace("steps: [game:", f"order: {order}\n      steps: [game:"), tmp_path, platform)
+    orders = {tuple(through_looks(looks, f"P{number}")) for number in range(8)}
+    assert (len(orders) > 1) == (order == "random")
+    assert order == "random" or orders == {("plain", "face", "voice")}
+
+
+def test_only_some_runs_are_taken(tmp_path: Path, platform: FakePlatform) -> None:
+    looks = study(LOOKS.replace("steps: [game:", "take: 2\n      steps: [game:"), tmp_path, platform)
+    alice = looks.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.get()
+    assert len(looks.stored("alice", "assignment")["games"]) == 2
+
+
+def test_a_server_starts_at_the_first_run_and_stops_after_the_last(tmp_path: Path, platform: FakePlatform) -> None:
+    looks = study(LOOKS, tmp_path, platform)
+    through_looks(looks, "alice")
+    looks.visitor("alice").get()
+    kinds = [kind for place, kind in enumerate(topics(platform)) if place == 0 or topics(platform)[place - 1] != kind]
+    assert kinds == [Topic.START, Topic.STOP]
+
+
+# Steps that are skipped
+
+
+def test_a_step_is_skipped_unless_its_rule_holds(tmp_path: Path, platform: FakePlatform) -> None:
+    config = 'project:\n  id: skips\n  steps:\n    - consent\n    - rate: {when: answers.consent.agree == "yes"}\n    - debrief\n'
+    skips = study(config, tmp_path, platform)
+    alice, bob = skips.visitor("alice"), skips.visitor("bob")
+    for person, answer in ((alice, "yes"), (bob, "no")):
+        person.answer(person.get(), agree=answer)
+    assert (heading(alice.get()), heading(bob.get())) == ("Rate", "Thanks")
+    assert skips.answers("bob")["rate"] == {"outcome": "skipped"}
+
+
+def test_a_page_has_a_least_and_a_longest_time(tmp_path: Path, platform: FakePlatform) -> None:
+    config = "project:\n  id: times\n  steps:\n    - consent: {minSeconds: 60}\n    - rate: {maxSeconds: 30}\n    - debrief\n"
+    times = study(config, tmp_path, platform)
+    alice = times.visitor("alice")
+    page = alice.get()
+    alice.answer(page, agree="yes")
+    assert heading(alice.get()) == "Consent"
+    platform.wait(seconds=61)
+    alice.answer(page, agree="yes")
+    assert heading(alice.get()) == "Rate"
+    platform.wait(seconds=31)
+    assert heading(alice.get()) == "Thanks"
+    assert times.answers("alice")["rate"] == {"outcome": "timeOver"}
+
+
+# Everybody
+
+
+def test_four_hundred_random_participants_reach_an_end(tmp_path: Path, platform: FakePlatform) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    ends: Counter[str] = Counter()
+    for number in range(400):
+        random, user = Random(number), f"R{number}"
+        person = soup.visitor(user)
+        for _ in range(20):
+            page = person.get()
+            if soup.stored(user, "end") or "Thanks" in page:
+                break
+            step = _due(person, page)
+            if step == "game":
+                soup.play(user, "game", score=random.randrange(9))
+            else:
+                person.answer(page, agree=random.choice(["yes"] * 9 + ["no"]), soups=random.choice("33x"), late="no")
+            platform.wait(seconds=random.randrange(600))
+        else:
+            pytest.fail(f"{user} is stuck")
+        ends[(soup.stored(user, "end") or {"end": "complete"})["end"]] += 1
+    assert ends.keys() == {"complete", "declined", "screenedOut"}
+
+
+def _due(person: Browser, page: str) -> str:
+    found = re.search(r'data-step="(\w+)"', page)
+    assert found
+    return found[1]
