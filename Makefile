@@ -178,6 +178,7 @@ $(VENV)/requirements/%.txt: requirements/%.txt requirements/intel-mac.txt | $(VE
 $(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas constraints) | $(VENV)/bin/python
 	@echo 'Installing what a study needs (once; a minute or two) …'
 	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/local.txt $(NOT_INSTALLED)
+	@$(INSTALL) --no-deps --editable . $(NOT_INSTALLED)
 	@touch $@
 
 $(VENV)/deploy: $(REQUIREMENTS)/deploy.txt $(VENV)/local

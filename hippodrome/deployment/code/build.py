@@ -160,18 +160,24 @@ class _Tree:
         if path:
             yield self._member(path)
         for folder in DATA.get(module, ()):
-            for one in sorted((self._root / folder).rglob("*")):
+            for one in sorted((self._base("hippodrome") / folder).rglob("*")):
                 if one.is_file() and not any(part.startswith((".", "__")) for part in one.parts[-2:]):
                     yield self._member(one)
 
     def _member(self, path: Path) -> ZipMember:
         body = self._body(path)
-        return ZipMember(path.relative_to(self._root).as_posix(), hashlib.sha256(body).hexdigest(), lambda: body)
+        base = next(base for base in (self._root / "lambdas", self._base("hippodrome")) if path.is_relative_to(base))
+        name = path.relative_to(base.parent if base.name == "lambdas" else base).as_posix()
+        return ZipMember(name, hashlib.sha256(body).hexdigest(), lambda: body)
+
+    def _base(self, top: str) -> Path:
+        """The folder that has this package of ours. In a wheel, `lambdas` does not lie beside `hippodrome`."""
+        return self._root if (self._root / top).is_dir() else places.PACKAGES
 
     def _path(self, module: str) -> Path | None:
         if module.partition(".")[0] not in OURS:
             return None
-        path = self._root.joinpath(*module.split("."))
+        path = self._base(module.partition(".")[0]).joinpath(*module.split("."))
         return next((one for one in (path / "__init__.py", path.with_suffix(".py")) if one.is_file()), None)
 
     def _body(self, path: Path) -> bytes:
