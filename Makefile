@@ -2,12 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-DEPLOY = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m deploy
+HIPPODROME = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m hippodrome
 # `plan` and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?= .
-# Installs the study's own packages (requirements.txt).
-PACKAGES = [ ! -f "$(PROJECT)/requirements.txt" ] || $(BIN)/python -m hippodrome.local.requirements "$(PROJECT)" --constraints $(REQUIREMENTS)/trial.txt
 DATA ?=
 USER_ID ?=
 DATA_GIVEN = $(strip $(DATA))# DATA may be empty in the environment
@@ -50,39 +48,36 @@ help: ## list these commands
 
 .PHONY: run
 run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
-	@$(PACKAGES)
-	@$(BIN)/python -m hippodrome.local "$(PROJECT)" --data "$(if $(DATA_GIVEN),$(DATA),$(or $(PROJECT),.)/data)" --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
+	@$(HIPPODROME) run "$(or $(PROJECT),.)" $(if $(DATA_GIVEN),--data "$(DATA)") --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
 
 .PHONY: try
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
-	@$(PACKAGES)
-	@$(BIN)/python -m hippodrome.local.rehearsal "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
+	@$(HIPPODROME) try "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
 
 # The default of PORT= is for `make run`. Without PORT=, this server takes 5000, the port of Gymie.
 .PHONY: gym
 gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
-	@$(BIN)/python -m hippodrome.trial.gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
+	@$(HIPPODROME) gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
 
 .PHONY: new
 new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPLATE= (without it: which there are)
-	@$(BIN)/python -m hippodrome.local.new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
+	@$(HIPPODROME) new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
 
 .PHONY: check
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
-	@$(PACKAGES)
-	@$(BIN)/python -m hippodrome.local.check "$(PROJECT)" $(ARGS)
+	@$(HIPPODROME) check "$(PROJECT)" $(ARGS)
 
 .PHONY: deploy
 deploy: $(VENV)/deploy ## install on AWS (DOMAIN=, EMAIL=): the stack, its certificate, the study of PROJECT=.
-	@$(DEPLOY) up "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
+	@$(HIPPODROME) deploy "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: plan
 plan: $(VENV)/deploy ## show what `make deploy` would change in the installation
-	@$(DEPLOY) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
+	@$(HIPPODROME) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
 
 .PHONY: register
 register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new version
-	@$(DEPLOY) register "$(PROJECT)" $(ARGS) $(FOUND)
+	@$(HIPPODROME) register "$(PROJECT)" $(ARGS) $(FOUND)
 
 # With PROJECT= for one study; without it, `data`, `erase` and `cost` take the study in this folder, the others all studies.
 .PHONY: certificate doctor status cost data erase logs stop destroy
@@ -101,7 +96,7 @@ doctor status data erase logs stop: STUDY = $(if $(filter-out .,$(PROJECT)),--pr
 data erase: STUDY += $(if $(DATA_GIVEN),--from "$(DATA)")
 erase: WHO = -- "$(USER_ID)"
 certificate doctor status cost data erase logs stop destroy:
-	@$(DEPLOY) $@ $(STUDY) $(ARGS) $(WHO) $(FOUND)
+	@$(HIPPODROME) $@ $(STUDY) $(ARGS) $(WHO) $(FOUND)
 
 WORKERS ?=
 # Many tests wait for processes, so two cores have four workers. `loadscope` gives a worker the tests of a module.

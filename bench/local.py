@@ -1,4 +1,4 @@
-"""Measures pages and the start of a game with `python -m hippodrome.local`."""
+"""Measures pages and the start of a game with `hippodrome run`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study that `python -m hippodrome.local` runs, and visitors who open its pages."""
+"""A study that `hippodrome run` runs, and visitors who open its pages."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def folder() -> Iterator[Path]:
 @contextlib.contextmanager
 def running(study: Path) -> Iterator[str]:
     """Run the study in this folder within the block; give the address of its site."""
-    command = [sys.executable, "-u", "-m", "hippodrome.local", ".", "--port", "0"]
+    command = [sys.executable, "-u", "-m", "hippodrome", "run", ".", "--port", "0"]
     with subprocess.Popen(command, cwd=study, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             assert process.stdout is not None

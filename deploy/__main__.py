@@ -1,8 +1,13 @@
-"""`python -m deploy COMMAND`: runs a command of hippodrome/deployment/."""
+"""`python -m deploy COMMAND` is `hippodrome COMMAND`, also with a Python that lacks the packages."""
 
 import sys
 
-from hippodrome.deployment.__main__ import main
+try:
+    from hippodrome.cli import main
+except ModuleNotFoundError:
+    from hippodrome.deployment.core import venv
+
+    venv.go_on()
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -33,9 +33,9 @@ class GymServerProcess:
 
 @contextlib.contextmanager
 def gym_server(
-    *arguments: str, program: Sequence[str] = ("-m", "hippodrome.trial.gym", "--port", "0"), cwd: Path = ROOT
+    *arguments: str, program: Sequence[str] = ("-m", "hippodrome", "gym", "--port", "0"), cwd: Path = ROOT
 ) -> Iterator[GymServerProcess]:
-    """Run `python -m hippodrome.trial.gym` with these arguments at a free port for the block, or another `program` of Python."""
+    """Run `hippodrome gym` with these arguments at a free port for the block, or another `program` of Python."""
     command = [sys.executable, "-W", "ignore", *program, *arguments]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, cwd=cwd, env=os.environ | {"PYTHONPATH": f"{ROOT}:{cwd}"}

@@ -34,7 +34,7 @@ class HeldStudy(StudyProcess):
             environment.STALLED_SECONDS: str(self._stalled),
         }
         arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
-        return processes.start("hippodrome.local", arguments, **options)
+        return processes.start("hippodrome", ["run", *arguments], **options)
 
     def steps_written(self, owner: str = "*") -> int:
         """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""

@@ -20,13 +20,13 @@ MAY: dict[str, set[str]] = {
     "trial": {"protocol"},
     "export": {"console", "control", "protocol"},
     "bots": {"control", "protocol", "trial"},
-    "local": {"places", "control", "functions", "protocol", "bots", "trial"},
+    "local": {"places", "console", "control", "functions", "protocol", "bots", "trial"},
     "deployment": {"places", "console", "export", "control", "functions", "protocol", "bots", "trial"},
 }
 """Which packages of `hippodrome` a package may import, and `places.py`."""
 AROUND = {
     "lambdas": {"functions"},
-    "deploy": {"deployment"},
+    "deploy": {"cli", "deployment"},
     "testing": {"places", "deployment", "control", "functions", "local", "protocol", "trial"},
     "bench": {"places", "deployment", "control", "functions", "protocol", "trial"},
 }
@@ -152,7 +152,7 @@ def loaded(module: str) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("module", ["hippodrome.local.__main__", "hippodrome.local.check.__main__"])
+@pytest.mark.parametrize("module", ["hippodrome.local.run", "hippodrome.local.check.command"])
 def test_only_processes_of_servers_and_agents_load_numpy(module: str) -> None:
     """It takes a third as long to load as all the rest, and `make run` and `make check` need it only there."""
     assert loaded(module).get("numpy") is None

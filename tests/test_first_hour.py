@@ -55,7 +55,7 @@ ELSEWHERE = {
     "The AWS credentials have expired.": "deployment/operate/test_doctor.py",
     "The profile … is of `aws login`, whose credentials cannot be read here.": "deployment/aws/test_account.py",
     "This AWS account may not run another build now.": "deployment/study/test_codebuild.py",
-    "The installation stands, but has no certificate. …": "deployment/lifecycle/test_up.py",
+    "The installation stands, but has no certificate. …": "deployment/lifecycle/test_deploy.py",
     "… wants no further orders …": "certificate/test_command.py",
     "Nothing is ordered until …": "certificate/test_command.py",
     "The image could not be built": "deployment/study/test_codebuild.py",

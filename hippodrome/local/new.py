@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.new FOLDER TEMPLATE`: begin a study of your own with a copy of an example."""
+"""`hippodrome new`: begins a study of your own with a copy of an example."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import re
 import shlex
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Annotated
 import typer
 
 from hippodrome import places
+from hippodrome.console import screen
 from hippodrome.control.config import ConfigErrors
 from hippodrome.control.config.folder import ConfigSource, read_source
 from hippodrome.control.model import ids
@@ -82,12 +82,12 @@ def make_study(template: StudyTemplate, folder: Path) -> str:
 
 def what_next(folder: Path) -> str:
     """Return what the researcher can do with a new study: the commands, and the files to change."""
-    given = f"PROJECT={shlex.quote(str(folder))}"
+    study = shlex.quote(str(folder))
     lines = [
         "Next:",
-        f"  make run {given}     runs it on this machine; open the link and take part",
-        f"  make check {given}   finds mistakes in what you change",
-        f"  make try {given}     sends simulated participants through it",
+        f"  hippodrome run {study}     runs it on this machine; open the link and take part",
+        f"  hippodrome check {study}   finds mistakes in what you change",
+        f"  hippodrome try {study}     sends simulated participants through it",
         "Change config.yml (title, researcher, steps, game), steps/ (the pages) and agent.py (game and agent).",
     ]
     return "\n".join(lines)
@@ -167,27 +167,35 @@ def _text(source: ConfigSource, path: tuple[str, ...]) -> str:
     return str(source.adapted.at(path) or "")
 
 
-def main(
-    folder: Annotated[str, typer.Argument(help="The folder of the new study; it must be empty or not exist.")] = "",
-    template: Annotated[str, typer.Argument(help="The name of the study to copy.")] = "",
+def command(
+    folder: Annotated[
+        str,
+        typer.Argument(
+            metavar="STUDY", help="The folder of the new study; it must be empty or not exist.", show_default=False
+        ),
+    ] = "",
+    template: Annotated[
+        str,
+        typer.Argument(
+            metavar="TEMPLATE", help="The name of the study to copy; left out, all are listed.", show_default=False
+        ),
+    ] = "",
 ) -> None:
-    """Copy the study TEMPLATE to FOLDER, give it an id of its own, and say what to do next."""
+    """Copy the study TEMPLATE to the folder STUDY, give it an id of its own, and say what to do next."""
     known = templates()
-    usage = f"make new PROJECT=../my-study TEMPLATE={next(iter(known), '')}"
+    usage = f"hippodrome new {shlex.quote(folder) if folder else '../my-study'}"
     if template not in known:
-        problem = f"There is no template {template}." if template else f"Name a template: {usage}"
-        sys.stdout.write(f"{problem}\n{listing(known)}\n")
+        problem = (
+            f"There is no template {template}." if template else f"Name a template: {usage} {next(iter(known), '')}"
+        )
+        screen.result(f"{problem}\n{listing(known)}")
         raise typer.Exit(1 if template or folder else 0)
     if folder in ("", "."):
-        sys.stdout.write(f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={template}\n")
+        screen.result(f"Name the folder of the new study: hippodrome new ../my-study {template}")
         raise typer.Exit(1)
     try:
         project_id = make_study(known[template], Path(folder))
     except NotMade as refusal:
-        sys.stdout.write(f"{refusal}\n")
+        screen.result(str(refusal))
         raise typer.Exit(1) from None
-    sys.stdout.write(f"Made {folder} from {template}; its project id is {project_id}.\n{what_next(Path(folder))}\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+    screen.result(f"Made {folder} from {template}; its project id is {project_id}.\n{what_next(Path(folder))}")

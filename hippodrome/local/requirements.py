@@ -1,23 +1,25 @@
-"""`python -m hippodrome.local.requirements FOLDER`: install what a study's agent imports, by its `requirements.txt`.
+"""Installs what a study's agent imports, by its `requirements.txt`.
 
-`make run`, `make try` and `make check` begin with it. It installs once for each content of the file. If the servers'
+`hippodrome run`, `try` and `check` begin with it. It installs once for each content of the file. If the servers'
 image has one of the packages too, the image's version is installed, as on AWS.
 """
 
 from __future__ import annotations
 
 import hashlib
+import shlex
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
-from typing import Annotated
 
-import typer
+from packaging.requirements import InvalidRequirement, Requirement
 
 from hippodrome import places
 from hippodrome.control.config import ConfigErrors, layout
 
 OF_THE_IMAGE = places.ROOT / "requirements" / "trial.txt"
+STAMPS = Path(sys.prefix) / "studies"
 
 
 def wanted(folder: Path) -> Path | None:
@@ -57,19 +59,48 @@ def install(file: Path, constraints: Path, stamps: Path) -> str:
     return ""
 
 
-def main(
-    folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
-    *,
-    constraints: Annotated[Path, typer.Option(help="The versions of the servers' image.")] = OF_THE_IMAGE,
-    stamps: Annotated[Path, typer.Option(help="The folder that notes what has been installed.")] = Path(sys.prefix)
-    / "studies",
-) -> None:
-    """Install the packages of the study in FOLDER, once. The exit status is 0 even if that fails."""
+def prepare(folder: Path, constraints: Path | None = None, stamps: Path = STAMPS) -> None:
+    """Install what the study in this folder needs, once. Print a sentence if that fails, or is left to the researcher.
+
+    `constraints` has the versions of the servers' image; `stamps` is the folder that notes what has been installed.
+    """
     file = wanted(folder)
-    failure = install(file, constraints, stamps) if file else ""
+    if file is None:
+        return
+    if sys.prefix == sys.base_prefix:  # a Python of the whole machine, which is not ours to change
+        missing = ", ".join(not_installed(file))
+        failure = missing and (
+            f"This Python lacks {missing}, which {file} names, and is no virtual environment, so nothing was "
+            f"installed. Install it with: {shlex.join([sys.executable, '-m', 'pip', 'install', '-r', str(file)])}"
+        )
+    else:
+        failure = install(file, constraints or _constraints(), stamps)
     if failure:
         sys.stdout.write(f"{failure}\n")
+        sys.stdout.flush()
 
 
-if __name__ == "__main__":
-    typer.run(main)
+def not_installed(file: Path) -> list[str]:
+    """Return the requirements in the file that this Python does not meet. Options and addresses are left out."""
+    missing = []
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            requirement = Requirement(line.partition(" #")[0].strip())
+        except InvalidRequirement:
+            continue
+        if requirement.marker is not None and not requirement.marker.evaluate():
+            continue
+        try:
+            version = metadata.version(requirement.name)
+        except metadata.PackageNotFoundError:
+            missing.append(str(requirement))
+        else:
+            if not requirement.specifier.contains(version, prereleases=True):
+                missing.append(str(requirement))
+    return missing
+
+
+def _constraints() -> Path:
+    """The versions of the servers' image; on Intel Macs those that make has written, for which there are wheels."""
+    of_make = Path(sys.prefix) / "requirements" / OF_THE_IMAGE.name
+    return of_make if of_make.is_file() else OF_THE_IMAGE

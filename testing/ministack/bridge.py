@@ -108,7 +108,7 @@ def account() -> None:
 
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()  # as with `python -m`
-    if sys.argv[1:3] == ["-m", "deploy"]:
+    if sys.argv[1:3] == ["-m", "hippodrome"]:
         certificates()
         internet()
         account()

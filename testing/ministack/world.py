@@ -226,7 +226,7 @@ class MinistackWorld:
     # -- commands
 
     def deploy(self, *arguments: str, keys: Mapping[str, str] | None = None, stack: str = "") -> CommandRun:
-        """Run `python -m deploy …` in the copy of the project, with these credentials or with root's."""
+        """Run `hippodrome …` in the copy of the project, with these credentials or with root's."""
         env = {name: value for name, value in os.environ.items() if not name.startswith(("AWS_", "HIPPODROME_"))}
         env |= {
             "AWS_ENDPOINT_URL": self.endpoint,
@@ -246,7 +246,7 @@ class MinistackWorld:
         began = time.monotonic()
         with tempfile.TemporaryFile("w+") as errors:
             process = processes.start(
-                "deploy", arguments, cwd=self.source, env=env, stdout=subprocess.PIPE, stderr=errors
+                "hippodrome", arguments, cwd=self.source, env=env, stdout=subprocess.PIPE, stderr=errors
             )
             try:
                 out, _ = process.communicate(timeout=280)  # a busy machine takes its time; the tests may take 300 s

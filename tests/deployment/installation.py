@@ -30,6 +30,7 @@ from moto.ecr.models import ecr_backends
 from moto.s3.models import s3_backends
 from moto.sns.models import sns_backends
 
+from hippodrome.cli import main
 from hippodrome.control.model import ids, server, warm_pool
 from hippodrome.control.model.messages import StartServer, parse_task_changed
 from hippodrome.control.model.participant import Participant, participant_key
@@ -39,7 +40,6 @@ from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.model.warm_pool import Pool
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import KEY
-from hippodrome.deployment.__main__ import main
 from hippodrome.deployment.aws.account import Account
 from hippodrome.protocol.answer import Answer
 from hippodrome.protocol.keys import answer_key
@@ -291,7 +291,7 @@ def environment(endpoint: str = "") -> dict[str, str]:
 def process(env: dict[str, str], *arguments: str, folder: Path = ROOT, timeout: float = 90) -> CommandResult:
     """Run a command as a process of its own."""
     with tempfile.TemporaryFile("w+") as errors:
-        ran = processes.start("deploy", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
+        ran = processes.start("hippodrome", arguments, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=errors)
         try:
             out, _ = ran.communicate(timeout=timeout)
         finally:

@@ -48,13 +48,13 @@ def running() -> Iterator[RunningInstallation]:
 
 
 def arguments(command: str) -> list[str]:
-    """Return the arguments that make passes to `python -m deploy`."""
+    """Return the arguments that make passes to `hippodrome`."""
     line = subprocess.run(
         ["make", "-n", *shlex.split(command)[1:]], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    (run,) = [one for one in line.stdout.splitlines() if "-m deploy" in one]
+    (run,) = [one for one in line.stdout.splitlines() if "-m hippodrome" in one]
     words = shlex.split(run.partition("||")[0])
-    return words[words.index("deploy") + 1 :]
+    return words[words.index("hippodrome") + 1 :]
 
 
 def types(running: RunningInstallation, capsys: Any, command: str, answer: str = "") -> None:

@@ -17,7 +17,6 @@ from rich.console import Console
 
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.deployment.__main__ import COMMANDS, main
 from hippodrome.deployment.core import options
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,12 +85,12 @@ def test_names_that_aws_reserves_are_refused(name: str) -> None:
 @pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
 def test_make_passes_the_project_to_deploy(target: str) -> None:
     words = " ".join(make(target, "PROJECT=../maze", "ARGS=--json").split())
-    assert f'deploy {target} --project "../maze/" --json' in words
+    assert f'hippodrome {target} --project "../maze/" --json' in words
     assert "--project" not in make(target)
 
 
 def test_make_cost_passes_the_folder_and_make_destroy_does_not() -> None:
-    assert 'deploy cost "../my study"' in make("cost", "PROJECT=../my study")
+    assert 'hippodrome cost "../my study"' in make("cost", "PROJECT=../my study")
     assert "PROJECT" not in make("destroy", "PROJECT=../maze")
     assert "maze" not in make("destroy", "PROJECT=../maze")
 
@@ -130,15 +129,6 @@ def test_deploy_in_a_python_without_packages_continues_in_that_of_make(tmp_path:
     (tmp_path / ".venv" / "deploy").touch()
     ran = subprocess.run([*command, "status", "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.stdout == "-m deploy status --json\n"
-
-
-def test_the_list_of_commands_fits_a_terminal(capsys: Any, monkeypatch: Any) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setenv("TERMINAL_WIDTH", "80")
-    assert main(["--help"]) == 0
-    listed = capsys.readouterr().out.partition("Commands:")[2]
-    assert all(name in listed for name in COMMANDS)
-    assert "..." not in listed
 
 
 def test_the_end_of_the_input_declines(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -227,7 +227,7 @@ def test_an_agent_that_fails_late_and_goes_on_is_an_error_with_its_line_and_trac
 
 
 def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    from hippodrome.deployment.__main__ import main
+    from hippodrome.cli import main
 
     folder = project(length=30)
     process = rehearsal(folder, "--bots", "2", "--play", "1")

@@ -1,4 +1,4 @@
-"""Whole studies over HTTP and WebSocket: `python -m hippodrome.local` in a process of its own, and bots for participants."""
+"""Whole studies over HTTP and WebSocket: `hippodrome run` in a process of its own, and bots for participants."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.deployment.__main__ import main
 from tests.deployment.installation import CommandResult
 from tests.export.data_world import into_folder
 

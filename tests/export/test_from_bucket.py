@@ -212,7 +212,7 @@ def test_a_run_that_was_interrupted_twice_is_finished_by_the_next(world: Install
     crowd(world.put, tmp_path, 30)
     out = tmp_path / "out"
     with world.served() as env:
-        line = [sys.executable, "-m", "deploy", "data", str(out), "--project", "maze"]
+        line = [sys.executable, "-m", "hippodrome", "data", str(out), "--project", "maze"]
         for how in (signal.SIGINT, signal.SIGKILL):
             before = len(list(out.glob("recordings/*/*/*.parquet")))
             with subprocess.Popen(

@@ -19,8 +19,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.deployment.__main__ import main
 from hippodrome.export import recording as converted
 from hippodrome.export import recording_columns
 from hippodrome.export.scrub import Scrub

@@ -15,11 +15,11 @@ import msgspec
 import pyarrow.parquet as pq
 import pytest
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
 from hippodrome.control.model import warm_pool
 from hippodrome.control.model.project import MASTER_LIST, MasterList
 from hippodrome.control.model.records import to_json
-from hippodrome.deployment.__main__ import main
 from hippodrome.export import fetch, manifest
 from hippodrome.export import run as export_run
 from hippodrome.export.fetch import Fetcher

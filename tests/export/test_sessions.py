@@ -10,8 +10,8 @@ import pyarrow.dataset
 import pyarrow.parquet as pq
 import pytest
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.deployment.__main__ import main
 from hippodrome.export.source import Folder
 from hippodrome.protocol.keys import membership_key, session_key, sessions_folder
 from tests.export.data_world import PROJECT, crowd, into_folder, key, register

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.deployment.__main__ import main
 from tests.deployment.installation import CommandResult, Installed
 from tests.export.data_world import crowd, into_folder
 from tests.export.place import Place, rows

@@ -1,4 +1,4 @@
-"""A real `python -m hippodrome.local` in a folder of its own, with a study whose game is quick."""
+"""A real `hippodrome run` in a folder of its own, with a study whose game is quick."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ class Local:
             cat = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=file) if self.through_pipe else None
             output = cat.stdin if cat else file
             self.process = processes.start(
-                "hippodrome.local",
-                [str(self.folder), "--port", "0", *options],
+                "hippodrome",
+                ["run", str(self.folder), "--data", "data", "--port", "0", *options],
                 cwd=self.place,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60"},
                 stdout=output,

@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
+"""`hippodrome run` where any call for a file, process, thread or socket may be refused: `SEED` says which, `CHANCE` how many.
 
 One of the first calls is refused in any case, so that each run has a refusal. Each refusal is a line `refused: …` on stderr.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import typer
 
-from hippodrome.local.__main__ import main
+from hippodrome.local.run import command
 from testing.os_faults import ERRORS, OsCall, OsFaultInjector
 
 
@@ -34,4 +34,4 @@ class ByChance(OsFaultInjector):
 if __name__ == "__main__":
     sys.argv[0] = "local"
     with ByChance(Path.cwd()).installed():
-        typer.run(main)
+        typer.run(command)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from hippodrome.control.config import read_project
 from hippodrome.local.backend.processes import end_everything
-from hippodrome.local.check.__main__ import main as check
+from hippodrome.local.check.command import command as check
 from hippodrome.local.rehearsal.study_process import copy_of
 from testing.files import write_files
 from tests.local.conftest import AGENT, ROOT, Local
@@ -114,7 +114,7 @@ def test_bots_walk_through_a_template_that_is_blank_with_an_agent_that_imports_g
     clone = write_clone(tmp_path / "clone", config)
     (clone / "App/agent.py").write_text(WITH_GYM)
     ran = subprocess.run(
-        [sys.executable, "-m", "hippodrome.local.rehearsal", str(clone), "--bots", "1", "--play", "1"],
+        [sys.executable, "-m", "hippodrome", "try", str(clone), "--bots", "1", "--play", "1"],
         check=False,
         cwd=ROOT,
         capture_output=True,

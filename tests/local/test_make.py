@@ -26,13 +26,13 @@ def make(*arguments: str, **environment: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (("run", "HOST=0.0.0.0", "PORT=1"), r'-m hippodrome.local "\." --data "\./data" --port 1 --host "0\.0\.0\.0"'),
-        (("run", "TLS=1", "NAMES=userId"), r'-m hippodrome.local .* --tls --names "userId"'),
-        (("run", "ARGS=--fresh"), r"-m hippodrome.local .* --fresh"),
-        (("try", "DATA=/x", "BOTS=3"), r'-m hippodrome.local\.rehearsal "\." --bots 3 --data "/x"'),
-        (("check", "PROJECT=../my-clone", "ARGS=--strict"), r'-m hippodrome.local\.check "\.\./my-clone" --strict'),
-        (("register", "PROJECT=../my-clone", "ARGS=--strict"), r'-m deploy register "\.\./my-clone" --strict'),
-        (("data", "PROJECT=../a", "DATA=/x"), r'-m deploy data --project "\.\./a/" --from "/x"'),
+        (("run", "HOST=0.0.0.0", "PORT=1"), r'-m hippodrome run "\." +--port 1 --host "0\.0\.0\.0"'),
+        (("run", "TLS=1", "NAMES=userId"), r'-m hippodrome run .* --tls --names "userId"'),
+        (("run", "ARGS=--fresh"), r"-m hippodrome run .* --fresh"),
+        (("try", "DATA=/x", "BOTS=3"), r'-m hippodrome try "\." --bots 3 --data "/x"'),
+        (("check", "PROJECT=../my-clone", "ARGS=--strict"), r'-m hippodrome check "\.\./my-clone" --strict'),
+        (("register", "PROJECT=../my-clone", "ARGS=--strict"), r'-m hippodrome register "\.\./my-clone" --strict'),
+        (("data", "PROJECT=../a", "DATA=/x"), r'-m hippodrome data --project "\.\./a/" --from "/x"'),
     ],
 )
 def test_variables_reach_the_command(arguments: tuple[str, ...], wanted: str) -> None:
@@ -50,7 +50,7 @@ def test_variables_that_are_not_given_are_not_passed_on() -> None:
 def test_a_variable_that_is_empty_in_the_environment_counts_as_not_given() -> None:
     """Otherwise the data would be in the current folder, or below the root."""
     for name in ("DATA", "PORT", "PROJECT"):
-        assert re.search(r'-m hippodrome.local "\.?" --data "\./data" --port 8000 ', make("run", **{name: ""}))
+        assert re.search(r'-m hippodrome run "\.?" +--port 8000 ', make("run", **{name: ""}))
     assert "--data" not in make("try", DATA="")
     assert "--from" not in make("data", DATA="")
 
@@ -88,7 +88,7 @@ def test_a_number_that_is_none_is_refused(given: str) -> None:
 def test_an_erasure_names_the_participant_after_all_options() -> None:
     """An id may begin with a dash."""
     erase = make("erase", "USER_ID=-a1", "PROJECT=../a", "DATA=/x", "ARGS=--yes").strip().splitlines()[-1]
-    assert re.search(r'-m deploy erase --project "\.\./a/" --from "/x" --yes -- "-a1"', erase)
+    assert re.search(r'-m hippodrome erase --project "\.\./a/" --from "/x" --yes -- "-a1"', erase)
 
 
 def test_an_unknown_variable_is_refused() -> None:

@@ -47,7 +47,7 @@ def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None
     assert done.returncode == 0, done.stderr
     assert f"Made {folder} from {TOP}; its project id is My-study." in done.stdout
     for command in ("run", "check", "try"):
-        assert f"make {command} PROJECT='{folder}'" in done.stdout
+        assert f"hippodrome {command} '{folder}'" in done.stdout
     assert read_project(folder).project.id == "My-study"
     assert sorted(path.name for path in folder.iterdir()) == ["agent.py", "config.yml", "steps"]
 
@@ -55,15 +55,15 @@ def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("variables", "first"),
     [
-        ((), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
-        (("PROJECT={folder}",), f"Name a template: make new PROJECT=../my-study TEMPLATE={TOP}"),
+        ((), f"Name a template: hippodrome new ../my-study {TOP}"),
+        (("PROJECT={folder}",), f"Name a template: hippodrome new {{folder}} {TOP}"),
         (("PROJECT={folder}", "TEMPLATE=pacman"), "There is no template pacman."),
     ],
 )
 def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str, tmp_path: Path) -> None:
     done = make_new(*(variable.format(folder=tmp_path / "x") for variable in variables))
     assert (done.returncode == 0) == (not variables)  # without variables, that was the question
-    assert done.stdout.splitlines()[0] == first
+    assert done.stdout.splitlines()[0] == first.format(folder=tmp_path / "x")
     assert re.search(rf"^  {TOP} +Learning to play Ms\. Pac-Man$", done.stdout, re.MULTILINE)
     assert not list(tmp_path.iterdir())
 
@@ -72,7 +72,7 @@ def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str
 def test_without_a_folder_it_asks_for_one(variables: tuple[str, ...]) -> None:
     done = make_new(*variables, f"TEMPLATE={TOP}")
     assert done.returncode != 0
-    assert done.stdout == f"Name the folder of the new study: make new PROJECT=../my-study TEMPLATE={TOP}\n"
+    assert done.stdout == f"Name the folder of the new study: hippodrome new ../my-study {TOP}\n"
 
 
 @pytest.mark.parametrize("name", new.templates())

@@ -1,4 +1,4 @@
-"""A real `python -m hippodrome.local` to which the system really refuses something: another file system, no more files, no room."""
+"""A real `hippodrome run` to which the system really refuses something: another file system, no more files, no room."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_a_server_lost_while_nothing_can_be_written_is_replaced(local: Make, res
 @linux
 def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: Make) -> None:
     here = local()
-    command = f"ulimit -f 0; exec {sys.executable} -m hippodrome.local {here.folder} --port 0"
+    command = f"ulimit -f 0; exec {sys.executable} -m hippodrome run {here.folder} --port 0"
     made = subprocess.run(
         ["/bin/sh", "-c", command],
         cwd=here.place,

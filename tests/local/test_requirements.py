@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from hippodrome.cli import main
+from hippodrome.console.problem import Problem
+from hippodrome.local import requirements
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -44,17 +48,12 @@ def installing(study: Path) -> str:
         "PIP_UPGRADE": "1",
         "PYTHONPATH": str(ROOT),
     }
+    run = (
+        "from hippodrome.local.requirements import prepare; from pathlib import Path; import sys; "
+        "prepare(*map(Path, sys.argv[1:]))"
+    )
     ran = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "hippodrome.local.requirements",
-            study,
-            "--constraints",
-            place / "image.txt",
-            "--stamps",
-            place / "stamps",
-        ],
+        [sys.executable, "-c", run, study, place / "image.txt", place / "stamps"],
         cwd=place,
         env=env,
         capture_output=True,
@@ -98,14 +97,37 @@ def test_an_unreadable_study_is_left_to_the_next_command(study: Path) -> None:
     assert installing(study) == ""
 
 
-def test_the_commands_for_one_machine_install(study: Path) -> None:
-    for command in ("run", "try", "check"):
-        said = subprocess.run(
-            ["make", "-n", command, f"PROJECT={study}"], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        first, second = (line for line in said.splitlines() if "-m hippodrome.local" in line)
-        assert f'-m hippodrome.local.requirements "{study}" --constraints requirements/trial.txt' in first
-        assert f'"{study}"' in second
+def test_a_python_that_is_no_virtual_environment_is_not_changed(
+    study: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.base_prefix", sys.prefix)
+    requirements.prepare(study)
+    said = capsys.readouterr().out
+    assert f"This Python lacks grove, which {study}/requirements.txt names" in said
+    assert f"-m pip install -r {study}/requirements.txt" in said
+
+
+def test_nothing_is_said_if_a_python_has_everything(
+    study: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.base_prefix", sys.prefix)
+    lines = ["# ours", "--no-index", "typer>=0.1  # a comment", "none; python_version < '3'"]
+    (study / "requirements.txt").write_text("\n".join(lines))
+    requirements.prepare(study)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("command", ["run", "try", "check"])
+def test_the_commands_for_one_machine_install_first(command: str, study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = []
+
+    def prepare(folder: Path) -> None:
+        folders.append(folder)
+        raise Problem("that is enough")
+
+    monkeypatch.setattr(requirements, "prepare", prepare)
+    assert main([command, str(study)]) == 1
+    assert folders == [study]
 
 
 def test_our_package_tests_is_imported_before_an_installed_one(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A real `python -m hippodrome.local`: walked through, killed, started again, ended."""
+"""A real `hippodrome run`: walked through, killed, started again, ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Warm servers for participants, in a real `python -m hippodrome.local`."""
+"""Warm servers for participants, in a real `hippodrome run`."""
 
 from __future__ import annotations
 

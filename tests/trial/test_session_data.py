@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
 from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.records import to_json
-from hippodrome.deployment.__main__ import main
 from hippodrome.protocol.keys import membership_key
 from hippodrome.trial.core.unfinished import RecordedTrial
 from hippodrome.trial.recordings.resume import add_lines

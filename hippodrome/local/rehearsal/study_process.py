@@ -99,8 +99,8 @@ class StudyProcess:
             time.sleep(0.05)
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
-        """Start `python -m hippodrome.local`; `options` are those of `subprocess.Popen`."""
-        command = [sys.executable, "-m", "hippodrome.local", *arguments]
+        """Start `hippodrome run`; `options` are those of `subprocess.Popen`."""
+        command = [sys.executable, "-m", "hippodrome", "run", *arguments]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)  # noqa: S603 - our own command
 
     def interrupt(self, seconds: float = END_SECONDS) -> bool:

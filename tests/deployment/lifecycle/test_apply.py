@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.deployment import __main__ as deploy
 from hippodrome.deployment.lifecycle import apply as applying
 from hippodrome.deployment.lifecycle import plan as plans
 from hippodrome.deployment.lifecycle.apply import ApplyRequest, apply
@@ -375,7 +375,7 @@ def test_a_plan_without_changes_says_so(world: World) -> None:
 def command(world: World, monkeypatch: pytest.MonkeyPatch) -> Any:
     for module in (plans, applying):
         monkeypatch.setattr(module, "open_account", lambda profile, region: world.account)
-    return lambda *arguments: deploy.main(list(arguments))
+    return lambda *arguments: cli.main(list(arguments))
 
 
 def test_plan_and_apply_have_their_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:

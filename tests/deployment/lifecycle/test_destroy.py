@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws.tasks import EcsTasks
 from hippodrome.control.model.messages import StartServer
-from hippodrome.deployment import __main__ as deploy
 from hippodrome.deployment.aws.account import open_account
 from hippodrome.deployment.core.stages import Executor
 from hippodrome.deployment.lifecycle import destroy, remains
@@ -113,7 +113,7 @@ def families(world: World) -> set[str]:
 
 def run(world: World, *arguments: str, monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(destroy, "open_account", lambda profile, region: world.account)
-    return deploy.main(["destroy", *arguments])
+    return cli.main(["destroy", *arguments])
 
 
 def test_destroy_deletes_all_but_the_data(
@@ -152,10 +152,10 @@ def test_the_commands_that_destroy_names_fetch_and_delete_the_kept_data(
     *fetching, deleting = last_commands(capsys.readouterr().err)
     monkeypatch.delenv("AWS_REGION", raising=False)
     monkeypatch.chdir(tmp_path)
-    assert [deploy.main(command) for command in fetching] == [Exit.DONE, Exit.DONE]
+    assert [cli.main(command) for command in fetching] == [Exit.DONE, Exit.DONE]
     assert {path.name for path in tmp_path.iterdir()} == {"data-other", "data-study"}
     assert "u1" in (tmp_path / "data-study" / "answers.csv").read_text()
-    assert deploy.main([*deleting, "--yes"]) == Exit.DONE
+    assert cli.main([*deleting, "--yes"]) == Exit.DONE
     assert buckets(installed) == set()
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
 from hippodrome.control.limits.rules import ParticipantSlots
 from hippodrome.control.lobby import decisions
@@ -22,7 +23,6 @@ from hippodrome.control.lobby.decisions import Decisions, Unmatched
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server, ServerState
-from hippodrome.deployment.__main__ import main
 from hippodrome.deployment.operate import folder_eraser
 from hippodrome.deployment.operate.data_folder import DataFolder
 from hippodrome.deployment.operate.folder_eraser import FolderEraser
@@ -322,6 +322,6 @@ def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:
 
 
 def test_erase_and_make_run_agree_on_the_folder_of_the_lock() -> None:
-    from hippodrome.local.__main__ import ROOT
+    from hippodrome.local.run import ROOT
 
     assert folder_eraser.STATE == ROOT

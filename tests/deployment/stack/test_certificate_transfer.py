@@ -10,13 +10,13 @@ from botocore.exceptions import ClientError
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit
 from hippodrome.control.certificates import order
 from hippodrome.control.certificates.order import Issued, OrderRequest, read_chain
 from hippodrome.control.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
-from hippodrome.deployment import __main__ as deploy
 from hippodrome.deployment.aws.account import Installation
-from hippodrome.deployment.lifecycle import up
+from hippodrome.deployment.lifecycle import deploy
 from hippodrome.deployment.stack import certificate, certificate_transfer
 from tests.deployment.certificates import chain
 from tests.deployment.lifecycle.test_destroy import TAG, buckets, make_bucket
@@ -72,7 +72,7 @@ def installation(world: World, number: int, monkeypatch: pytest.MonkeyPatch, roo
         "HostedZoneId": world.zone,
     }
     found = Installation("hippodrome", REGION, "CREATE_COMPLETE", outputs)
-    monkeypatch.setattr(up, "find_installation", lambda account, stack: found)
+    monkeypatch.setattr(deploy, "find_installation", lambda account, stack: found)
     monkeypatch.setattr(certificate, "find_installation", lambda account, stack: found)
     return found
 
@@ -94,7 +94,7 @@ def test_five_installations_in_succession_order_one_certificate(
 ) -> None:
     for number in range(5):
         installation(world, number, monkeypatch)
-        report = up.certify(world.account, "hippodrome")
+        report = deploy.certify(world.account, "hippodrome")
         assert report.directory == PRODUCTION
         assert document(world, number, PRIVKEY) == document(world, 0, PRIVKEY)
         assert document(world, number, FULLCHAIN) == document(world, 0, FULLCHAIN)
@@ -106,9 +106,9 @@ def test_the_installation_that_took_it_over_renews_it_with_the_same_account(
     world: World, authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installation(world, 0, monkeypatch)
-    up.certify(world.account, "hippodrome")
+    deploy.certify(world.account, "hippodrome")
     second = installation(world, 1, monkeypatch)
-    up.certify(world.account, "hippodrome")
+    deploy.certify(world.account, "hippodrome")
     certificate.obtain(world.account, second, certificate.Choice(PRODUCTION, force=True))
     assert authority.real == 2
     assert len(set(authority.accounts[-2:])) == 1
@@ -123,7 +123,7 @@ def test_certificates_that_are_not_fresh_or_not_ours_are_not_taken_over(
 ) -> None:
     authority.days = 20 if why == "due" else 80
     installation(world, 0, monkeypatch, "example.net" if why == "another domain" else DOMAIN)
-    up.certify(world.account, "hippodrome")
+    deploy.certify(world.account, "hippodrome")
     s3 = world.account.client("s3")
     if why == "another installation":
         other = [{"Key": "hippodrome:stack", "Value": "hippodrome-lab"}]
@@ -167,9 +167,9 @@ def test_the_command_certificate_takes_it_over_and_a_dry_run_does_not(
     certificate.obtain(world.account, installation(world, 0, monkeypatch), certificate.Choice(PRODUCTION))
     installation(world, 1, monkeypatch)
     monkeypatch.setattr(certificate, "open_account", lambda profile, region: world.account)
-    assert deploy.main(["certificate", "--production", "--dry-run"]) == Exit.CHANGES
+    assert cli.main(["certificate", "--production", "--dry-run"]) == Exit.CHANGES
     with pytest.raises(ClientError):
         document(world, 1, PRIVKEY)
-    assert deploy.main(["certificate", "--production"]) == Exit.DONE
+    assert cli.main(["certificate", "--production"]) == Exit.DONE
     assert authority.real == 1
     assert "is taken over from the bucket hippodrome-bucket-0" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.check`: it reports every mistake and remark, and nothing else."""
+"""`hippodrome check`: it reports every mistake and remark, and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.check` on agent.py: each failure with its line."""
+"""`hippodrome check` on agent.py: each failure with its line."""
 
 from __future__ import annotations
 
@@ -473,7 +473,7 @@ def test_ctrl_c_names_the_call_and_its_line(folder: Path, terminal: bool) -> Non
     agent(folder, "self.n += 1", "import time; time.sleep(1000)")
     keyboard, screen = pty.openpty() if terminal else os.pipe()
     check = subprocess.Popen(
-        [sys.executable, "-m", "hippodrome.local.check", str(folder)],
+        [sys.executable, "-m", "hippodrome", "check", str(folder)],
         cwd=ROOT,
         stdout=screen,
         stderr=subprocess.DEVNULL,

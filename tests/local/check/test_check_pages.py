@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.check` on pages: Jinja, HTML, questions, and the code that recruiters ask for."""
+"""`hippodrome check` on pages: Jinja, HTML, questions, and the code that recruiters ask for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Environments for the tests, registered on import: `python -m hippodrome.trial.gym --import` and the tests themselves import it."""
+"""Environments for the tests, registered on import: `hippodrome gym --import` and the tests themselves import it."""
 
 from __future__ import annotations
 

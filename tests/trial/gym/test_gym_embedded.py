@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 
+from hippodrome.cli import main
 from hippodrome.trial.gym import override
-from hippodrome.trial.gym.__main__ import main
 from hippodrome.trial.gym.settings import Limits
 from testing.gym_server import ROOT, GymServerProcess, TextClient, gym_server
 
@@ -110,10 +110,10 @@ def test_the_documentation_has_every_limit_with_its_default() -> None:
 @pytest.mark.parametrize(
     ("arguments", "command"),
     [
-        ([], "-m hippodrome.trial.gym --port 5000"),
-        (["PORT=5001"], "-m hippodrome.trial.gym --port 5001"),
-        (["HOST=0.0.0.0"], '-m hippodrome.trial.gym --port 5000 --host "0.0.0.0"'),
-        (["ARGS=--seconds 10"], "-m hippodrome.trial.gym --port 5000 --seconds 10"),
+        ([], "-m hippodrome gym --port 5000"),
+        (["PORT=5001"], "-m hippodrome gym --port 5001"),
+        (["HOST=0.0.0.0"], '-m hippodrome gym --port 5000 --host "0.0.0.0"'),
+        (["ARGS=--seconds 10"], "-m hippodrome gym --port 5000 --seconds 10"),
     ],
 )
 def test_make_gym_starts_a_server(arguments: list[str], command: str) -> None:
@@ -128,7 +128,7 @@ def test_only_two_functions_can_be_replaced() -> None:
 
 def test_a_port_that_is_taken_is_reported(program: GymServerProcess) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "hippodrome.trial.gym", "--port", str(program.port)],
+        [sys.executable, "-m", "hippodrome", "gym", "--port", str(program.port)],
         cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 1
@@ -139,27 +139,22 @@ def test_a_port_that_is_taken_is_reported(program: GymServerProcess) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--processes", "0"], "--processes must be a number from 1 to 1e+09"),
-        (["--seconds", "nan"], "--seconds must be a number from 1 to 1e+09"),
-        (["--idle-seconds", "-1"], "--idle-seconds must be a number from 0 to 1e+09"),
-        (["--port", "70000"], "--port must be a number from 0 to 65535"),
+        (["--processes", "0"], "Invalid value for '--processes'"),
+        (["--idle-seconds", "-1"], "Invalid value for '--idle-seconds'"),
+        (["--port", "70000"], "Invalid value for '--port'"),
         (["--host", "192.0.2.1"], "Cannot listen at 192.0.2.1:5000: Cannot assign requested address."),
     ],
 )
 def test_wrong_arguments_are_reported_before_anything_starts(
     arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    try:
-        status = main(arguments)
-    except SystemExit as end:
-        status = int(end.code or 0)
-    assert status != 0
+    assert main(["gym", *arguments]) != 0
     assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("host", [".".join(["name" * 15] * 6), "a..b"])
 def test_a_host_that_does_not_exist_is_reported(host: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--host", host]) == 1
+    assert main(["gym", "--host", host]) == 1
     assert f"Cannot listen at {host}:5000: there is no such host." in capsys.readouterr().err
 
 
@@ -183,7 +178,7 @@ thread.join()
 def test_a_module_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("raise RuntimeError('no')")
     done = subprocess.run(
-        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", "--import", "broken"],
+        [sys.executable, "-m", "hippodrome", "gym", "--port", "0", "--import", "broken"],
         cwd=tmp_path, env={"PYTHONPATH": f"{ROOT}:{tmp_path}"}, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (1, "broken cannot be imported: RuntimeError: no\n")
@@ -193,7 +188,7 @@ def test_a_module_that_cannot_be_imported_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize("recorded", [False, True])
 def test_the_server_says_in_a_line_that_it_has_ended(tmp_path: Path, number: int, recorded: bool) -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", *(["--record", str(tmp_path)] if recorded else [])],
+        [sys.executable, "-m", "hippodrome", "gym", "--port", "0", *(["--record", str(tmp_path)] if recorded else [])],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None
@@ -224,7 +219,7 @@ def test_other_processes_of_the_program_stay(tmp_path: Path) -> None:
 
 def test_a_host_that_others_can_reach_gets_a_warning() -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "hippodrome.trial.gym", "--port", "0", "--host", "0.0.0.0"],
+        [sys.executable, "-m", "hippodrome", "gym", "--port", "0", "--host", "0.0.0.0"],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         assert process.stderr is not None

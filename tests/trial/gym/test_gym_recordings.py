@@ -15,8 +15,8 @@ import numpy as np
 import psutil
 import pytest
 
+from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.deployment.__main__ import main
 from hippodrome.trial.gym.recordings import ConnectionRecorder
 from hippodrome.trial.recordings import recording
 from testing.gym_server import ROOT, TextClient, gym_server

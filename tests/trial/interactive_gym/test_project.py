@@ -453,7 +453,7 @@ def test_an_experiment_with_two_humans_is_a_study_for_two_participants(tmp_path:
     assert [config["trial"][key] for key in ("maxPing", "pingSamples")] == [250, 5]
     assert "has no effect" not in said
     assert "Remark: game_page_html_fn is called for 0 alone: all participants read the same instructions" in said
-    done = run_python(tmp_path, "-m", "hippodrome.local.check", str(project))
+    done = run_python(tmp_path, "-m", "hippodrome", "check", str(project))
     assert done.returncode == 0, done.stdout
     assert "is the game (fields) for 2 participants together" in done.stdout
 

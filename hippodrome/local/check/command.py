@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.check [FOLDER]`: find what would go wrong in the study of a project.
+"""`hippodrome check`: finds what would go wrong in a study.
 
 With a mistake the exit status is 1. A remark is about something that works, but most likely not as it was meant.
 """
@@ -15,16 +15,22 @@ from typing import Annotated
 import typer
 
 from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
+from hippodrome.local import requirements
 from hippodrome.local.check import agent, agent_file
 from hippodrome.local.check.project import check_project
+from hippodrome.local.study_folder import StudyFolder
 
 
-def main(
-    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+def command(
+    folder: StudyFolder = Path(),
     seconds: Annotated[float, typer.Option(min=1, help="How long agent.py may take.")] = agent.SECONDS,
     strict: Annotated[bool, typer.Option("--strict", help="Count remarks as mistakes.")] = False,
 ) -> None:
-    """Name every mistake in config.yml and the step pages, and try agent.py."""
+    """Name every mistake in config.yml and the step pages, and try agent.py. Nothing is changed.
+
+    What the study's requirements.txt names is installed first. The exit code is 1 if there is a mistake.
+    """
+    requirements.prepare(folder)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake
     config, found = None, []
@@ -81,7 +87,3 @@ def _summary(found: list[Diagnostic], config: Config | None) -> str:
 
 def _count(number: int, word: str) -> str:
     return f"{number} {word}{'' if number == 1 else 's'}"
-
-
-if __name__ == "__main__":
-    typer.run(main)

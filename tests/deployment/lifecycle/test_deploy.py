@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from botocore.exceptions import ClientError
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.certificates.rules import PRODUCTION, STAGING, Decision, Verdict
-from hippodrome.deployment import __main__ as deploy
 from hippodrome.deployment.aws.account import Installation
-from hippodrome.deployment.lifecycle import up
+from hippodrome.deployment.lifecycle import deploy
 from hippodrome.deployment.lifecycle.apply import ApplyOutcome, ApplyRequest
 from hippodrome.deployment.stack.certificate import Choice, Report
 
@@ -73,15 +73,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))
         return Exit.DONE
 
-    monkeypatch.setattr(up, "open_account", lambda profile, region: FakeAccount())
-    monkeypatch.setattr(up, "describe_stack", lambda account, stack: {"StackStatus": "CREATE_COMPLETE"})
-    monkeypatch.setattr(up, "find_installation", lambda account, stack: installation)
-    monkeypatch.setattr(up, "may_apply", lambda account, stack: True)
-    monkeypatch.setattr(up.applying, "apply", apply)
-    monkeypatch.setattr(up.certificate_transfer, "take_over", lambda account, installation: done.append("take over"))
-    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report("", Verdict.ORDER))
-    monkeypatch.setattr(up.certificate, "obtain", obtain)
-    monkeypatch.setattr(up.register, "command", register)
+    monkeypatch.setattr(deploy, "open_account", lambda profile, region: FakeAccount())
+    monkeypatch.setattr(deploy, "describe_stack", lambda account, stack: {"StackStatus": "CREATE_COMPLETE"})
+    monkeypatch.setattr(deploy, "find_installation", lambda account, stack: installation)
+    monkeypatch.setattr(deploy, "may_apply", lambda account, stack: True)
+    monkeypatch.setattr(deploy.applying, "apply", apply)
+    monkeypatch.setattr(
+        deploy.certificate_transfer, "take_over", lambda account, installation: done.append("take over")
+    )
+    monkeypatch.setattr(deploy.certificate, "inspect", lambda account, installation: report("", Verdict.ORDER))
+    monkeypatch.setattr(deploy.certificate, "obtain", obtain)
+    monkeypatch.setattr(deploy.register, "command", register)
     return done
 
 
@@ -95,7 +97,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_first_run_does_all_steps_in_order(calls: list[str], folder: Path) -> None:
-    assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
+    assert cli.main(["deploy", str(folder), "--domain", "example.org"]) == Exit.DONE
     assert calls == [
         "apply example.org",
         "take over",
@@ -108,7 +110,7 @@ def test_the_first_run_does_all_steps_in_order(calls: list[str], folder: Path) -
 def test_deploy_says_which_certificate_it_looks_at(
     calls: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert deploy.main(["up", str(folder), "--domain", "example.org"]) == Exit.DONE
+    assert cli.main(["deploy", str(folder), "--domain", "example.org"]) == Exit.DONE
     looking = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Looking at")]
     assert looking == ["Looking at the test certificate …", "Looking at the real certificate …"]
 
@@ -126,8 +128,8 @@ def test_deploy_says_which_certificate_it_looks_at(
 def test_a_certificate_is_ordered_if_the_present_one_is_due_or_missing(
     calls: list[str], monkeypatch: pytest.MonkeyPatch, directory: str, due: Verdict, expected: list[str]
 ) -> None:
-    monkeypatch.setattr(up.certificate, "inspect", lambda account, installation: report(directory, due))
-    up.certify(None, "hippodrome")  # type: ignore[arg-type]
+    monkeypatch.setattr(deploy.certificate, "inspect", lambda account, installation: report(directory, due))
+    deploy.certify(None, "hippodrome")  # type: ignore[arg-type]
     assert calls == ["take over", *expected]
 
 
@@ -138,9 +140,9 @@ def test_after_a_failed_test_certificate_no_real_one_is_ordered(
         calls.append(choice.directory)
         raise Problem("The proof was not seen.", "Look at DNS.")
 
-    monkeypatch.setattr(up.certificate, "obtain", obtain)
+    monkeypatch.setattr(deploy.certificate, "obtain", obtain)
     (folder / "config.yml").write_text(CONFIG.format(use="false"))
-    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert cli.main(["deploy", str(folder)]) == Exit.FAILED
     assert calls == ["apply None", "take over", STAGING]
     said = capsys.readouterr().err
     assert "The installation stands, but has no certificate. The proof was not seen." in said
@@ -153,28 +155,28 @@ def test_a_study_without_a_game_needs_no_certificate(
     def obtain(*_: Any, **__: Any) -> Report:
         raise Problem("The proof was not seen.")
 
-    monkeypatch.setattr(up.certificate, "obtain", obtain)
-    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    monkeypatch.setattr(deploy.certificate, "obtain", obtain)
+    assert cli.main(["deploy", str(folder)]) == Exit.DONE
     assert calls == ["apply None", "take over", "register project"]
 
 
 def test_no_certificate_is_ordered_on_request(calls: list[str], folder: Path) -> None:
-    assert deploy.main(["up", str(folder), "--no-certificate"]) == Exit.DONE
+    assert cli.main(["deploy", str(folder), "--no-certificate"]) == Exit.DONE
     assert calls == ["apply None", "register project"]
 
 
 def test_for_a_researcher_only_the_study_is_registered(
     calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(up, "may_apply", lambda account, stack: False)
-    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    monkeypatch.setattr(deploy, "may_apply", lambda account, stack: False)
+    assert cli.main(["deploy", str(folder)]) == Exit.DONE
     assert calls == ["register project"]
     assert "researcher" in capsys.readouterr().err
 
 
 def test_mistakes_in_the_study_stop_it_before_anything_is_made(calls: list[str], folder: Path) -> None:
     (folder / "config.yml").write_text("project: {id: study, useAWS: true, steps: {x: 1}}")
-    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert cli.main(["deploy", str(folder)]) == Exit.FAILED
     assert calls == []
 
 
@@ -184,9 +186,9 @@ def test_mistakes_and_missing_credentials_are_reported_together(
     def nobody(*_: Any) -> None:
         raise Problem("There are no AWS credentials on this machine.", "Log in.")
 
-    monkeypatch.setattr(up, "open_account", nobody)
+    monkeypatch.setattr(deploy, "open_account", nobody)
     (folder / "config.yml").write_text("project: {id: study, useAWS: true, steps: {x: 1}}")
-    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert cli.main(["deploy", str(folder)]) == Exit.FAILED
     said = capsys.readouterr().err
     assert "✗ study: The project cannot be registered: there are" in said
     assert "✗ There are no AWS credentials on this machine." in said
@@ -202,7 +204,7 @@ def test_a_folder_without_a_study_for_aws_gets_only_the_installation(
     (folder / "config.yml").unlink()
     if config:
         (folder / "config.yml").write_text(config)
-    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert cli.main(["deploy", str(folder)]) == Exit.DONE
     assert said in capsys.readouterr().err
     assert calls[0] == "apply None"
     assert not any(line.startswith("register") for line in calls)
@@ -210,12 +212,12 @@ def test_a_folder_without_a_study_for_aws_gets_only_the_installation(
 
 def test_a_study_without_use_aws_is_registered(calls: list[str], folder: Path) -> None:
     (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").format())
-    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert cli.main(["deploy", str(folder)]) == Exit.DONE
     assert calls[-1] == "register project"
 
 
 def test_the_example_study_is_registered_unchanged(calls: list[str]) -> None:
-    assert deploy.main(["up", str(ROOT), "--domain", "example.org", "--email", "me@example.org"]) == Exit.DONE
+    assert cli.main(["deploy", str(ROOT), "--domain", "example.org", "--email", "me@example.org"]) == Exit.DONE
     assert calls[0] == "apply example.org"
     assert calls[-1] == f"register {ROOT.name}"
 
@@ -224,7 +226,7 @@ def test_a_study_without_aws_setup_is_refused(
     calls: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "config.yml").write_text(CONFIG.replace("  useAWS: {use}\n", "").replace("awsSetup", "#").format())
-    assert deploy.main(["up", str(folder)]) == Exit.FAILED
+    assert cli.main(["deploy", str(folder)]) == Exit.FAILED
     assert calls == []
     assert "project.awsSetup: gives no cpu and no memory" in capsys.readouterr().err
 
@@ -233,7 +235,7 @@ def test_the_base_of_the_image_may_come_from_a_mirror(
     calls: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HIPPODROME_BASE_IMAGE", "mirror.example.org/python:3.13")
-    assert deploy.main(["up", str(folder)]) == Exit.DONE
+    assert cli.main(["deploy", str(folder)]) == Exit.DONE
     assert calls[-1] == "register project on mirror.example.org/python:3.13"
 
 
@@ -256,8 +258,8 @@ class Cloud:
 
 
 def test_credentials_that_may_read_the_template_may_apply() -> None:
-    assert up.may_apply(Cloud(False, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
-    assert up.may_apply(Cloud(True), "hippodrome")  # type: ignore[arg-type]
-    assert not up.may_apply(Cloud(True, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
+    assert deploy.may_apply(Cloud(False, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
+    assert deploy.may_apply(Cloud(True), "hippodrome")  # type: ignore[arg-type]
+    assert not deploy.may_apply(Cloud(True, "AccessDenied"), "hippodrome")  # type: ignore[arg-type]
     with pytest.raises(ClientError):
-        up.may_apply(Cloud(True, "Throttling"), "hippodrome")  # type: ignore[arg-type]
+        deploy.may_apply(Cloud(True, "Throttling"), "hippodrome")  # type: ignore[arg-type]

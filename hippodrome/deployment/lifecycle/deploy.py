@@ -1,4 +1,4 @@
-"""`deploy up`, which `make deploy` runs: puts the installation, its certificate and a study on AWS."""
+"""`hippodrome deploy`: puts the installation, its certificate and a study on AWS."""
 
 from __future__ import annotations
 

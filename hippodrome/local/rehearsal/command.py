@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local.rehearsal [FOLDER] --bots 20`: send simulated participants through a whole study.
+"""`hippodrome try`: sends simulated participants through a whole study.
 
 It runs the study with a data folder of its own, which stays in `data-try/` of the project, and lets bots walk through
 it. Then it checks that everything that they sent and played is in the data, and that no server is left.
@@ -31,6 +31,7 @@ from hippodrome.bots.crowd import SIGNALS, interruptible, walk
 from hippodrome.bots.links import with_project
 from hippodrome.bots.report import BotReport
 from hippodrome.control.config import Config, ConfigErrors, read_project
+from hippodrome.local import requirements
 from hippodrome.local.rehearsal.crashes import ServerLogs
 from hippodrome.local.rehearsal.logs import FunctionLog, verify
 from hippodrome.local.rehearsal.report import report
@@ -44,6 +45,7 @@ from hippodrome.local.rehearsal.study_process import (
     sessions_of,
     wait_until_gone,
 )
+from hippodrome.local.study_folder import StudyFolder
 
 
 @dataclass(frozen=True)
@@ -140,23 +142,21 @@ def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
     people = [user.name for user in users.iterdir() if not user.name.startswith("bot-")] if users.is_dir() else []
     if people or place.resolve() == (folder / "data").resolve():
         reason = f"holds the data of {len(people)} participants" if people else "is where the study's own data belong"
-        raise StudyNotStarted(
-            f"{place} {reason}, and bots must not be among them. Name another folder with --data (with make: DATA=)."
-        )
+        raise StudyNotStarted(f"{place} {reason}, and bots must not be among them. Name another folder with --data.")
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StudyNotStarted(
-            f"The bots' data cannot be stored in {place}: {error.strerror}. Name another folder with --data "
-            "(with make: DATA=)."
+            f"The bots' data cannot be stored in {place}: {error.strerror}. Name another folder with --data."
         ) from None
     return place
 
 
 def _how_to_read(folder: Path, data: Path) -> str:
     """Where the data are, and the command that makes tables of them."""
-    project = "" if folder.resolve() == Path.cwd() else f" PROJECT={shlex.quote(str(folder))}"
-    return f"The bots' data are in {data}. This makes tables of them: make data{project} DATA={shlex.quote(str(data))}"
+    study = "" if folder.resolve() == Path.cwd() else f" {shlex.quote(str(folder))}"
+    command = f"hippodrome data{study} --from {shlex.quote(str(data))}"
+    return f"The bots' data are in {data}. This makes tables of them: {command}"
 
 
 def _keep_logs(study: StudyProcess, project: Path) -> Path:
@@ -223,8 +223,8 @@ def _rehearse_and_report(
     return fine
 
 
-def main(
-    folder: Annotated[Path, typer.Argument(help="The project folder.")] = Path(),
+def command(
+    folder: StudyFolder = Path(),
     *,
     bots: Annotated[int, typer.Option(min=1, max=1000, help="How many simulated participants.")] = 20,
     at_once: Annotated[int, typer.Option(min=1, help="How many of them walk at the same time.")] = 10,
@@ -234,15 +234,20 @@ def main(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="The folder for the bots' data; default: data-try/ of the project. With --url: that study's data."
+            help="The folder for the bots' data; else one in data-try/ of STUDY. With --url: that study's data.",
+            show_default=False,
         ),
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="The link of a study that runs already, on this machine only.")
     ] = None,
 ) -> None:
-    """Send simulated participants through the whole study of FOLDER, and check that everything arrives."""
-    os.umask(0o077)  # like `make run`: only their owner may read these files
+    """Send simulated participants through the whole study, and check that everything that they do arrives.
+
+    What the study's requirements.txt names is installed first. The exit code is 1 if something is missing.
+    """
+    requirements.prepare(folder)
+    os.umask(0o077)  # like `run`: only their owner may read these files
     console = Console(highlight=False)
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)  # like Ctrl-C, after which nothing is left running
@@ -275,7 +280,3 @@ def main(
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     raise typer.Exit(0 if fine else 1)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -1,4 +1,4 @@
-"""`python -m hippodrome.local [FOLDER]`: run a study on this machine."""
+"""`hippodrome run`: runs a study on this machine."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from typing import Annotated
 import psutil
 import typer
 
+from hippodrome.local import requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend import files
 from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.publish import NotPublished
 from hippodrome.local.study import Study, from_here
+from hippodrome.local.study_folder import StudyFolder
 from hippodrome.local.web import server
 from hippodrome.local.web.access import origin_of
 
@@ -30,11 +32,14 @@ ROOT = ".hippodrome"
 STARTER_SECONDS = 1.0  # seconds between two looks whether the starter still runs
 
 
-def main(
-    folder: Annotated[Path, typer.Argument(help="The project folder: config.yml, steps/, agent.py.")] = Path(),
+def command(
+    folder: StudyFolder = Path(),
     *,
     port: Annotated[int, typer.Option(help="If it is in use, the next free one is taken. 0: any free one.")] = 8000,
-    data: Annotated[Path, typer.Option(help="Where answers and recordings are kept.")] = Path("data"),
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Where answers and recordings are kept; else data/ in STUDY.", show_default=False),
+    ] = None,
     host: Annotated[
         str, typer.Option(help="127.0.0.1 or localhost: a study runs for this machine only.")
     ] = server.HOST,
@@ -60,13 +65,18 @@ def main(
         int | None, typer.Option(help="End the study when the process with this id has ended.", hidden=True)
     ] = None,
 ) -> None:
-    """Run the study of FOLDER on this machine, and print its link."""
+    """Run the study on this machine, and print its link. What its requirements.txt names is installed first.
+
+    Answers and recordings are kept in its folder data/ from run to run. Ctrl-C ends the study.
+    """
+    requirements.prepare(folder)
     os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
+    data = folder / "data" if data is None else data
     activity_log = ActivityLog()
     if host not in ("127.0.0.1", "localhost"):
         activity_log.show(
             f"A study cannot run at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
-            "so participants could not play on another machine. Leave --host out (with make: HOST=)."
+            "so participants could not play on another machine. Leave --host out."
         )
         raise typer.Exit(1)
     origins = [origin_of(given) for given in origin or ()]
@@ -77,8 +87,7 @@ def main(
         raise typer.Exit(1)
     if names is not None and (names not in ("hash", "userId") or not tls):
         activity_log.show(
-            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses "
-            "(with make: TLS=1 NAMES=userId)."
+            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses."
         )
         raise typer.Exit(1)
     new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
@@ -140,12 +149,12 @@ def _wait(ended: int, starter: int | None) -> None:
 
 
 _REMEDIES = {
-    errno.ENOSPC: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
-    errno.EDQUOT: "Make room on this disk, or put the data elsewhere with DATA=FOLDER.",
+    errno.ENOSPC: "Make room on this disk, or put the data elsewhere with --data FOLDER.",
+    errno.EDQUOT: "Make room on this disk, or put the data elsewhere with --data FOLDER.",
     errno.EMFILE: "Allow this process more open files (`ulimit -n 8192`), and try again.",
     errno.ENFILE: "Close other programs, and try again.",
 }
-_ELSEWHERE = "Put the data where you may write with DATA=FOLDER, or change who may write there."
+_ELSEWHERE = "Put the data where you may write with --data FOLDER, or change who may write there."
 
 
 def _reason(error: OSError) -> str:
@@ -203,7 +212,3 @@ def _signals() -> Iterator[int]:
             signal.signal(number, handler)
         os.close(reader)
         os.close(writer)
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit
-from hippodrome.deployment import __main__ as deploy
-from hippodrome.deployment.lifecycle import up
+from hippodrome.deployment.lifecycle import deploy
 from testing.exploration import sample
 from tests.deployment.fake_cloudformation import happy
 from tests.deployment.registering import write_study
@@ -62,7 +62,7 @@ def ctrl_c(world: World, monkeypatch: pytest.MonkeyPatch) -> CtrlC:
     ctrl_c = CtrlC()
     plain = world.account.client
     monkeypatch.setattr(world.account, "client", lambda *where: InterruptedClient(plain(*where), ctrl_c.called))
-    monkeypatch.setattr(up, "open_account", lambda profile, region: world.account)
+    monkeypatch.setattr(deploy, "open_account", lambda profile, region: world.account)
     return ctrl_c
 
 
@@ -79,9 +79,9 @@ def deploy_study(world: World, ctrl_c: CtrlC, folder: Path, monkeypatch: pytest.
         s3 = world.account.client("s3")
         return s3.put_object(Bucket=world.code_bucket, Key=what, Body=b"done")
 
-    monkeypatch.setattr(up, "_certify", lambda *_: mark("certificate"))
-    monkeypatch.setattr(up.register, "command", lambda *_, **__: Exit.DONE if mark("registered") else Exit.FAILED)
-    return lambda: deploy.main(["up", str(folder), "--domain", DOMAIN, "--email", "me@example.org"])
+    monkeypatch.setattr(deploy, "_certify", lambda *_: mark("certificate"))
+    monkeypatch.setattr(deploy.register, "command", lambda *_, **__: Exit.DONE if mark("registered") else Exit.FAILED)
+    return lambda: cli.main(["deploy", str(folder), "--domain", DOMAIN, "--email", "me@example.org"])
 
 
 def assert_whole(world: World) -> None:

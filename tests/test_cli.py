@@ -1,0 +1,64 @@
+"""The command `hippodrome`: its help, its names, and how it ends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hippodrome.cli import COMMANDS, GROUPS, main
+
+ROOT = Path(__file__).resolve().parent.parent
+NARROW = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
+
+
+def test_help_lists_every_command_in_its_group_and_fits_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in NARROW.items():
+        monkeypatch.setenv(name, value)
+    assert main(["--help"]) == 0
+    shown = capsys.readouterr().out
+    for heading, commands in GROUPS.items():
+        part = shown.partition(f"{heading}:\n")[2].partition("\n\n")[0]
+        assert [line.split()[0] for line in part.splitlines()] == list(commands)
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "On this machine:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    assert capsys.readouterr().out.startswith(f"Usage: hippodrome {command} ")
+
+
+def test_a_mistyped_command_is_refused_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["chek"]) == 2
+    assert "No such command 'chek'. Did you mean 'check'?" in capsys.readouterr().err
+
+
+def test_help_and_completion_import_no_command() -> None:
+    """Else each key of Tab would take seconds, and a Python without the extra `aws` could not list its commands."""
+    program = "import sys, hippodrome.cli; hippodrome.cli.main(['--help']); print([n for n in sys.modules if n.startswith(('boto', 'hippodrome.local', 'hippodrome.deployment'))])"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def completions(words: str) -> list[str]:
+    """Return what bash offers after these words."""
+    env = {"_HIPPODROME_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split(" ")) - 1)}
+    done = subprocess.run(
+        [sys.executable, "-m", "hippodrome"], cwd=ROOT, env=env, capture_output=True, text=True, check=False
+    )
+    return done.stdout.split()
+
+
+def test_commands_and_options_are_completed() -> None:
+    assert completions("hippodrome de") == ["deploy", "destroy"]
+    assert "--fresh" in completions("hippodrome run --f")
