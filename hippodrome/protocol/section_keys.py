@@ -58,6 +58,14 @@ class Key:
     """JSON Schema of the value, for editors."""
     needed: bool = False
     """Whether every study needs the key."""
+    together: bool = False
+    """Whether the key is for games of several participants."""
+    kind: str = ""
+    """The possible values in words, for docs/config.md; "" if the schema says enough."""
+    otherwise: str = ""
+    """The default in words, for docs/config.md; "" if the value says enough."""
+    example: str = ""
+    """A value as YAML, for docs/config.md."""
     each: Check | None = None
     """If the value is a list: the check of each item."""
     section: type[Section] | None = None
@@ -82,43 +90,53 @@ def flag(default: bool, meaning: str, **more: Any) -> Any:
     return key(values.flag, default, meaning, {"type": "boolean"}, **more)
 
 
-def whole(low: int, high: int, default: int | None, meaning: str) -> Any:
+def whole(low: int, high: int, default: int | None, meaning: str, **more: Any) -> Any:
     """Declare a key that is a whole number from `low` to `high`."""
     schema = {"type": "integer", "minimum": low, "maximum": high}
-    return key(values.whole(low, high), default, meaning, schema)
+    return key(values.whole(low, high), default, meaning, schema, **more)
 
 
-def seconds(most: int, default: float, meaning: str, *, least: float = 0) -> Any:
+def seconds(most: int, default: float, meaning: str, *, least: float = 0, **more: Any) -> Any:
     """Declare a key that is a number of seconds from `least` to `most`."""
-    return key(values.number(least, most), default, meaning, {"type": "number", "minimum": least, "maximum": most})
+    schema = {"type": "number", "minimum": least, "maximum": most}
+    return key(values.number(least, most), default, meaning, schema, **more)
 
 
-def choice(words: tuple[str, ...], meaning: str) -> Any:
+def choice(words: tuple[str, ...], meaning: str, **more: Any) -> Any:
     """Declare a key that is one of these words; the first is the default."""
-    return key(values.one_of(*words), words[0], meaning, {"enum": list(words)})
+    return key(values.one_of(*words), words[0], meaning, {"enum": list(words)}, **more)
 
 
-def text(default: str | None, meaning: str, check: Check | None = None) -> Any:
+def text(default: str | None, meaning: str, check: Check | None = None, **more: Any) -> Any:
     """Declare a key that is a text; without a check, of up to 500 characters."""
-    return key(check or values.text(), default, meaning, {"type": "string"})
+    return key(check or values.text(), default, meaning, {"type": "string"}, **more)
 
 
-def items(item: str, limit: int, each: Check, default: tuple[str, ...], meaning: str, *, single: bool = False) -> Any:
+def items(
+    item: str,
+    limit: int,
+    each: Check,
+    default: tuple[str, ...],
+    meaning: str,
+    *,
+    single: bool = False,
+    **more: Any,
+) -> Any:
     """Declare a key that is a list of at most `limit` texts; with `single`, one of them may stand there by itself."""
     schema = {"items": {"type": "string"}, "type": ["array", "string"] if single else "array"}
-    return key(values.items(item, limit, single), default, meaning, schema, each=each)
+    return key(values.items(item, limit, single), default, meaning, schema, each=each, **more)
 
 
-def section(kind: type[Section], default: Section | None, meaning: str, example: str = "", **more: Any) -> Any:
-    """Declare a key that is a section of its own; `example` is one line of it, for messages."""
-    check = values.section(example or f"{min(names(kind))}: …")
+def section(kind: type[Section], default: Section | None, meaning: str, line: str = "", **more: Any) -> Any:
+    """Declare a key that is a section of its own; `line` is one line of it, for messages."""
+    check = values.section(line or f"{min(names(kind))}: …")
     return key(check, default, meaning, {"$ref": f"#/$defs/{kind.__name__}"}, section=kind, **more)
 
 
-def texts(example: str, meaning: str, entries: Entries) -> Any:
-    """Declare a key that maps names, which the project chooses, to texts."""
+def texts(line: str, meaning: str, entries: Entries, **more: Any) -> Any:
+    """Declare a key that maps names, which the project chooses, to texts; `line` is one line of it, for messages."""
     schema = {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
-    return key(values.section(example), {}, meaning, schema, entries=entries)
+    return key(values.section(line), {}, meaning, schema, entries=entries, **more)
 
 
 def others(entries: Entries, schema: Mapping[str, Any]) -> Any:

@@ -15,8 +15,6 @@ from hippodrome.protocol.trial_sections import SceneSection, Ui
 from hippodrome.protocol.values import KeyPath, number_in
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
-SESSION_KEYS = ("substitute", "absent", "gather", "afterAbsent", "countdown", "maxPing", "pingSamples", "playerNames")
-"""Keys of games of several participants (`project.players`). A registration leaves out a key with its default value."""
 MAX_EPISODES = 1_000_000
 MAX_BREAK = 600
 """Seconds."""
@@ -42,8 +40,8 @@ def _break(value: object) -> float | str:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
 
-def _rate(default: int, meaning: str) -> Any:
-    return keyed.whole(1, HIGHEST_RATE, default, meaning)
+def _rate(default: int, meaning: str, **more: Any) -> Any:
+    return keyed.whole(1, HIGHEST_RATE, default, meaning, **more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,38 +49,57 @@ class TrialSection(Section):
     """The section `trial`: the game and its server."""
 
     action_buffer_lifespan: int = keyed.whole(
-        1, 10_000, 1, "Environment steps for which an action is taken if no other action comes; 1 is no buffer."
+        1,
+        10_000,
+        1,
+        "For how many steps of the environment an action lasts, unless another comes. 1 is no buffer."
+        " Some environments ignore actions at random; with 5, hardly any action is lost.",
+        example="5",
     )
-    max_episodes: int = keyed.whole(1, MAX_EPISODES, 20, "Episodes until the trial is over.")
+    max_episodes: int = keyed.whole(
+        1, MAX_EPISODES, 20, "Episodes until the trial is over and the participant moves on.", example="3"
+    )
     between_episodes: float | str = keyed.key(
         _break,
         3,
-        "Seconds of the break between two episodes, with the score and a countdown; 0 is no break. Or a file of "
-        "steps/, which the page shows until the participant goes on.",
+        "Seconds of the break between two episodes, in which the page shows the score and counts "
+        "down. The button Start ends the break at once, and so does Space if it is no key of an "
+        "action. 0 is no break. Or a page of `steps/`, which is shown until the participant goes on. "
+        "See [pages in the game](#pages-in-the-game).",
         {"anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_BREAK}, {"type": "string"}]},
+        kind="0 to 600, or name of a page",
+        example="pause",
     )
     instructions: str | None = keyed.key(
         page,
         None,
-        "A file of steps/ that the game page shows before the game, and again in a pause.",
+        "A page of `steps/` that the game page shows before the game, and again in a pause. See "
+        "[pages in the game](#pages-in-the-game).",
         {"type": "string"},
+        kind="name of a page",
+        example="rules",
     )
     reset_freeze: float = keyed.seconds(
         60,
         0,
-        "Seconds for which each episode shows its first picture, with a countdown; keys do nothing.",
+        "Seconds for which each episode shows its first picture, with a countdown, before its first "
+        "step. Keys do nothing meanwhile.",
+        example="3",
     )
-    max_steps: int = keyed.whole(0, 10**9, 0, "Steps after which an episode is truncated; 0 is no limit.")
+    max_steps: int = keyed.whole(
+        0, 10**9, 0, "Steps after which an episode is truncated. 0 is no limit.", example="1000"
+    )
     episode_seconds: float = keyed.seconds(
         86_400,
         0,
-        "Seconds of play after which an episode is truncated; the page shows the time left. 0 is no limit.",
+        "Seconds of play after which an episode is truncated; pauses and the countdown do not count. "
+        "The page shows the time that is left. 0 is no limit.",
+        example="90",
     )
     keys: dict[str, Any] = keyed.key(
         values.section("ArrowLeft: left"),
         {},
-        "The action of each key of the keyboard, by KeyboardEvent.key, with + between keys that are held together; "
-        "or such a map for each player. Default: arrows, WASD, Space and digits, by the names of the actions.",
+        "What the keys of the keyboard do; see [keys](#keys).",
         {
             "type": "object",
             "additionalProperties": {
@@ -93,144 +110,255 @@ class TrialSection(Section):
             },
         },
         entries=key_maps.actions_of_keys,
+        kind="section",
+        otherwise="by the actions' names",
+        example="{ArrowLeft: left, a: left}",
     )
-    labels: dict[str, str] = keyed.texts("left: Go left", "Texts of the buttons, by action.", key_maps.labels)
+    labels: dict[str, str] = keyed.texts(
+        "left: Go left",
+        "Texts of the buttons, by action. An arrow's text stands below the arrow; with `keys`, the "
+        "list of keys shows it, too.",
+        key_maps.labels,
+        kind="section",
+        otherwise="the actions' names",
+        example="{left: Go left}",
+    )
     input: str = keyed.choice(
         ("held", "single"),
-        "Whether an action goes on while its keys are held, or each press of a key is one action.",
+        "`held`: an action goes on while its keys are held. `single`: each press of a key is one action, for one step.",
+        example="single",
     )
     game: str | None = keyed.key(
         values.text("the name of an environment"),
         None,
-        "Name of the environment, given to the agent's start(). Needed if there is a game step.",
+        "The name of the environment; your agent's `start()` receives it. If another package "
+        "registers it with Gymnasium, its module stands before it: `minigrid:MiniGrid-Empty-5x5-v0`.",
         {"type": "string"},
+        otherwise="needed if there is a game step",
+        example="ALE/Pong-v5",
     )
     data_file: str = keyed.choice(
         ("episode", "trial"),
-        "Whether a recording is written after each episode or once at the end of the trial.",
+        "`episode`: a recording after each episode, which needs less memory. `trial`: one at the end.",
+        example="trial",
     )
-    s3upload: bool = keyed.flag(True, "Whether recordings are uploaded; otherwise they are lost with the server.")
+    s3upload: bool = keyed.flag(
+        True, "Whether recordings are kept. If not, they are lost with the server.", example="false"
+    )
     action_space: tuple[str, ...] = keyed.items(
-        "action", 1000, values.action_name, (), "Names of the actions, in the order of the environment's numbers."
+        "action",
+        1000,
+        values.action_name,
+        (),
+        "Names of the actions, in the order of the environment's numbers: the first is action 0. See "
+        "[actionSpace](#actionspace).",
+        kind="list of different texts of at most 64 letters",
+        example="[noop, fire, right, left]",
     )
-    allow_frame_rate_change: bool = keyed.flag(False, "Whether participants may change the frame rate.")
-    frame_rate_step_size: int = _rate(5, "Frames per second by which fpsUp and fpsDown change the rate.")
-    min_frame_rate: int = _rate(1, "Lowest rate, in frames per second.")
-    max_frame_rate: int = _rate(90, "Highest rate, in frames per second.")
-    starting_frame_rate: int = _rate(30, "Rate at which a trial starts, in frames per second.")
+    allow_frame_rate_change: bool = keyed.flag(
+        False,
+        "Whether participants may change the rate (HIPPO's spelling `allowFramRateChange` is "
+        "understood). The next three keys have no effect if participants may not.",
+        example="true",
+    )
+    frame_rate_step_size: int = _rate(
+        5, "By how many frames per second `fpsUp` and `fpsDown` change the rate.", example="10"
+    )
+    min_frame_rate: int = _rate(1, "The lowest rate.", kind="1 to 240, at most `startingFrameRate`", example="5")
+    max_frame_rate: int = _rate(90, "The highest rate.", kind="1 to 240, at least `startingFrameRate`", example="60")
+    starting_frame_rate: int = _rate(30, "Frames per second when the trial starts.", example="20")
     ui: Ui = keyed.section(
         Ui,
         Ui(left=True, right=True, up=True, down=True, start=True, pause=True),
-        "Controls on the game page. Default: left, right, up, down, start, pause.",
+        "Which controls are shown; see [ui](#ui).",
+        otherwise="`left`, `right`, `up`, `down`, `start` and `pause`",
     )
-    record_observations: bool = keyed.flag(False, "Whether recordings hold the full observations, which can be large.")
-    lossless: bool = keyed.flag(False, "Whether every picture arrives unchanged, however many bytes that takes.")
+    record_observations: bool = keyed.flag(
+        False,
+        "Whether recordings hold the full observations, which can be very large. HIPPO saved them "
+        "always, so `make check` remarks on it in a project of HIPPO's layout.",
+        example="true",
+    )
+    lossless: bool = keyed.flag(
+        False,
+        "Whether every frame shows participants the exact pixels. If not, moving textures are sent as"
+        " JPEGs; see [agent.md](agent.md#pictures).",
+        example="true",
+    )
     callback_seconds: float = keyed.seconds(
         10,
         0.5,
-        "Seconds for which the game waits for a callback of the agent; then it goes on without waiting.",
+        "How many seconds the game waits for each of the agent's [callbacks](callbacks.md). Then it "
+        "goes on without waiting.",
+        example="2",
     )
     gym: str = keyed.choice(
         ("none", "watch", "advise"),
-        "What programs with the server's token may do at its path /gym: nothing, watch each step, or also advise.",
+        "What programs that have the server's token may do at its path `/gym` while a person plays: "
+        "nothing; `watch`: see each step as it is recorded; `advise`: also suggest actions "
+        "([gym.md](gym.md#watching-a-trial-and-advising)).",
+        example="watch",
     )
     scene: SceneSection | None = keyed.section(
         SceneSection,
         None,
-        "With this section the game is drawn by the objects that render() returns, without it by frames.",
+        "The game is drawn by objects that your agent's `render()` returns instead of by frames; see "
+        "[objects.md](objects.md#configyml).",
         "width: 600",
+        example="{width: 600, height: 400}",
     )
     players: dict[str, Any] = keyed.key(
         player_checks.players,
         {},
-        "Who plays each player of the environment: human, random, idle, agent:Class of agent.py, an .onnx file, or "
-        "gym://name. If groups differ, one such map for each group, by its number. Default: human, in an "
-        "environment with one player.",
+        "Who plays each player of an environment that has several: `human`, `random` (a random "
+        "possible action), `idle` (the idle action), `agent:Partner` (a class of agent.py), "
+        "`policies/partner.onnx` (a file below the project's folder; `sample:policies/partner.onnx` "
+        "draws by its output), or `gym://name` (a program at the trial's `/gym`; needs `gym: "
+        "advise`). At least one human. If groups differ: one such map for each [group](#steps), by "
+        "its number; groups exist only if a page has versions.",
         {
             "type": "object",
             "additionalProperties": {
                 "anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]
             },
         },
+        kind="a map: the player's name and who plays it",
+        otherwise="one human",
+        example="{player_0: human, player_1: random}",
     )
-    frame_skip: int = keyed.whole(1, 1000, 1, "In real time, the steps from one choice of a policy to its next.")
+    frame_skip: int = keyed.whole(
+        1,
+        1000,
+        1,
+        "In real time, policies choose at one step in so many. `policyActions` says what they do between.",
+        example="4",
+    )
     policy_actions: str | None = keyed.key(
         values.one_of("held", "single"),
         None,
-        "In real time, whether a policy's action goes on until its next choice, or is one action for one step. "
-        "Default: as input.",
+        "In real time, what a policy's player does between two choices, or if the policy is late. "
+        "`held`: its last action goes on. `single`: it takes the idle action, so with `frameSkip: 4` "
+        "it acts in one step of four.",
         {"enum": ["held", "single"]},
+        otherwise="as `input`",
+        example="single",
     )
     policy_seconds: float = keyed.seconds(
         600,
         10,
-        "With pace: turns, the seconds that a policy has for its choice; then the idle action is taken.",
+        "With `turns`: the seconds that a policy may think; then the idle action is taken. In real "
+        "time it has until the next frame; `policyActions` says what happens if it is late.",
         least=0.01,  # elsewhere 0 means no limit; here it would make each action late
+        example="3",
     )
     substitute: str | None = keyed.key(
         player_checks.policy,
         None,
-        "The policy, as in players, that plays in the place of an absent participant, if project.players is 2 or more.",
+        "With `project.players`: what plays in the place of a participant who is not there. A policy as in `players`.",
         {"type": "string"},
+        kind="a policy",
+        example="agent:Partner",
+        together=True,
     )
     absent: float = keyed.seconds(
         3600,
         30,
-        "In a game of several participants, seconds for which the game is held when a participant is disconnected.",
+        "With `project.players`: seconds for which the game is held when a participant's connection is gone.",
+        example="60",
+        together=True,
     )
     gather: float = keyed.seconds(
         3600,
         120,
-        "In a game of several participants, seconds for which the others wait for a participant who has not come or "
-        "is still reading, before the game and at a page between two episodes.",
+        "With `project.players`: seconds for which those who are there wait, before the game and at a"
+        " page between two episodes, for a participant who has not come or who reads on.",
+        example="300",
+        together=True,
     )
     after_absent: str = keyed.choice(
         ("end", "policy"),
-        "What happens when absent or gather is over: the game ends for all, or substitute plays in the place until the "
-        "participant is back.",
+        "What happens when `absent` or `gather` is over: the game ends for all, or `substitute` plays"
+        " until the participant is back.",
+        example="policy",
+        together=True,
     )
-    countdown: float = keyed.seconds(60, 3, "Seconds from when all participants are there until the game begins.")
+    countdown: float = keyed.seconds(
+        60,
+        3,
+        "With `project.players`: seconds from when all are there until the game begins.",
+        example="5",
+        together=True,
+    )
     max_ping: int = keyed.whole(
         0,
         10_000,
         0,
-        "The longest round trip of a participant to the server before a game of several participants, in "
-        "milliseconds; 0 is no limit.",
+        "With `project.players`: milliseconds that a participant's round trip to the server may take,"
+        " measured before the game; 0 is no limit.",
+        example="250",
+        together=True,
     )
-    ping_samples: int = keyed.whole(1, 100, 5, "Round trips that are measured before the game; their median counts.")
+    ping_samples: int = keyed.whole(
+        1,
+        100,
+        5,
+        "How many round trips are measured before the game; their median counts. They take [20 "
+        "seconds](players.md#several-participants) at most.",
+        example="10",
+        together=True,
+    )
     player_names: dict[str, str] = keyed.texts(
         "red: The red one",
-        "Names of players that participants who play together read, instead of the environment's names.",
+        "With `project.players`: what participants read instead of the names that the environment has for its players.",
         key_maps.player_names,
+        kind="a map: the player's name and a text of at most 64 letters",
+        otherwise="the names, with a capital",
+        example="{agent_left: Red, agent_right: Blue}",
+        together=True,
     )
     seed: int | None = keyed.whole(
         0,
         2**31 - MAX_EPISODES - 1,  # so that the last episode's seed, too, is below 2**31
         None,
-        "Seed of the first episode; each later episode has the next number. Default: a random seed for each episode.",
+        "Seed of the first episode; each later episode has the next number. Without this key, each "
+        "episode has a random seed. Recordings hold the seeds in both cases.",
+        otherwise="random",
+        example="7",
     )
     pace: str = keyed.choice(
         ("realtime", "turns"),
-        "Whether a step is taken at each frame, or as soon as all players whose turn it is have chosen.",
+        "`realtime`: a step at each frame. `turns`: the game waits until all players who are to act "
+        "have chosen; a step comes no sooner than one frame after the last step.",
+        example="turns",
     )
     turn_seconds: float = keyed.seconds(
         86_400,
         0,
-        "With pace: turns, the seconds in which a participant must choose; 0 is no limit.",
+        "With `turns`: the seconds in which a participant must choose. A pause stops the clock. 0 is no limit.",
+        example="20",
     )
     turn_ends: str = keyed.choice(
         ("idle", "random", "episode"),
-        "What happens when turnSeconds are over: the idle action, a random possible one, or the episode ends.",
+        "What happens when `turnSeconds` are over: the idle action is taken, a random possible one, "
+        "or the episode ends. The page tells the participant.",
+        example="random",
     )
     idle_action: str | dict[str, str] | None = keyed.key(
         player_checks.idle_action,
         None,
-        "Name of the action that is taken without a key, or one for each player. Default: noop if there is such "
-        "an action, otherwise the first action.",
+        "Name of the action that is taken while no key is pressed, or a map of one for each player.",
         {"anyOf": [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "string"}}]},
+        kind="a name of `actionSpace`, or a map by player",
+        otherwise="`noop`, else the first",
+        example="stay",
     )
     options: dict[str, Any] = keyed.key(
-        values.options, {}, "A map of your own keys for the agent; at most 4 KB.", {"type": "object"}
+        values.options,
+        {},
+        "Settings of your own for your agent; see [options](#options).",
+        {"type": "object"},
+        kind="section of your own keys",
+        example="{difficulty: 3}",
     )
 
     @property
@@ -325,3 +453,7 @@ class TrialSection(Section):
         values, since ECS limits the length of a server's variables."""
         defaults = TrialSection().document()
         return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != defaults[key]}
+
+
+SESSION_KEYS = tuple(key.name for key in keyed.keys(TrialSection) if key.together)
+"""Keys of games of several participants (`project.players`). A registration leaves out a key with its default value."""

@@ -109,17 +109,23 @@ def _pixels(default: int, meaning: str) -> Any:
 class SceneSection(Section):
     """The section `scene`: the picture of a game that is drawn by objects (docs/objects.md)."""
 
-    width: int = _pixels(600, "Width of the picture, in its own pixels; the page makes the picture larger or smaller.")
-    height: int = _pixels(400, "Height of the picture, in its own pixels.")
+    width: int = _pixels(
+        600, "Width of the picture, in pixels of its own. The page shows it larger or smaller, as there is room."
+    )
+    height: int = _pixels(400, "Height of the picture.")
     background: str = keyed.key(
         _color,
         "#ffffff",
-        "Color behind all objects, as #rrggbb in quotes.",
+        "The color behind all objects.",
         {"type": "string", "pattern": "^#[0-9a-fA-F]{6}$"},
+        kind='`"#rrggbb"`, in quotes',
     )
     coordinates: str = keyed.choice(
         ("relative", "pixels"),
-        "Whether x, y and points are fractions of the picture, from 0 to 1, or its pixels.",
+        "`relative`: x, y and points are shares of the picture, so that 0.5 is its middle. `pixels`: "
+        "they are pixels of it.",
     )
     pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
-    assets: str = keyed.text("assets", "The project's folder with the images that sprites show.", _folder)
+    assets: str = keyed.text(
+        "assets", "The project's folder with the images that sprites show.", _folder, kind="a folder of the project"
+    )

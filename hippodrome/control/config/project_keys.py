@@ -210,8 +210,9 @@ _MATCHING: dict[str, object] = {
 }
 
 
-def _step(meaning: str) -> Any:
-    return keyed.key(step_name, None, meaning, {"anyOf": [{"minimum": 1, "type": "integer"}, {"const": FINAL}]})
+def _step(meaning: str, **more: Any) -> Any:
+    schema = {"anyOf": [{"minimum": 1, "type": "integer"}, {"const": FINAL}]}
+    return keyed.key(step_name, None, meaning, schema, kind=f"number of a step, or `{FINAL}`", **more)
 
 
 def _apart(_value: object) -> dict[str, Any]:
@@ -247,25 +248,38 @@ class AwsSetupKeys(Section):
     """The project's place on AWS, and the size of its servers."""
 
     bucket: str | None = keyed.text(
-        None, "HIPPO's name of the S3 bucket. No effect: pages and data lie in the installation's."
+        None,
+        "No effect: HIPPO's key for the S3 bucket. Pages and data lie in the installation's.",
+        otherwise="the installation's",
     )
-    region: str | None = keyed.text(None, "AWS region, such as ca-central-1. Default: the installation's.", region)
+    region: str | None = keyed.text(
+        None, "The AWS region.", region, kind="code of a region", otherwise="the installation's", example="eu-north-1"
+    )
     root_domain: str | None = keyed.text(
         None,
-        "Domain below which each server gets its name; without https://. Default: the installation's.",
+        "The installation's domain, below which servers get their names.",
         domain,
+        kind="domain name, without `https://`",
+        otherwise="the installation's",
+        example="play.paddle.example",
     )
     cpu: float | None = keyed.key(
         fargate.cpu,
         None,
-        "vCPUs of each participant's server. Needed for AWS.",
+        "vCPUs of each participant's server.",
         {"enum": [int(n) if n >= 1 else n for n in fargate.SIZES]},
+        kind="one of the table below",
+        otherwise="needed on AWS",
+        example="1",
     )
     memory: float | None = keyed.key(
         fargate.memory,
         None,
-        "Memory of each participant's server in GB; must fit cpu. Needed for AWS.",
+        "Memory of each server in GB; must fit `cpu`.",
         {"type": "number", "minimum": 0.5, "maximum": 120},
+        kind="see below",
+        otherwise="needed on AWS",
+        example="4",
     )
 
 
@@ -274,10 +288,14 @@ class EventsKeys(Section):
     """The steps at which a participant's server starts and stops."""
 
     start_server_step: str | None = _step(
-        "The server starts when the participant reaches this step. Default with a game step: 2, or 1 if it is step 1."
+        "The server starts when the participant reaches this step. It must not come after the first game step.",
+        otherwise="`2` if there is a game step (`1` if the game is step 1), else none",
+        example="3",
     )
     stop_server_step: str | None = _step(
-        "The server stops when the participant reaches this step. Default: the step after the last game step."
+        "The server stops when the participant reaches this step. It must come after the last game step.",
+        otherwise="the step after the last game step, else none",
+        example="4",
     )
 
 
@@ -297,140 +315,230 @@ class ProjectKeys(Section):
     id: str = keyed.key(
         project_id,
         "",
-        "The project's id: letters, digits, dashes and underscores; unique in your organization.",
+        "The project's name in addresses and folders. Unique in your organization.",
         {"type": ["string", "integer"], "pattern": "^(?!_)[A-Za-z0-9_-]{1,64}$"},
         needed=True,
+        kind=(
+            "letters, digits, dashes, underscores (not the first); 1 to 64; not `SSL`, the folder of the "
+            "servers' certificate"
+        ),
+        example="paddle-feedback",
     )
-    name: str = keyed.text("", "The name of the study for people. Default: the id.", values.text("a name"))
-    researcher: str = keyed.text("", "The person who is responsible for the study.")
+    name: str = keyed.text(
+        "",
+        "The title that participants see.",
+        values.text("a name"),
+        otherwise="the `id`",
+        example="Paddle with feedback",
+    )
+    researcher: str = keyed.text(
+        "", "The responsible researcher; participants see the name at the bottom of each page.", example="Mio Sørensen"
+    )
     contact: str = keyed.text(
-        "", "How participants reach the researchers if something does not work, such as an e-mail address."
+        "",
+        "How participants reach you if something does not work, such as an e-mail address. They see "
+        "it on pages that report an error, and when no server could run their game.",
+        example="study@example.edu",
     )
     team_members: tuple[str, ...] = keyed.items(
-        "person", 200, values.text(), (), "The other members of the team: one name or a list.", single=True
+        "person",
+        200,
+        values.text(),
+        (),
+        "The other researchers.",
+        single=True,
+        kind="text, or a list",
+        example="[Ada, Bo]",
     )
-    live: bool = keyed.flag(True, "Whether participants can take part now.")
-    max_runtime: int = keyed.whole(1, 1440, 60, "Minutes after which a server is stopped, whatever happens.")
+    live: bool = keyed.flag(
+        True,
+        "Whether participants can take part now. If not, the link answers as if there were no such "
+        "project, also for participants in the middle of it; see [closing](#closing).",
+        example="false",
+    )
+    max_runtime: int = keyed.whole(
+        1,
+        1440,
+        60,
+        "Minutes after which a participant's server is stopped, whatever happens. If your "
+        "administrator has set a lower limit, that counts.",
+        example="45",
+    )
     use_aws: bool = keyed.flag(
         False,
-        "Whether the study runs on AWS; false keeps it on one machine. Default: on AWS as soon as it is deployed.",
+        "Whether the study is for AWS; see [useAWS](#useaws).",
         name="useAWS",
+        otherwise="on AWS once it is deployed",
+        example="true",
     )
     aws_setup: AwsSetupKeys = keyed.section(
-        AwsSetupKeys, AwsSetupKeys(), "The size of the servers, and their place on AWS; needed for AWS."
+        AwsSetupKeys,
+        AwsSetupKeys(),
+        "How large the servers are, and where on AWS; see [awsSetup](#awssetup).",
+        otherwise="needed on AWS",
     )
     events: EventsKeys = keyed.section(
-        EventsKeys, EventsKeys(), "The steps at which the participant's server starts and stops."
+        EventsKeys,
+        EventsKeys(),
+        "When the server starts and stops; see [events](#events).",
+        otherwise="around the game",
     )
     ssl: SslKeys = keyed.section(
-        SslKeys,
-        SslKeys(),
-        "No effect: servers get the installation's certificate. HIPPO's configurations have this section.",
+        SslKeys, SslKeys(), "Has no effect; see [ssl](#ssl).", otherwise="the installation's own"
     )
     steps: dict[str, str] = keyed.key(
         values.section("1: consent"),
         {},
-        "The study's steps in order: a list of names with settings (docs/designs.md), or 1, 2, 3 … and finalStep. "
-        "Each is a file of the steps folder, or game.",
+        "The pages in order: a list of names with settings ([designs](designs.md)), or 1, 2, 3 … and `finalStep`; see "
+        "[steps](#steps).",
         {"anyOf": [_NUMBERED, _NAMED]},
         needed=True,
         entries=steps_by_number,
+        kind="list or section",
+        example="[consent, game, thanks]",
     )
     conditions: dict[str, Any] = keyed.key(
         _apart,
         {},
-        "Factors between people, each with its levels: everybody gets one cell of their product, in balance "
-        "(docs/designs.md).",
+        "Factors between people, each with its levels; everybody gets one cell of their product, in balance; see "
+        "[designs](designs.md#conditions-between-people).",
         _FACTORS,
+        kind="section",
+        otherwise="none",
+        example="{partner: [helpful, lazy]}",
     )
     ends: dict[str, Any] = keyed.key(
         _apart,
         {},
-        'Ends before the last step, each with its rule, such as declined: answers.consent.agree == "no" '
-        "(docs/designs.md).",
+        "Ends before the last step, for those who decline, fail a check, or run out of time; see "
+        "[designs](designs.md#ends).",
         {"type": "object"},
+        kind="section",
+        otherwise="none",
+        example="{declined: 'answers.consent.agree == \"no\"'}",
     )
     cluster: str = keyed.choice(
         ("installation", "participant"),
-        "One ECS cluster for the installation, or one for each participant as in HIPPO.",
+        "`installation`: all servers share one ECS cluster. `participant`: each participant has a "
+        "cluster, as in HIPPO.",
     )
     subdomain: str = keyed.choice(
-        ("hash", "userId"), "The name of a server: a hash, which keeps ids private, or the userId as in HIPPO."
+        ("hash", "userId"),
+        "The first part of a server's DNS name. `hash`: a short hash, so that DNS holds no ids of "
+        "recruiters. `userId`: the id in lower case, as in HIPPO, if your administrator allows it; an"
+        " id that DNS does not accept (64 characters, a dash or an underscore at its beginning or "
+        "end) gets a hash.",
     )
     plain_clients: bool = keyed.flag(
         False,
-        "Whether HIPPO's front end plays without a token. Anybody who knows an id can then play as that participant.",
+        "Whether HIPPO's own front end may open the game. It has no token, so the participant's id "
+        "and the front end's address open a server. A person who knows an id can then play in that "
+        "participant's place ([security](security.md#identity)). Needs `subdomain: userId` and your "
+        "administrator's consent; see [coming from "
+        "HIPPO](hippo.md#the-plain-websocket-protocol-and-the-react-front-end).",
+        example="true",
     )
     front_end: tuple[str, ...] = keyed.items(
         "https:// address",
         5,
         page_origin,
         (),
-        "Origins of HIPPO's front end: https://, or http:// on this machine. Needed with plainClients.",
+        "Where that front end is.",
         single=True,
+        kind=(
+            "an `https://` address without path, or a list of at most 5; on one machine also `http://localhost:3000`"
+        ),
+        otherwise="needed with `plainClients`",
+        example="https://play.example.org",
     )
     allowed_hosts: tuple[str, ...] = keyed.items(
         "https:// address",
         MAX_HOSTS,
         origin,
         (),
-        "https:// origins from which step pages may load images, media, frames and scripts.",
+        "Other sites from which your pages may load images, videos, frames and scripts.",
+        kind="list of `https://` addresses without path; at most 50",
+        example="[https://media.example.org]",
     )
     record_headers: tuple[str, ...] = keyed.items(
         "name of a header",
         MAX_HEADERS,
         header,
         ("user-agent", "accept-language"),
-        "Headers of a participant's first request that are kept. user-agent names browser and device.",
+        "Headers of a participant's first request that are kept in `participant.json`: by default "
+        "those that name browser, device and languages. `[]` keeps none. The IP address is "
+        "`x-forwarded-for`: it is kept only if you name it, and is personal data, so say it in your "
+        "consent form.",
+        kind="list of names; at most 20",
+        example="[user-agent]",
     )
     max_participants: int | None = keyed.whole(
         1,
         100_000,
         None,
-        "The largest number of participants. Later ones are told that the study is full. Default: no limit.",
+        "How many participants may take part. For others the study is full; see [limits](#limits).",
+        otherwise="no limit",
+        example="200",
     )
     max_servers: int | None = keyed.whole(
-        1, 10_000, None, "The largest number of servers that run at once. Default: no limit."
+        1, 10_000, None, "How many servers may run at once; see [limits](#limits).", otherwise="no limit", example="20"
     )
     max_server_hours: int | None = keyed.whole(
-        1, 1_000_000, None, "Hours that all servers together may run. Default: no limit."
+        1,
+        1_000_000,
+        None,
+        "Hours that all servers together may run; see [limits](#limits).",
+        kind="1 to 1000000, and enough for `maxRuntime`",
+        otherwise="no limit",
+        example="300",
     )
     warm_servers: int = keyed.whole(
         0,
         100,
         0,
-        "Servers that are started ahead, so that participants need not wait. Each waiting server costs money.",
+        "How many servers start ahead and wait for participants; see [warm servers](#warm-servers).",
+        kind="0 to 100, at most `maxServers`",
+        example="4",
     )
-    signed_links: bool = keyed.flag(False, "Whether participants need a link that `deploy links` has signed.")
+    signed_links: bool = keyed.flag(
+        False, "Whether a link must be signed; see [Inviting participants](recruiting.md#signed-links).", example="true"
+    )
     players: int = keyed.whole(
-        1,
-        MAX_PLAYERS,
-        1,
-        "The number of participants who play together in one environment. With 1 each plays alone, on their own "
-        "server.",
+        1, MAX_PLAYERS, 1, "How many participants play together in one environment. 1: each plays alone.", example="2"
     )
     matching: str | dict[str, str] = keyed.key(
         who_with_whom,
         "arrival",
-        "Who plays with whom: arrival, group, mixed, {same: field}, {different: field}, or match of agent.py.",
+        "Who plays with whom: `arrival` (who came first), `group` (people of one group), `mixed` (of "
+        "different groups), `{same: field}` or `{different: field}` (by what they answered in that "
+        "field of an earlier page). `match`: the function "
+        "[`match`](sessions.md#a-function-that-matches) of `agent.py` decides.",
         _MATCHING,
+        kind="one of these",
+        example="{same: language}",
     )
     seats: str = keyed.choice(
         tuple(SEATS),
-        "Who plays which player: by lot, in the order of the groups, or in the order in which match returns them.",
+        "Who plays which player. `lot`: drawn by lot. `group`: in the order of the groups, so that a "
+        "participant of group 0 is the first human player; needs `matching: mixed` or `match`. "
+        "`match`: in the order in which the function [`match`](sessions.md#a-function-that-matches) "
+        "names the members of a session.",
+        example="group",
     )
     patience: float = keyed.seconds(
-        3600, 300, "Seconds for which a participant waits in the lobby for others.", least=10
+        3600, 300, "Seconds after which a participant no longer waits for others.", least=10, example="120"
     )
     after_patience: str = keyed.choice(
         ("unmatched", "policies"),
-        "What follows when patience is over: the next step, or a game with policies (trial.substitute) in empty "
-        "places.",
+        "What happens then. `unmatched`: the next step. `policies`: a game with those who are there; "
+        "`trial.substitute` plays in the empty places.",
+        example="policies",
     )
     texts: dict[str, str] = keyed.key(
         values.section('start: "Los"'),
         {},
-        "The study's own words for Hippodrome's texts (docs/texts.md). Default: English.",
+        "Your own words for what Hippodrome says to participants, such as buttons and errors, for a "
+        "study in another language; see [texts](texts.md).",
         {
             "additionalProperties": False,
             "properties": {
@@ -440,6 +548,9 @@ class ProjectKeys(Section):
             "type": "object",
         },
         entries=keyed.map_of(text_name, own_text),
+        kind="section: names and texts",
+        otherwise="English",
+        example='{continue: "Weiter"}',
     )
 
     @property

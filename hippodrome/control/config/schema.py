@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from hippodrome.control.config.project_keys import SECTIONS, ConfigFile
 from hippodrome.protocol.section_keys import Key, Section, keys, others_of
 from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
+
+_SEE = re.compile(r"(?:;|\.) [Ss]ee \[[^]]*\]\([^)]*\)")
+_LINK = re.compile(r"\[([^]]*)\]\([^)]*\)")
 
 
 def config_schema() -> dict[str, Any]:
@@ -35,9 +39,16 @@ def _of(section: type[Section]) -> dict[str, Any]:
     return schema | ({"required": needed} if needed else {})
 
 
+def _plain(key: Key) -> str:
+    """The meaning of a key and its default, without the links of docs/config.md."""
+    default = key.otherwise and (key.otherwise if key.otherwise.startswith("needed") else f"default: {key.otherwise}")
+    sentence = f" {default[0].upper()}{default[1:]}." if default else ""
+    return _LINK.sub(r"\1", _SEE.sub("", key.meaning)) + sentence
+
+
 def _property(key: Key) -> dict[str, Any]:
     """The schema of a key. Its value may be empty unless the key is needed, since an empty key counts as not given."""
-    about: dict[str, Any] = {"description": key.meaning} if key.meaning else {}
+    about: dict[str, Any] = {"description": _plain(key)} if key.meaning else {}
     if key.section is None and key.default not in (None, ""):
         about["default"] = key.default
     if key.needed:

@@ -26,9 +26,11 @@ from hippodrome.control.config import (
     read_project,
 )
 from hippodrome.control.config.__main__ import main
+from hippodrome.control.config.yaml_file import parse_yaml
 from hippodrome.control.model.project import Project
 from hippodrome.deployment.core.project_folder import may_use_aws
 from hippodrome.protocol import section_keys, trial
+from tests.control.config import tables
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -415,7 +417,29 @@ def test_the_schema_refuses_configurations_that_are_refused(folder: Path, text: 
 
 def test_the_schema_in_the_docs_is_the_current_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
-    assert capsys.readouterr().out == (DOCS / "config.schema.json").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == tables.SCHEMA.read_text(encoding="utf-8") == tables.schema()
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_the_tables_of_keys_in_the_docs_are_the_current_ones(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert tables.page_with_tables(text) == text
+
+
+def test_a_key_that_the_docs_lack_gets_a_row_below_the_one_declared_before_it() -> None:
+    text = tables.PAGES[0].read_text(encoding="utf-8")
+    rows = text.splitlines(keepends=True)
+    without = "".join(row for row in rows if not row.startswith("| `seats`"))
+    assert "`seats`" not in without
+    assert tables.page_with_tables(without) == text
+
+
+def test_every_example_of_a_value_is_accepted() -> None:
+    for path, section in project_keys.SECTIONS.items():
+        for key in section_keys.keys(section):
+            if key.example and (*path, key.name) != project_keys.STEPS:  # config/design.py reads a list of steps
+                document = parse_yaml(f"{key.name}: {key.example}".encode()).values
+                assert section_keys.check_section(section, document, path)[1] == [], key.name
 
 
 def test_the_schema_says_what_every_key_means() -> None:
@@ -433,11 +457,3 @@ def test_the_examples_in_the_reference_are_right(folder: Path) -> None:
     found = read_project(folder)
     size = found.project.aws_setup
     assert (may_use_aws(folder), size.cpu, size.memory, found.steps[1].variants) == (True, 1, 4, 2)
-
-
-def test_the_reference_has_every_key() -> None:
-    text = (DOCS / "config.md").read_text(encoding="utf-8")
-    sections = {path: names for path, names in project_keys.NAMES.items() if path and path[-1] != "scene"}
-    keys = frozenset().union(*sections.values())
-    missing = [key for key in keys if f"`{key}`" not in text]
-    assert not missing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -31,28 +32,35 @@ WHO = st.dictionaries(
     ),
     max_size=3,
 )
+
+
+def by_schema(schema: Mapping[str, Any]) -> st.SearchStrategy[Any] | None:
+    """Values for a flag, a number or a word, right and wrong ones; None for another kind of value."""
+    match schema:
+        case {"type": "boolean"}:
+            return FLAGS
+        case {"minimum": _}:
+            return NUMBERS
+        case {"enum": [*words]}:
+            return st.sampled_from([*words, "other"])
+    return None
+
+
 KEYS: dict[str, st.SearchStrategy[Any]] = {
-    **dict.fromkeys(("maxEpisodes", "actionBufferLifespan", "frameRateStepSize", "callbackSeconds"), NUMBERS),
-    **dict.fromkeys(("maxSteps", "resetFreeze", "episodeSeconds"), NUMBERS),
+    **{
+        key.name: values
+        for key in section_keys.keys(trial.TrialSection)
+        if (values := by_schema(key.schema)) is not None
+    },
+    trial.RATE_CHANGE_MISSPELT: FLAGS,
     "betweenEpisodes": NUMBERS | st.sampled_from(["pause", "pause.html", "../pause", "game"]),
     "instructions": st.sampled_from(["rules", "rules.html", "a/b", "game", "é", 3]),
     "keys": st.dictionaries(st.sampled_from(["a", "A", "Space", "a+b", "Left", "Tab", "p"]), NAMES.map(str) | ACTIONS),
     "labels": st.dictionaries(st.sampled_from(["up", "Up", "left", ""]), st.sampled_from(["Go", "", 3, "x" * 65])),
-    **dict.fromkeys(("input", "policyActions"), st.sampled_from(["held", "single", "both"])),
     **dict.fromkeys(("minFrameRate", "startingFrameRate", "maxFrameRate"), st.integers(1, 241)),
-    **dict.fromkeys(
-        (trial.RATE_CHANGE, trial.RATE_CHANGE_MISSPELT, "s3upload", "recordObservations", "lossless"), FLAGS
-    ),
     "actionSpace": NAMES,
-    "dataFile": st.sampled_from(["episode", "trial", "both"]),
-    "gym": st.sampled_from(["none", "watch", "advise", "play"]),
-    **dict.fromkeys(("frameSkip", "policySeconds", "seed", "turnSeconds"), NUMBERS),
-    "pace": st.sampled_from(["realtime", "turns", "fast"]),
-    **dict.fromkeys(("absent", "gather", "countdown", "maxPing", "pingSamples"), NUMBERS),
-    "afterAbsent": st.sampled_from(["end", "policy", "wait"]),
     "substitute": st.sampled_from(["random", "human", "agent:Partner", "../x.onnx", "gym://x", 3]),
     "playerNames": st.dictionaries(PLAYERS, st.sampled_from(["Red", "", 3, "x" * 65]), max_size=2),
-    "turnEnds": st.sampled_from(["idle", "random", "episode", "game"]),
     "idleAction": st.sampled_from(["noop", "up", 3, "a" * 65]) | st.dictionaries(PLAYERS, st.just("up"), max_size=2),
     "players": WHO | st.dictionaries(st.sampled_from(["0", "1", "x"]), WHO, max_size=2),
     "ui": st.dictionaries(st.sampled_from(["left", "stop", "fpsUp"]), FLAGS),
