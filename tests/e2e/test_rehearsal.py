@@ -35,10 +35,10 @@ TGKILL = {"x86_64": 234, "aarch64": 131}.get(platform.machine(), -1)  # the syst
 Process = subprocess.Popen[str]
 
 
-def rehearsal(*arguments: str | Path, module: str = "hippodrome.local.rehearsal", **env: str) -> Process:
+def rehearsal(*arguments: str | Path, **env: str) -> Process:
     return processes.start(
-        module,
-        [*map(str, arguments)],
+        "hippodrome",
+        ["try", *map(str, arguments)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "150", **env},
         stdout=subprocess.PIPE,
@@ -55,9 +55,7 @@ def said(process: Process, seconds: float = 120) -> str:
 
 
 def test_bots_walk_through_the_example_project(tmp_path: Path) -> None:
-    process = rehearsal(
-        ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data", module="hippodrome.local.rehearsal"
-    )
+    process = rehearsal(ROOT, "--bots", "2", "--play", "2", "--data", tmp_path / "data")
     text = said(process)
     assert process.returncode == 0, text
     for line in ("ui.stop", "2 of 2: a bot plays 2 s (`--play 0`: to the end)", "6 of 6", "of 30 set", "none"):

@@ -17,8 +17,8 @@ EXAMPLES = sorted(path.parent.name for path in (ROOT / "examples").glob("*/confi
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_make_check_finds_neither_mistakes_nor_remarks(example: str, tmp_path: Path) -> None:
     process = processes.start(
-        "hippodrome.local.check",
-        [str(ROOT / "examples" / example)],
+        "hippodrome",
+        ["check", str(ROOT / "examples" / example)],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,

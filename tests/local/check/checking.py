@@ -47,8 +47,8 @@ def run(folder: Path) -> tuple[int, list[str]]:
     said = folder.parent / "said.log"
     with said.open("w") as errors:
         done = processes.start(
-            "hippodrome.local.check",
-            [str(folder)],
+            "hippodrome",
+            ["check", str(folder)],
             cwd=folder.parent,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE,
