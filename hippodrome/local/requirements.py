@@ -47,7 +47,7 @@ def install(file: Path, constraints: Path, stamps: Path) -> str:
         return ""
     sys.stdout.write(f"Installing what {file} names (once) …\n")
     sys.stdout.flush()
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    pip = [sys.executable, "-P", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     status = subprocess.run([*pip, "-r", file, "-c", constraints], check=False).returncode  # noqa: S603 - the study's own
     if status:
         return (

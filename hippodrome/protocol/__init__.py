@@ -12,6 +12,7 @@
   disk.py                how both sides write files on one machine, so that a power cut leaves none half written
   exits.py               the exit codes of a server
   keyboard.py            the names of keys
+  server_modules.py      the modules that every server imports, which no file of a researcher may hide
   similar.py             which known name was probably meant by an unknown one
 
 The package imports only the standard library, because it is part of the functions' zips and of the servers' image.

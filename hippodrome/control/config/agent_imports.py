@@ -23,7 +23,7 @@ from hippodrome import places
 from hippodrome.control.config import Config, Diagnostic, hippo_requirements, layout
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.config.layout import AGENT, REQUIREMENTS
-from hippodrome.protocol import players
+from hippodrome.protocol import players, server_modules
 from hippodrome.protocol.values import KeyPath, printable
 
 _IN_IMAGE = ("protocol", "trial")  # packages of Hippodrome
@@ -176,11 +176,19 @@ def project_requirements(folder: Path, text: str) -> tuple[str, list[Diagnostic]
     return hippo_requirements.adapt(text, file.relative_to(folder).as_posix(), present)
 
 
+def hiding_files(folder: Path) -> list[Diagnostic]:
+    """Return a mistake for each file beside agent.py that hides a module which servers need."""
+    agent = layout.agent_folder(folder) / AGENT
+    if not agent.is_file():
+        return []
+    label = agent.relative_to(folder).as_posix()
+    return [Diagnostic(label, None, "", sentence) for sentence in server_modules.hiding(agent.parent)]
+
+
 def hidden_files(folder: Path) -> list[Diagnostic]:
     """Return a mistake for each file beside agent.py that an import means and does not get.
 
-    The folder of agent.py is the last place where Python looks, so another module of the same name comes first: one of
-    Python, of Hippodrome, or of an installed package. Only the first import of each file is named.
+    Python and Hippodrome have a module of this name, and it comes first. Only the first import of each file is named.
     """
     code, found = layout.agent_folder(folder).resolve(), dict[str, Diagnostic]()
     for (file, line, module), own_files in _imports_and_files(folder, _all):
@@ -197,10 +205,7 @@ def _also_has(name: str) -> str:
     """Who else has a module of this name; "" if nobody."""
     if name in sys.stdlib_module_names or name == "test":  # Python's own tests, which that list leaves out
         return "Python"
-    if name == "hippodrome":
-        return "Hippodrome"
-    distributions = sorted(set(_distributions().get(name, ())))
-    return f"the installed package {printable(distributions[0], 100)}" if distributions else ""
+    return "Hippodrome" if name == "hippodrome" else ""
 
 
 def requirement_remarks(folder: Path) -> list[Diagnostic]:

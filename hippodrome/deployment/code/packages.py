@@ -322,7 +322,7 @@ class WheelCache:
         self._wheels[pin.name] = Wheel(place / path.name)
 
     def _pip(self, pins: list[Pin], folder: Path) -> None:
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--no-input"]
+        command = [sys.executable, "-P", "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--no-input"]
         command += ["--disable-pip-version-check", "--progress-bar=off", "--dest", str(folder)]
         command += self.target.pip_options + [str(pin) for pin in pins]
         lines: list[str] = []

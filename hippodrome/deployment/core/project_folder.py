@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from hippodrome.console.problem import Problem
-from hippodrome.control.config import Config, ConfigErrors, Diagnostic, layout, read_project
+from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, layout, read_project
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.model.project import MIN_RUNTIME_MARGIN, Project
 from hippodrome.deployment.aws.account import Installation
@@ -180,7 +180,10 @@ def _with_lines(folder: Path, found: list[tuple[KeyPath, str]], remark: bool = F
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:
-    """Yield a mistake if Python cannot parse agent.py. `make check` runs it, too."""
+    """Yield a mistake if Python cannot parse agent.py, or if no server could start beside the files of its folder.
+
+    `make check` runs it, too.
+    """
     found = layout.find(folder)
     if found.agent is None or not config.game_steps:
         return
@@ -191,6 +194,7 @@ def _agent(folder: Path, config: Config) -> Iterator[str]:
         yield str(Diagnostic(label, error.lineno, "", f"Python cannot read this: {error.msg}"))
     except (ValueError, OSError) as error:
         yield str(Diagnostic(label, None, "", f"Python cannot read this: {error}"))
+    yield from map(str, agent_imports.hiding_files(folder))
 
 
 def _mistakes(wrong: list[str]) -> Problem:

@@ -22,5 +22,6 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
     if config:
         found += check_sessions(folder, config)
     if config and plays:
-        found += [*never_called(folder, config), *agent_imports.hidden_files(folder)]
+        found += never_called(folder, config)
+        found += [*agent_imports.hiding_files(folder), *agent_imports.hidden_files(folder)]
     return found + check_pages(folder, config) + (read_agent(folder) if plays else [])

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from hippodrome.protocol import server_modules
 from hippodrome.protocol.similar import nearest
-from hippodrome.trial.agent import callbacks, environments, signatures
+from hippodrome.trial.agent import callbacks, environments, import_path, signatures
 from hippodrome.trial.agent.callback_names import FEEDBACK
 from hippodrome.trial.agent.hippo_config import hippo_config
 from hippodrome.trial.agent.signatures import Signature, UnfitSignature
@@ -100,14 +101,18 @@ def load(folder: Path) -> Any:
     """Return the agent of a project folder.
 
     That is an object of the class `Agent` in the folder's agent.py; or the module agent.py itself, if it has no such
-    class but the five functions; or the default agent, if there is no agent.py. Raises AgentError if methods or
-    functions are missing, and whatever the file itself raises.
+    class but the five functions; or the default agent, if there is no agent.py. agent.py can import the files beside
+    it, and `gym`. Raises AgentError if methods or functions are missing or a file hides a module that servers need, and
+    whatever agent.py itself raises.
     """
     path = folder / "agent.py"
     if not path.is_file():
         return Agent()
-    # agent.py can import the files beside it, and `gym`. They come last, so that they hide no installed package.
-    sys.path.extend(str(place) for place in (folder, _OLD_GYM) if str(place) not in sys.path)
+    if hiding := server_modules.hiding(folder):  # what a server loads from now on would be the researcher's
+        raise AgentError("; ".join(hiding))
+    import_path.add(folder)
+    if str(_OLD_GYM) not in sys.path:
+        sys.path.append(str(_OLD_GYM))  # last, so that it hides no Gym that is installed
     sys.argv = [
         path.name
     ]  # for an agent that reads arguments: not the arguments of this process, which differ between check and server

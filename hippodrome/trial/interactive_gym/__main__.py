@@ -39,8 +39,10 @@ def main() -> None:
     if not options.no_run:
         command = [
             sys.executable,
+            "-P",
             "-m",
-            "hippodrome.local",
+            "hippodrome",
+            "run",
             str(folder),
             "--port",
             str(config.port),

@@ -196,6 +196,12 @@ def test_an_agent_with_a_syntax_error_is_refused(
     assert register_world.made == []
 
 
+def test_a_file_that_hides_a_package_of_the_servers_is_refused(folder: Path, register: Register) -> None:
+    (folder / "numpy.py").touch()
+    ran = register(code=Exit.FAILED)
+    assert "agent.py: numpy.py hides the package numpy, which servers need; rename it" in ran.err
+
+
 def test_a_missing_folder_is_reported(register_world: RegisterWorld, tmp_path: Path, capsys: Capsys) -> None:
     ran = register_world.run(capsys, "register", str(tmp_path / "nowhere"))
     assert (ran.code, "there is no such folder" in ran.err) == (Exit.FAILED, True)

@@ -666,8 +666,8 @@ def test_words_that_reach_no_method_of_the_agent_are_remarked(folder: Path, cont
 @pytest.mark.parametrize(
     ("file", "whose"),
     [
-        ("hippodrome.py", "Hippodrome"), ("hippodrome/maze.py", "Hippodrome"), ("random.py", "Python"), ("test.py", "Python"), ("yaml.py", "the installed package PyYAML"),
-        ("maze.py", None), ("console.py", None), ("export/__init__.py", None), ("trial.py", None),
+        ("hippodrome.py", "Hippodrome"), ("hippodrome/maze.py", "Hippodrome"), ("random.py", "Python"), ("test.py", "Python"),
+        ("maze.py", None), ("console.py", None), ("export/__init__.py", None), ("trial.py", None), ("responses.py", None),
     ],
 )  # fmt: skip
 def test_a_file_that_an_import_does_not_get_is_named(folder: Path, file: str, whose: str | None) -> None:
@@ -680,3 +680,44 @@ def test_a_file_that_an_import_does_not_get_is_named(folder: Path, file: str, wh
     shown = name if inner else file
     message = f"import {name} finds a module of {whose}, and not {shown} beside agent.py; rename {shown}"
     assert found == ([message] if whose else [])
+
+
+def test_the_agents_files_win_over_installed_packages_and_hippodromes_folders(folder: Path) -> None:
+    names = ("responses", "utils", "console", "export", "testing", "trial", "communicator")  # responses is installed
+    for name in names:
+        (folder / f"{name}.py").write_text("WHOSE = 'the researcher'\n")
+    (folder / "random.py").write_text("raise SystemExit('hides random')\n")
+    uses = (
+        f"import random, {', '.join(names)}\nassert {{m.WHOSE for m in ({', '.join(names)})}} == {{'the researcher'}}"
+    )
+    agent(folder, "class Agent:", f"{uses}\n\nclass Agent:")
+    assert tried(folder) == []
+
+
+@pytest.mark.parametrize(("file", "module"), [("numpy.py", "numpy"), ("PIL/__init__.py", "PIL"), ("yaml.py", "yaml")])
+def test_a_file_that_hides_a_package_of_the_servers_is_a_mistake(folder: Path, file: str, module: str) -> None:
+    (folder / file).parent.mkdir(exist_ok=True)
+    (folder / file).write_text("raise SystemExit('hides the package')\n")
+    shown = file.removesuffix("__init__.py")
+    mistake = f"agent.py: {shown} hides the package {module}, which servers need; rename it"
+    status, lines = run(folder)
+    assert (status, lines) == (1, [mistake, "1 mistake."])
+    assert tried(folder) == [f'agent.py: start("none") fails: AgentError: {mistake.removeprefix("agent.py: ")}'], (
+        "as on a server"
+    )
+
+
+def test_a_folder_without_code_hides_no_package(folder: Path) -> None:
+    (folder / "numpy").mkdir()
+    (folder / "numpy" / "maze.npy").touch()
+    assert [*looked(folder), *tried(folder)] == []
+
+
+def test_the_studys_files_hide_nothing_from_a_command_in_its_folder(folder: Path) -> None:
+    for name in ("random", "typer", "responses"):
+        (folder / f"{name}.py").write_text("raise SystemExit('hides it')\n")
+    command = [sys.executable, "-m", "hippodrome", "check"]
+    done = subprocess.run(
+        command, check=False, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1][:11]) == (0, "No mistakes"), done.stdout + done.stderr
