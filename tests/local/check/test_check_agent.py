@@ -702,9 +702,8 @@ def test_a_file_that_hides_a_package_of_the_servers_is_a_mistake(folder: Path, f
     mistake = f"agent.py: {shown} hides the package {module}, which servers need; rename it"
     status, lines = run(folder)
     assert (status, lines) == (1, [mistake, "1 mistake."])
-    assert tried(folder) == [f'agent.py: start("none") fails: AgentError: {mistake.removeprefix("agent.py: ")}'], (
-        "as on a server"
-    )
+    (on_a_server,) = tried(folder)
+    assert on_a_server.endswith(mistake.removeprefix("agent.py:"))
 
 
 def test_a_folder_without_code_hides_no_package(folder: Path) -> None:
