@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -94,6 +96,22 @@ def test_nothing_imports_uphill(package: str) -> None:
 def test_packages_beside_the_product_use_only_these_of_it(package: str) -> None:
     found = packages(ROOT / package)
     assert {other: file for other, file in found.items() if other not in AROUND[package] | {"testing"}} == {}
+
+
+def test_the_client_of_environments_imports_no_server() -> None:
+    """`from hippodrome.gym import RemoteEnv` runs where a program trains."""
+    loaded = "import sys, hippodrome.gym; print(*(name for name in sys.modules if name.startswith('hippodrome.')))"
+    modules = subprocess.run(
+        [sys.executable, "-c", loaded], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
+    client = ("client", "exact", "forms", "remote", "spaces", "values")
+    trial = {
+        "hippodrome.gym",
+        "hippodrome.trial",
+        "hippodrome.trial.gym",
+        *(f"hippodrome.trial.gym.{one}" for one in client),
+    }
+    assert set(modules.split()) == trial
 
 
 def test_only_tests_of_the_bench_import_it() -> None:

@@ -58,7 +58,7 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
                 modes = [mode for mode in made["metadata"].get("render_modes") or [] if mode != "human"]
                 self.metadata = {**made["metadata"], "render_modes": modes}
                 kwargs = {"url": url, "env_id": env_id, "ca": ca, "timeout": timeout, **params}
-                self.spec = EnvSpec(env_id, entry_point="hippodrome.trial.gym:RemoteEnv", kwargs=kwargs, **made["spec"])
+                self.spec = EnvSpec(env_id, entry_point="hippodrome.gym:RemoteEnv", kwargs=kwargs, **made["spec"])
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 client.unfit(error)
         except BaseException:

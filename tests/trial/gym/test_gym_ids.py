@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from hippodrome.trial.gym import RemoteEnv, RemoteError, ids
+from hippodrome.gym import RemoteEnv, RemoteError
+from hippodrome.trial.gym import ids
 from testing.gym_server import gym_server
 
 

@@ -20,7 +20,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from hippodrome.trial.gym import ConnectionLost, RemoteEnv, RemoteError
+from hippodrome.gym import ConnectionLost, RemoteEnv, RemoteError
 from hippodrome.trial.gym.spaces import CodecError
 from testing.gym_server import TextClient, gym_server
 from tests.trial.gym import remote_environments  # noqa: F401 - registers environments
@@ -171,7 +171,7 @@ def test_without_autoreset_the_steps_stop_at_the_end(url: str) -> None:
 @pytest.mark.filterwarnings("ignore:.*HumanRendering")
 def test_a_registered_id_is_drawn_in_a_window_of_the_clients(url: str) -> None:
     kwargs = {"url": url, "env_id": "CartPole-v1"}
-    gymnasium.register("Remote/Drawn-v0", "hippodrome.trial.gym:RemoteEnv", kwargs=kwargs)
+    gymnasium.register("Remote/Drawn-v0", "hippodrome.gym:RemoteEnv", kwargs=kwargs)
     with gymnasium.make("Remote/Drawn-v0", render_mode="human") as env:
         assert isinstance(env, gymnasium.wrappers.HumanRendering)
         assert env.unwrapped.render_mode == "rgb_array"

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from hippodrome.trial.gym import ConnectionLost, RemoteEnv
+from hippodrome.gym import ConnectionLost, RemoteEnv
 from testing.gym_server import gym_server
 from tests.trial.test_trial_tls import put
 

@@ -11,7 +11,8 @@ import pytest
 from gymnasium import spaces
 from websockets.sync.server import ServerConnection, serve
 
-from hippodrome.trial.gym import ConnectionLost, RemoteEnv, RemoteError, exact
+from hippodrome.gym import ConnectionLost, RemoteEnv, RemoteError
+from hippodrome.trial.gym import exact
 from hippodrome.trial.gym.forms import SUBPROTOCOL
 from hippodrome.trial.gym.spaces import describe
 
