@@ -14,7 +14,10 @@ import pytest
 from tests.test_first_hour import says
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 
 
 def code(page: str, language: str) -> list[str]:
@@ -46,7 +49,7 @@ def test_every_make_target_exists(page: Path) -> None:
 SOURCES = {
     file.relative_to(ROOT).as_posix()
     for top in ROOT.iterdir()
-    if not top.name.startswith(".") and top.name not in ("data", "data-try", "shots")
+    if (top.name == ".github" or not top.name.startswith(".")) and top.name not in ("data", "data-try", "shots")
     for file in (top, *(top.rglob("*") if top.is_dir() else ()))
 }
 OF_A_STUDY = re.compile(r"steps/|(forget|protocol)\.py|App/|src/hippogym|updateProject\.py")
