@@ -5,16 +5,11 @@ BIN := $(VENV)/bin
 HIPPODROME = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m hippodrome
 # `plan` and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
-PROJECT ?= .
+PROJECT ?=
 DATA ?=
 USER_ID ?=
-DATA_GIVEN = $(strip $(DATA))# DATA may be empty in the environment
-TLS_GIVEN = $(if $(filter command,$(origin TLS)),$(filter-out 0,$(TLS)))# TLS=1 and NAMES= count only on the command line
-NAMES_GIVEN = $(if $(filter command,$(origin NAMES)),$(NAMES))
-WITH_TLS = $(if $(TLS_GIVEN),--tls) $(if $(NAMES_GIVEN),--names "$(NAMES)")
-HOST_GIVEN = $(filter command,$(origin HOST))# only HOST=… on make's command line: shells have a variable HOST too
-PORT ?= 8000
-BOTS ?= 20
+PORT ?=
+BOTS ?=
 TEMPLATE ?=
 STACK ?= hippodrome
 DOMAIN ?=
@@ -23,6 +18,12 @@ ARGS ?=
 MINISTACK := .venv-ministack
 AUDIT := .venv-audit
 .DEFAULT_GOAL := help
+# With the slash it is a folder, never an id. Without PROJECT= it is the study in this folder, the example.
+STUDY = $(if $(strip $(PROJECT)),"$(PROJECT)/")
+option = $(if $(strip $($(1))),--$(2) "$($(1))")# $(call option,DATA,from) is --from "FOLDER", or nothing without DATA=
+# Shells have variables HOST, and may have TLS and NAMES: these three count only on make's command line.
+typed = $(if $(filter command,$(origin $(1))),$(2))
+WHERE = $(call typed,HOST,--host "$(HOST)") $(call typed,TLS,$(if $(filter-out 0,$(TLS)),--tls)) $(call typed,NAMES,--names "$(NAMES)")
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
 KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
@@ -31,72 +32,49 @@ $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(fi
 # PROJECT=$STUDY with nothing in STUDY would be the example, and DATA= another folder than was meant.
 $(foreach name,PROJECT DATA USER_ID TEMPLATE PORT BOTS STACK DOMAIN EMAIL,$(if $(filter command,$(origin $(name))),$(if $(strip $($(name))),,\
 	$(error $(name)= has no value, and nothing was run: write one, or leave $(name)= out))))
-NUMBERS := PORT BOTS WORKERS TIMES SEED WITHIN
-DIGITS := 0 1 2 3 4 5 6 7 8 9
-without = $(if $(2),$(call without,$(subst $(firstword $(2)),,$(1)),$(wordlist 2,10,$(2))),$(1))# the text $(1) without the characters $(2)
-$(foreach name,$(NUMBERS),$(if $(call without,$($(name)),$(DIGITS)),\
-	$(error $(name)=$($(name)) is not a whole number, and nothing was run)))
-$(if $(filter 0,$(BOTS)),$(error BOTS=0 sends nobody, and nothing was run; write BOTS=1 or more))
 # make itself would run the other commands first: `make check ../my-study` would check the example.
 COMMANDS := $(if $(MAKECMDGOALS),$(shell sed -nE 's/^([a-z-]+):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST))))
 $(foreach goal,$(filter-out $(COMMANDS) $(VENV)/% $(MINISTACK)/% $(AUDIT)/%,$(MAKECMDGOALS)),\
-	$(error There is no command $(goal) here, and nothing was run; `make help` lists the commands. The folder of a study is given by PROJECT=$(goal)))
+	$(error There is no command $(goal) here, and nothing was run; `make help` lists the commands. For the study in a folder, \
+	write: make $(or $(firstword $(filter $(COMMANDS),$(MAKECMDGOALS))),run) PROJECT=$(goal)))
 
 .PHONY: help
 help: ## list these commands
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
 
-.PHONY: run
+.PHONY: run try check gym new
 run: $(VENV)/local ## run the study of PROJECT=. on this machine, its data in DATA=PROJECT/data, at PORT=8000
-	@$(HIPPODROME) run "$(or $(PROJECT),.)" $(if $(DATA_GIVEN),--data "$(DATA)") --port $(or $(PORT),8000) $(if $(HOST_GIVEN),--host "$(HOST)") $(WITH_TLS) $(ARGS)
-
-.PHONY: try
+	@$(HIPPODROME) run $(STUDY) $(call option,DATA,data) $(call option,PORT,port) $(WHERE) $(ARGS)
 try: $(VENV)/local ## send BOTS=20 simulated participants through the study of PROJECT=., their data in DATA=
-	@$(HIPPODROME) try "$(PROJECT)" --bots $(BOTS) $(if $(DATA_GIVEN),--data "$(DATA)") $(ARGS)
-
-# The default of PORT= is for `make run`. Without PORT=, this server takes 5000, the port of Gymie.
-.PHONY: gym
+	@$(HIPPODROME) try $(STUDY) $(call option,BOTS,bots) $(call option,DATA,data) $(ARGS)
 gym: $(VENV)/local ## serve Gymnasium's environments to Gymie's clients and RemoteEnv, at PORT=5000 (docs/gym.md)
-	@$(HIPPODROME) gym --port $(if $(filter file,$(origin PORT)),5000,$(or $(PORT),5000)) $(if $(HOST_GIVEN),--host "$(HOST)") $(ARGS)
-
-.PHONY: new
+	@$(HIPPODROME) gym $(call option,PORT,port) $(WHERE) $(ARGS)
 new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPLATE= (without it: which there are)
-	@$(HIPPODROME) new "$(if $(filter file,$(origin PROJECT)),,$(PROJECT))" "$(TEMPLATE)"
-
-.PHONY: check
+	@$(HIPPODROME) new "$(PROJECT)" "$(TEMPLATE)"
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
-	@$(HIPPODROME) check "$(PROJECT)" $(ARGS)
+	@$(HIPPODROME) check $(STUDY) $(ARGS)
 
-.PHONY: deploy
+.PHONY: deploy plan register certificate doctor status cost data erase logs stop destroy
 deploy: $(VENV)/deploy ## install on AWS (DOMAIN=, EMAIL=): the stack, its certificate, the study of PROJECT=.
-	@$(HIPPODROME) deploy "$(PROJECT)" $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
-
-.PHONY: plan
 plan: $(VENV)/deploy ## show what `make deploy` would change in the installation
-	@$(HIPPODROME) plan $(if $(DOMAIN),--domain "$(DOMAIN)") $(if $(EMAIL),--email "$(EMAIL)") $(ARGS) $(FOUND)
-
-.PHONY: register
 register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new version
-	@$(HIPPODROME) register "$(PROJECT)" $(ARGS) $(FOUND)
-
-# With PROJECT= for one study; without it, `data`, `erase` and `cost` take the study in this folder, the others all studies.
-.PHONY: certificate doctor status cost data erase logs stop destroy
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
 doctor: $(VENV)/deploy ## check that everything is in order on AWS, and say what to do if not
 status: $(VENV)/deploy ## show participants' steps and servers (ARGS=--watch)
-cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (what it has cost: ARGS="--project ID")
+cost: $(VENV)/deploy ## compute what the study of PROJECT=. will cost (what it has cost: ARGS=--spent)
 data: $(VENV)/deploy ## convert answers and recordings of PROJECT=. (DATA=) to CSV and Parquet, from here or AWS
 erase: $(VENV)/deploy ## erase one participant, USER_ID=, from the data of PROJECT=. or DATA=, on this machine or AWS
 logs: $(VENV)/deploy ## show the logs of functions and servers (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
-certificate destroy: STUDY =
-cost: STUDY = $(if $(filter-out .,$(PROJECT)),"$(PROJECT)")
-doctor status data erase logs stop: STUDY = $(if $(filter-out .,$(PROJECT)),--project "$(PROJECT)/")
-data erase: STUDY += $(if $(DATA_GIVEN),--from "$(DATA)")
-erase: WHO = -- "$(USER_ID)"
-certificate doctor status cost data erase logs stop destroy:
-	@$(HIPPODROME) $@ $(STUDY) $(ARGS) $(WHO) $(FOUND)
+deploy register cost: TOLD = $(STUDY)
+deploy plan: TOLD += $(call option,DOMAIN,domain) $(call option,EMAIL,email)
+doctor status logs stop: TOLD = $(or $(STUDY),--all)
+data: TOLD = $(STUDY) $(call option,DATA,from)
+erase: TOLD = $(call option,DATA,from)
+erase: WHO = -- "$(USER_ID)" $(STUDY)
+deploy plan register certificate doctor status cost data erase logs stop destroy:
+	@$(HIPPODROME) $@ $(TOLD) $(ARGS) $(WHO) $(FOUND)
 
 WORKERS ?=
 # Many tests wait for processes, so two cores have four workers. `loadscope` gives a worker the tests of a module.

@@ -48,7 +48,7 @@ def download() -> Iterator[Row]:
 def _run(people: int) -> tuple[float, float]:
     """Run the command on a bucket with so many participants; return its seconds and its peak memory in MB."""
     with _served(people) as env, folder() as here, (here / "report").open("wb") as out:
-        command = [sys.executable, "-m", "hippodrome", "data", str(here / "out"), "--project", "maze", "--json"]
+        command = [sys.executable, "-m", "hippodrome", "data", "maze", "--to", str(here / "out"), "--json"]
         begun = time.perf_counter()
         process = subprocess.Popen(command, env={**os.environ, **env}, cwd=here, stdout=out)
         _, status, used = os.wait4(process.pid, 0)

@@ -1,1 +1,1 @@
-"""`python -m deploy`: the command line for AWS, of hippodrome/deployment/."""
+"""`hippodrome`: the command line for AWS, of hippodrome/deployment/."""

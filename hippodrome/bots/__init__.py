@@ -1,2 +1,2 @@
-"""Bots are simulated participants. They try a study before people come: `make try` sends them through a study on one
+"""Bots are simulated participants. They try a study before people come: `try` sends them through a study on one
 machine, `deploy doctor --rehearse --play` on AWS."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from typing import Any
 
@@ -23,6 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hippodrome.console.problem import Exit, Problem
+from hippodrome.console.program import as_typed
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -30,22 +31,22 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 def info(line: str, style: str = "") -> None:
     """Print a line on the progress of the command (stderr)."""
-    err.print(Text(line, style=style))
+    err.print(Text(as_typed(line), style=style))
 
 
 def success(line: str) -> None:
     """Print a line on a finished piece of work (stderr)."""
-    err.print(Text("✓ ", style="green") + Text(line))
+    err.print(Text("✓ ", style="green") + Text(as_typed(line)))
 
 
 def warning(line: str) -> None:
     """Print a warning (stderr)."""
-    err.print(Text("! ", style="yellow") + Text(line))
+    err.print(Text("! ", style="yellow") + Text(as_typed(line)))
 
 
 def result(line: str) -> None:
     """Print a line of the command's result (stdout)."""
-    out.print(Text(line))
+    out.print(Text(as_typed(line)))
 
 
 def result_json(value: Any) -> None:
@@ -99,11 +100,29 @@ def confirm(question: str, yes: bool = False) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        advice = "Add --yes (with make: ARGS=--yes) to answer it beforehand."
+        advice = "Add --yes to answer it beforehand."
         raise Problem(f"This needs a yes: {question}", advice, exit_code=Exit.DECLINED)
     err.print(Text(f"{question} [y/N] "), end="")
     if read_line().lower() not in {"y", "yes"}:
         raise Problem("Nothing was changed.", exit_code=Exit.DECLINED)
+
+
+def choose(question: str, answers: Mapping[str, str]) -> str | None:
+    """Ask which of these is meant, each a word with its meaning, and return the word; None if stdin is no terminal.
+
+    The first letter of a word is enough. Raises `Problem` with the exit code DECLINED for any other answer.
+    """
+    if not sys.stdin.isatty():
+        return None
+    err.print(Text(question))
+    for word, meaning in answers.items():
+        err.print(Text(f"  {word}: {meaning}"))
+    err.print(Text(f"{' or '.join(answers)}? "), end="")
+    answer = read_line().lower()
+    chosen = [word for word in answers if answer and word.startswith(answer)]
+    if len(chosen) != 1:
+        raise Problem("Nothing was done.", f"Answer {' or '.join(answers)}.", exit_code=Exit.DECLINED)
+    return chosen[0]
 
 
 def read_line() -> str:
@@ -116,8 +135,10 @@ def read_line() -> str:
 
 def show_problem(problem: Problem) -> None:
     """Print a problem with its details and advice (stderr)."""
-    err.print(Text("✗ ", style="bold red") + Text(str(problem), style="bold"))
+    err.print(Text("✗ ", style="bold red") + Text(as_typed(str(problem)), style="bold"))
     for line in problem.details:
-        err.print(Text(f"  {line}"))
+        err.print(Text(as_typed(f"  {line}")))
     if problem.advice:
-        err.print(Text(f"→ {problem.advice}"))
+        err.print(Text(as_typed(f"→ {problem.advice}")))
+    for command in problem.commands:
+        err.print(Text(as_typed(f"  {command}")))

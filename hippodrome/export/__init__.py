@@ -1,1 +1,1 @@
-"""`make data`: converts answers and recordings into tables and datasets, from a bucket or a folder with its keys."""
+"""`data`: converts answers and recordings into tables and datasets, from a bucket or a folder with its keys."""

@@ -1,4 +1,4 @@
-"""A run of `make data`: fetches new files, removes what the source has lost, and writes all tables and the manifest."""
+"""A run of `data`: fetches new files, removes what the source has lost, and writes all tables and the manifest."""
 
 from __future__ import annotations
 
@@ -88,11 +88,10 @@ def _refuse_unknown(source: Source, project_id: str, folder: Path, project: Proj
     here = _registered(source)
     raise Problem(
         f"There is no project {project_id} in the {source.place}.",
-        f"It holds: {', '.join(here)}. Name the right one with --project: its id, or its folder (with make: "
-        "PROJECT=../my-study)."
+        f"It holds: {', '.join(here)}. Name the right study: its id, or its folder."
         if here
-        else "Name the right project with --project (with make: PROJECT=../my-study), or the right data: the folder "
-        "data/ of a study, or data-try/try-… of one rehearsal, with --from (with make: DATA=).",
+        else "Name the right study, or the right data: the folder "
+        "data/ of a study, or data-try/try-… of one rehearsal, with --from.",
     )
 
 
@@ -199,7 +198,7 @@ def _run(
     if files_before and not tally.participants:
         raise Problem(
             f"There are no participants of {project_id} in the {source.where}, and this folder holds theirs.",
-            "If that is right, delete the folder. If not, look at --project, --stack and --region.",
+            "If that is right, delete the folder. If not, look at STUDY, --stack and --region.",
         )
     tally.gone = fetch.forget_gone(state, folder)
     parquet = "parquet" in options.formats
@@ -346,10 +345,9 @@ def _same_study(
         before = state.fact(name)
         if before is not None and before != value:
             other = f"{before} of this machine" if before == "folder" else before
-            option = "--aws " if source.where.startswith("bucket") else ""
             raise Problem(
                 f"{folder} {words[name].format(other)}.",
-                f'Name another folder, such as {folder}-2 (with make: ARGS="{option}{folder}-2"), or rename this one.',
+                f"Name another folder, such as --to {folder}-2, or rename this one.",
             )
         if before is None and write:
             state.set_fact(name, value)

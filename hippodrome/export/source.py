@@ -1,4 +1,4 @@
-"""The source of data: an installation's bucket, or a folder that `make run` has filled. Both have the same keys."""
+"""The source of data: an installation's bucket, or a folder that `run` has filled. Both have the same keys."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Folder:
     def __init__(self, root: Path) -> None:
         if not root.is_dir():
             raise Problem(
-                f"There is no folder {root}.", "Name the folder that `make run` keeps its data in, such as data/."
+                f"There is no folder {root}.", "Name the folder that `hippodrome run` keeps its data in, such as data/."
             )
         self._root = root
         self.place = f"folder {root.resolve()}"

@@ -1,1 +1,1 @@
-"""Studies on one machine: the commands `make run`, `try`, `check` and `new`, and what replaces AWS there."""
+"""Studies on one machine: the commands `hippodrome run`, `try`, `check` and `new`, and what replaces AWS there."""

@@ -1,4 +1,4 @@
-"""The environment variables that servers and `make check` take over from this process."""
+"""The environment variables that servers and `hippodrome check` take over from this process."""
 
 from __future__ import annotations
 

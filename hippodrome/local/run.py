@@ -17,6 +17,7 @@ from typing import Annotated
 import psutil
 import typer
 
+from hippodrome.console.arguments import StudyFolder
 from hippodrome.local import requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
@@ -24,7 +25,6 @@ from hippodrome.local.backend import files
 from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.publish import NotPublished
 from hippodrome.local.study import Study, from_here
-from hippodrome.local.study_folder import StudyFolder
 from hippodrome.local.web import server
 from hippodrome.local.web.access import origin_of
 

@@ -21,7 +21,7 @@ DEFAULT_GAME = "ALE/MsPacman-v5"
 """The game of a server that is started by hand and whose settings name none. A registered study always names one."""
 
 STEP_SECONDS = 30.0
-"""Seconds in which the agent must take a step or begin an episode, and draw it. `make check` waits no longer either."""
+"""Seconds in which the agent must take a step or begin an episode, and draw it. `check` waits no longer either."""
 
 STALLED_SECONDS = 3.0
 """A client that acknowledges frames counts as lost or hidden if it leaves one without acknowledgement for so long."""

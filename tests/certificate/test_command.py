@@ -1,4 +1,4 @@
-"""The command `python -m deploy certificate`: S3 and Route 53 on moto, a real authority, and the test's own DNS server."""
+"""The command `hippodrome certificate`: S3 and Route 53 on moto, a real authority, and the test's own DNS server."""
 
 import json
 import secrets
@@ -282,7 +282,7 @@ def test_a_test_certificate_is_reported_as_one(world, delegated, tmp_path, capsy
     by_hand(world, tmp_path, origin=STAGING)
     ran = world.run(capsys, "certificate", "--dry-run")
     assert "browsers do not trust it" in ran.err
-    assert "python -m deploy certificate --production" in ran.err
+    assert "hippodrome certificate --production" in ran.err
     assert world.run(capsys, "certificate", "--dry-run", "--json").json["trustedByBrowsers"] is False
 
 

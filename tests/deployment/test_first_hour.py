@@ -28,7 +28,7 @@ from tests.deployment.running_installation import RunningInstallation, held
 
 REHEARSE = 'make doctor ARGS="--rehearse"'
 PLAY = 'make doctor ARGS="--rehearse --play 2 --transcript transcript.json"'
-STATUS, DATA, COST = "make status", "make data ARGS=--aws", 'make cost ARGS="--project ms-pacman"'
+STATUS, DATA, COST = "make status", "make data ARGS=--aws", "make cost ARGS=--spent"
 WITH_SERVERS = (REHEARSE, PLAY, STATUS, DATA, COST)
 STUDY = "ms-pacman"
 

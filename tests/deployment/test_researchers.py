@@ -28,7 +28,13 @@ REFUSED = {"logs:DescribeLogGroups"}  # this action has no resources; `logs` goe
 
 @pytest.mark.parametrize(
     "command",
-    ["status", "cost --project maze", "links --new 2 --project maze", "logs next_step", "data {folder} --project maze"],
+    [
+        "status --all",
+        "cost maze --spent",
+        "links maze --new 2",
+        "logs --all --function next_step",
+        "data maze --to {folder}",
+    ],
 )
 def test_a_command_of_researchers_needs_no_more_than_their_policy(
     register_world: RegisterWorld, capsys: Any, tmp_path: Path, command: str

@@ -1,4 +1,4 @@
-"""Output and options of all commands: progress, JSON, `--project`, and the targets of make that run them."""
+"""Output and options of all commands: progress, JSON, the study's name, and the targets of make that run them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from hippodrome.cli import main
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.deployment.core import options
+from hippodrome.deployment.core.study_selection import StudySelection, selected
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -53,18 +55,42 @@ def test_times_in_json_are_iso_8601(capsys: Any) -> None:
     assert json.loads(capsys.readouterr().out) == {"at": "2026-11-21T18:30:00+00:00"}
 
 
-def test_a_project_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch: Any) -> None:
-    folder = tmp_path / "maze"
+def study_here(folder: Path, project_id: str) -> None:
     folder.mkdir()
-    (folder / "config.yml").write_text("project:\n  id: labyrinth\n  nonsense: true\n")
+    (folder / "config.yml").write_text(f"project:\n  id: {project_id}\n  nonsense: true\n")
+
+
+def test_a_study_is_named_by_its_id_or_its_folder(tmp_path: Path, monkeypatch: Any) -> None:
+    folder = tmp_path / "maze"
+    study_here(folder, "labyrinth")
     monkeypatch.chdir(tmp_path)
-    assert options.project_id(None) is None
-    assert options.project_id("maze") == "maze"
-    assert options.project_id("maze/") == options.project_id("./maze") == options.project_id(str(folder)) == "labyrinth"
+    assert selected("forest") == StudySelection("forest", None)
+    for named in ("maze/", "./maze", str(folder)):
+        assert selected(named) == StudySelection("labyrinth", Path(named))
+    assert selected("labyrinth").folder is None
     monkeypatch.chdir(folder)
-    assert options.project_id(".") == "labyrinth"
+    assert selected(None) == selected(".") == selected("labyrinth") == StudySelection("labyrinth", Path())
     with pytest.raises(Problem, match=r"has no config\.yml"):
-        options.project_id("..")
+        selected("..")
+
+
+def test_a_word_that_is_a_folder_and_may_be_another_studys_id_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    """Else `hippodrome stop maze` would stop the servers of another study than was meant."""
+    study_here(tmp_path / "maze", "labyrinth")
+    study_here(tmp_path / "forest", "forest")
+    monkeypatch.chdir(tmp_path)
+    assert selected("forest") == StudySelection("forest", Path("forest"))
+    with pytest.raises(Problem, match="may be the folder maze/ here, whose study is labyrinth") as refused:
+        selected("maze")
+    assert refused.value.advice.startswith("Write maze/ for the folder")
+
+
+@pytest.mark.parametrize("command", ["status", "doctor", "logs", "stop", "cost --spent"])
+def test_no_command_takes_all_studies_by_itself(command: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == Exit.MISUSE
+    assert "Name one, by its folder or its id; or add --all" in capsys.readouterr().err
+    assert main([*command.split(), "maze", "--all"]) == Exit.MISUSE
 
 
 @pytest.mark.parametrize("name", ["", "a b", "1x", "x" * 31, "pilot-", "pilot_2", "ärger"])
@@ -82,16 +108,14 @@ def test_names_that_aws_reserves_are_refused(name: str) -> None:
         options.stack_name(name)
 
 
-@pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor"])
-def test_make_passes_the_project_to_deploy(target: str) -> None:
-    words = " ".join(make(target, "PROJECT=../maze", "ARGS=--json").split())
-    assert f'hippodrome {target} --project "../maze/" --json' in words
-    assert "--project" not in make(target)
+@pytest.mark.parametrize("target", ["status", "data", "logs", "stop", "doctor", "cost", "register", "deploy"])
+def test_make_passes_the_study_on(target: str) -> None:
+    words = " ".join(make(target, "PROJECT=../my maze", "ARGS=--json").split())
+    assert f'hippodrome {target} "../my maze/" --json' in words
+    assert ("--all" in make(target)) is (target in ("status", "logs", "stop", "doctor"))
 
 
-def test_make_cost_passes_the_folder_and_make_destroy_does_not() -> None:
-    assert 'hippodrome cost "../my study"' in make("cost", "PROJECT=../my study")
-    assert "PROJECT" not in make("destroy", "PROJECT=../maze")
+def test_make_destroy_passes_no_study() -> None:
     assert "maze" not in make("destroy", "PROJECT=../maze")
 
 

@@ -233,9 +233,9 @@ def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Pat
     assert process.returncode == 0, text
     (data,) = (folder / "data-try").glob("try-*")
     assert not (folder / "data").exists()
-    assert f"make data PROJECT={folder} DATA={data}" in text
+    assert f"hippodrome data {folder} --from {data}" in text
     monkeypatch.chdir(tmp_path)
-    assert main(["data", "--project", f"{folder}/", "--from", str(data)]) == 0
+    assert main(["data", f"{folder}/", "--from", str(data)]) == 0
     with (tmp_path / f"data-tiny-{data.name}" / "answers.csv").open(newline="") as table:
         assert len(list(csv.DictReader(table))) == 2
     assert [*copy_of(folder, tmp_path / "copy")]

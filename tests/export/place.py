@@ -21,9 +21,9 @@ class Place:
         self.data, self.out = tmp / "data", tmp / "out"
         self.put = into_folder(self.data)
 
-    def run(self, *more: str, out: Path | None = None) -> CommandResult:
+    def run(self, *more: str, out: Path | None = None, study: str = "maze") -> CommandResult:
         self._capsys.readouterr()
-        code = main(["data", str(out or self.out), "--project", "maze", "--from", str(self.data), *more])
+        code = main(["data", study, "--to", str(out or self.out), "--from", str(self.data), *more])
         printed = self._capsys.readouterr()
         assert "This should not have happened" not in printed.err, printed.err
         return CommandResult(code, printed.out, printed.err)

@@ -37,7 +37,7 @@ def test_data_of_more_than_a_page_are_fetched_whole(
     for number in range(count):
         body = json.dumps(made_of.answer("1", {"n": str(number)})).encode()
         backend.put_object(world.env["BUCKET"], key(f"u{number:05}", "answers/1.json"), body)
-    arguments = ("data", str(tmp_path / "out"), "--project", "maze", "--json")
+    arguments = ("data", "maze", "--to", str(tmp_path / "out"), "--json")
     ran = world.run(capsys, *arguments)
     assert ran.code == Exit.DONE, ran.err
     assert ran.json["counts"]["participants"] == count
@@ -61,12 +61,12 @@ def test_a_bucket_and_a_folder_give_the_same_tables(world: Installed, tmp_path: 
     users = crowd(both, tmp_path, 4, observe=True)
     both(key(users[0], "stray.txt"), b"?")
     for out, more in (("aws", []), ("here", ["--from", str(tmp_path / "data")])):
-        ran = world.run(capsys, "data", str(tmp_path / out), "--project", "maze", *more)
+        ran = world.run(capsys, "data", "maze", "--to", str(tmp_path / out), *more)
         assert ran.code == Exit.DONE, ran.err
     one, other = (json.loads((tmp_path / out / "manifest.json").read_text()) for out in ("aws", "here"))
     assert one["files"] == other["files"]
     assert (one["source"], other["source"]) == (f"bucket {world.env['BUCKET']}", "folder")
-    assert world.run(capsys, "data", str(tmp_path / "here"), "--project", "maze").code == Exit.FAILED
+    assert world.run(capsys, "data", "maze", "--to", str(tmp_path / "here")).code == Exit.FAILED
 
 
 def test_a_body_that_breaks_off_is_fetched_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
@@ -102,14 +102,14 @@ def test_a_body_that_breaks_off_is_fetched_again(world: Installed, tmp_path: Pat
 def test_refused_and_unknown_projects_are_reported(world: Installed, tmp_path: Path, capsys: Any) -> None:
     crowd(world.put, tmp_path, 2)
     out = str(tmp_path / "out")
-    assert "no project nobody" in world.run(capsys, "data", out, "--project", "nobody").err
+    assert "no project nobody" in world.run(capsys, "data", "nobody", "--to", out).err
     world.register(study(id="empty"))
-    assert "No participant has begun empty yet" in world.run(capsys, "data", out, "--project", "empty").err
+    assert "No participant has begun empty yet" in world.run(capsys, "data", "empty", "--to", out).err
     world.fail("s3:ListObjectsV2", "AccessDenied", status=403)
-    refused = world.run(capsys, "data", out, "--project", "maze")
+    refused = world.run(capsys, "data", "maze", "--to", out)
     assert (refused.code, "may not list objects" in refused.err) == (Exit.FAILED, True)
-    assert world.run(capsys, "data", out, "--project", "maze", "--stack", "other").code == Exit.FAILED
-    assert world.run(capsys, "data", out, "--project", "maze").code == Exit.DONE
+    assert world.run(capsys, "data", "maze", "--to", out, "--stack", "other").code == Exit.FAILED
+    assert world.run(capsys, "data", "maze", "--to", out).code == Exit.DONE
 
 
 # From a bucket that outlived its installation
@@ -123,12 +123,12 @@ def demolish(world: Installed) -> str:
 
 def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, tmp_path: Path, capsys: Any) -> None:
     crowd(world.put, tmp_path, 4)
-    assert world.run(capsys, "data", str(tmp_path / "before"), "--project", "maze").code == Exit.DONE
+    assert world.run(capsys, "data", "maze", "--to", str(tmp_path / "before")).code == Exit.DONE
     kept = demolish(world)
-    without = world.run(capsys, "data", str(tmp_path / "x"), "--project", "maze").err
+    without = world.run(capsys, "data", "maze", "--to", str(tmp_path / "x")).err
     assert "no stack named hippodrome" in without
     assert "the bucket that `destroy` has named: --bucket." in without
-    after = ("data", str(tmp_path / "after"), "--project", "maze", "--bucket", kept)
+    after = ("data", "maze", "--to", str(tmp_path / "after"), "--bucket", kept)
     assert world.run(capsys, *after, "--dry-run", "--json").json["participants"] == 4
     with world.recording() as calls:
         ran = world.run(capsys, *after)
@@ -142,9 +142,9 @@ def test_a_kept_bucket_gives_the_same_as_its_installation_did(world: Installed, 
 
 def test_a_folder_is_updated_from_the_kept_bucket(world: Installed, tmp_path: Path, capsys: Any) -> None:
     users = crowd(world.put, tmp_path, 3)
-    world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze")
+    world.run(capsys, "data", "maze", "--to", str(tmp_path / "out"))
     world.put(key(users[2], "answers/3.json"), json.dumps(made_of.answer("3", GAME)).encode())
-    again = ("data", str(tmp_path / "out"), "--project", "maze", "--bucket", demolish(world), "--json")
+    again = ("data", "maze", "--to", str(tmp_path / "out"), "--bucket", demolish(world), "--json")
     assert world.run(capsys, *again).json["run"]["new"] == 1
 
 
@@ -154,7 +154,7 @@ def test_answers_are_fetched_without_the_list_of_projects_with_a_warning(
     crowd(world.put, tmp_path, 3)
     kept = demolish(world)
     world.client("s3").delete_object(Bucket=kept, Key="project_master_list.json")
-    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", kept)
+    ran = world.run(capsys, "data", "maze", "--to", str(tmp_path / "out"), "--bucket", kept)
     assert (ran.code, f"project_master_list.json is gone from {kept}" in ran.err) == (Exit.DONE, True), ran.err
     assert [row["finished"] for row in rows(tmp_path / "out" / "answers.csv")] == ["", "", ""]
 
@@ -166,7 +166,7 @@ def test_a_kept_bucket_says_which_projects_it_holds(world: Installed, tmp_path: 
     world.put("SSL/privkey.pem", b"")
     world.record("ann")
     kept = demolish(world)
-    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "pages-only", "--bucket", kept)
+    ran = world.run(capsys, "data", "pages-only", "--to", str(tmp_path / "out"), "--bucket", kept)
     assert (ran.code, "It holds those of later, maze: name one" in ran.err) == (Exit.FAILED, True), ran.err
 
 
@@ -185,7 +185,7 @@ def test_a_bucket_without_the_studys_data_is_reported(
     world.client("s3").create_bucket(Bucket="photographs")
     for at in keys:
         world.client("s3").put_object(Bucket="photographs", Key=at, Body=b"")
-    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", "photographs")
+    ran = world.run(capsys, "data", "maze", "--to", str(tmp_path / "out"), "--bucket", "photographs")
     assert (ran.code, says in ran.err) == (Exit.FAILED, True), ran.err
     assert not (tmp_path / "out").exists()
 
@@ -194,7 +194,7 @@ def test_a_missing_or_foreign_bucket_is_reported(world: Installed, tmp_path: Pat
     """Gap: moto does not compare ExpectedBucketOwner. S3 answers 403 to HeadBucket then, without a word."""
 
     def told(name: str) -> str:
-        ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", "maze", "--bucket", name)
+        ran = world.run(capsys, "data", "maze", "--to", str(tmp_path / "out"), "--bucket", name)
         assert ran.code == Exit.FAILED
         return ran.err
 
@@ -212,7 +212,7 @@ def test_a_run_that_was_interrupted_twice_is_finished_by_the_next(world: Install
     crowd(world.put, tmp_path, 30)
     out = tmp_path / "out"
     with world.served() as env:
-        line = [sys.executable, "-m", "hippodrome", "data", str(out), "--project", "maze"]
+        line = [sys.executable, "-m", "hippodrome", "data", "maze", "--to", str(out)]
         for how in (signal.SIGINT, signal.SIGKILL):
             before = len(list(out.glob("recordings/*/*/*.parquet")))
             with subprocess.Popen(
@@ -225,9 +225,9 @@ def test_a_run_that_was_interrupted_twice_is_finished_by_the_next(world: Install
                 said = running.stderr.read()
             assert "Traceback" not in said, said
             assert running.returncode in (Exit.DONE, Exit.INTERRUPTED, -how)
-        dry = process(env, "data", str(out), "--project", "maze", "--dry-run", "--json")
+        dry = process(env, "data", "maze", "--to", str(out), "--dry-run", "--json")
         assert dry.code == (Exit.DONE if running.returncode == Exit.DONE else Exit.CHANGES), dry.err
-        whole = process(env, "data", str(out), "--project", "maze", "--json")
+        whole = process(env, "data", "maze", "--to", str(out), "--json")
         assert whole.code == Exit.DONE, whole.err
         assert whole.json["run"]["new"] == dry.json["new"]
     assert len(rows(out / "answers.csv")) == 30

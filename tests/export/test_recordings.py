@@ -40,7 +40,7 @@ def convert(tmp: Path, body: bytes, scrub: Scrub | None = None) -> tuple[convert
 
 
 def data(tmp: Path, *more: str, out: str = "out") -> Path:
-    code = main(["data", str(tmp / out), "--project", "maze", "--from", str(tmp / "data"), "--json", *more])
+    code = main(["data", "maze", "--to", str(tmp / out), "--from", str(tmp / "data"), "--json", *more])
     assert code == Exit.DONE
     return tmp / out
 
@@ -312,7 +312,7 @@ def test_datasets_are_made_by_relative_paths_and_the_printed_path_is_absolute(
 ) -> None:
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, frames=6)
     monkeypatch.chdir(tmp_path)
-    assert main(["data", "--project", "maze", "--from", "data/", "--format", "minari"]) == Exit.DONE
+    assert main(["data", "maze", "--from", "data/", "--format", "minari"]) == Exit.DONE
     assert f"MINARI_DATASETS_PATH={tmp_path / 'data-maze' / 'minari'} " in capsys.readouterr().err
     assert load(Path("data-maze"), "maze-3-v0", monkeypatch).total_steps == 6
 
@@ -397,7 +397,7 @@ def test_if_minari_has_no_space_the_run_and_the_dataset_say_that_observations_we
 ) -> None:
     crowd(into_folder(tmp_path / "data"), tmp_path, 1, observe=True, picture=look)
     out = tmp_path / "out"
-    assert main(["data", str(out), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
+    assert main(["data", "maze", "--to", str(out), "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
     dataset, told = load(out, "maze-3-v0", monkeypatch), capsys.readouterr().err
     assert "maze-3-v0: observations were recorded, but Minari has no space for them: steps' numbers stand" in told
     assert "recordObservations" not in told
@@ -411,7 +411,7 @@ def test_without_observations_a_dataset_holds_step_numbers_and_the_run_says_so(
     tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
     crowd(into_folder(tmp_path / "data"), tmp_path, 3)
-    assert main(["data", str(tmp_path / "out"), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0  # fmt: skip
+    assert main(["data", "maze", "--to", str(tmp_path / "out"), "--from", str(tmp_path / "data"), "--format", "minari"]) == 0  # fmt: skip
     told = capsys.readouterr().err
     assert "observations were not recorded" in told
     assert "`recordObservations: true`" in told
@@ -446,7 +446,7 @@ def test_episodes_that_minari_cannot_hold_are_counted(tmp_path: Path, capsys: An
     more[2]["action"] = 1
     broken = b"".join(json.dumps(line).encode() + b"\n" for line in [*lines, *more])
     put(recording_key("user-0001"), gzip.compress(broken))
-    code = main(["data", str(tmp_path / "out"), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari", "--json"])  # fmt: skip
+    code = main(["data", "maze", "--to", str(tmp_path / "out"), "--from", str(tmp_path / "data"), "--format", "minari", "--json"])  # fmt: skip
     assert code == Exit.DONE
     (dataset,) = json.loads(capsys.readouterr().out)["minari"]
     assert dataset["episodes"] == 1
@@ -535,7 +535,7 @@ def test_participants_numbers_are_random_and_stay_the_same_in_later_runs(tmp_pat
     assert json.loads((out / "manifest.json").read_bytes())["files"] == json.loads(listed)["files"]
     (out / "private/state.sqlite").unlink()
     (out / "private/identities.csv").unlink()
-    assert main(["data", str(out), "--project", "maze", "--from", str(tmp_path / "data"), "--identities", "apart"]) == Exit.FAILED  # fmt: skip
+    assert main(["data", "maze", "--to", str(out), "--from", str(tmp_path / "data"), "--identities", "apart"]) == Exit.FAILED  # fmt: skip
     again = numbers(data(tmp_path, "--identities", "apart", out="elsewhere"))
     assert not set(again.values()) & set(first.values())  # drawn, not computed
 

@@ -321,10 +321,10 @@ def test_a_project_that_the_folder_does_not_hold_is_refused_and_those_that_it_ho
 ) -> None:
     place.put(MASTER_LIST, to_json(MasterList([PROJECT])))
     crowd(place.put, place.tmp, 1)
-    ran = place.run("--project", "mase", *more)
+    ran = place.run(*more, study="mase")
     assert (ran.code, f"There is no project mase in the folder {place.data}" in ran.err) == (Exit.FAILED, True)
     assert "It holds: maze." in ran.err
-    assert f"DATA={place.data}" in place.run("--from", str(place.tmp), *more).err
+    assert f"--from {place.data}" in place.run("--from", str(place.tmp), *more).err
     assert not place.out.exists()
 
 
@@ -441,7 +441,7 @@ def test_a_run_interrupted_while_fetching_is_continued(place: Place, monkeypatch
         patch.setattr(Folder, "fetch", cut)
         patch.setattr(fetch, "MAX_WAITING", 2)
         patch.setattr(fetch, "PARALLEL", 1)
-        code = main(["data", str(place.out), "--project", "maze", "--from", str(place.data)])
+        code = main(["data", "maze", "--to", str(place.out), "--from", str(place.data)])
     assert code == (Exit.INTERRUPTED if error is KeyboardInterrupt else Exit.FAILED)
     assert not (place.out / "manifest.json").exists()
     told = place.done()
@@ -601,12 +601,13 @@ def test_foreign_folders_and_wrong_options_are_refused(place: Place, tmp_path: P
     assert place.run(out=full).code == Exit.FAILED
     assert [path.name for path in full.iterdir()] == ["thesis.txt"]
     assert place.run(out=full / "thesis.txt").code == Exit.FAILED
-    for wrong in (["--format", "xls"], ["--format", ","], ["--identities", "away"], ["--project", "no such/id"]):
+    for wrong in (["--format", "xls"], ["--format", ","], ["--identities", "away"]):
         assert place.run(*wrong).code == Exit.FAILED
-    assert place.run("--project", "another").code == Exit.FAILED
+    assert place.run(study="another").code == Exit.FAILED
+    assert place.run(study="no such/id").code == Exit.FAILED
     place.done()
     assert "identities together" in place.run("--identities", "apart").err
-    assert main(["data", str(place.out), "--project", "maze", "--from", str(tmp_path / "none")]) == Exit.FAILED
+    assert main(["data", "maze", "--to", str(place.out), "--from", str(tmp_path / "none")]) == Exit.FAILED
 
 
 def test_formulas_are_escaped_too_if_datasets_are_the_only_format(place: Place) -> None:
@@ -624,7 +625,7 @@ def test_a_package_that_is_missing_is_named_before_anything_is_done(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == package else there(name))
     ran = place.run("--format", formats)
     assert (ran.code, f"The package {package} is not installed" in ran.err) == (Exit.FAILED, True)
-    assert "make data" in ran.err
+    assert 'pip install "hippodrome[data]"' in ran.err
     assert not place.out.exists()
     assert place.run("--format", "csv").code == Exit.DONE
 

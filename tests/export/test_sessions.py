@@ -202,7 +202,7 @@ def test_a_number_that_no_column_can_hold_does_not_stop_the_run(place: Place, wr
 def test_minari_has_a_dataset_for_each_human_player(tmp_path: Path, monkeypatch: Any) -> None:
     study(into_folder(tmp_path / "data"), tmp_path, observe=True)
     out = tmp_path / "out"
-    assert main(["data", str(out), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
+    assert main(["data", "maze", "--to", str(out), "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
     expected = {"left": (ANN, 1, 1.0, 7), "right": (BOB, 2, 0.5, 9)}
     for player, (participant, action, reward, pixel) in expected.items():
         dataset = load(out, f"maze-3-{player}-v0", monkeypatch)
@@ -250,7 +250,7 @@ def test_participants_with_different_players_have_a_dataset_for_each_player(tmp_
         arrive(put, user, {})
         put(single(user), record(tmp_path, user, frames=3, head={"players": head}))
     out = tmp_path / "out"
-    assert main(["data", str(out), "--project", "maze", "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
+    assert main(["data", "maze", "--to", str(out), "--from", str(tmp_path / "data"), "--format", "minari"]) == 0
     for player in ("left", "right"):
         dataset = load(out, f"maze-3-{player}-v0", monkeypatch)
         (about,) = dataset.storage.get_episode_metadata([0])

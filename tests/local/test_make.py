@@ -26,17 +26,23 @@ def make(*arguments: str, **environment: str) -> str:
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (("run", "HOST=0.0.0.0", "PORT=1"), r'-m hippodrome run "\." +--port 1 --host "0\.0\.0\.0"'),
-        (("run", "TLS=1", "NAMES=userId"), r'-m hippodrome run .* --tls --names "userId"'),
-        (("run", "ARGS=--fresh"), r"-m hippodrome run .* --fresh"),
-        (("try", "DATA=/x", "BOTS=3"), r'-m hippodrome try "\." --bots 3 --data "/x"'),
-        (("check", "PROJECT=../my-clone", "ARGS=--strict"), r'-m hippodrome check "\.\./my-clone" --strict'),
-        (("register", "PROJECT=../my-clone", "ARGS=--strict"), r'-m hippodrome register "\.\./my-clone" --strict'),
-        (("data", "PROJECT=../a", "DATA=/x"), r'-m hippodrome data --project "\.\./a/" --from "/x"'),
+        (("run", "HOST=0.0.0.0", "PORT=1"), 'run --port "1" --host "0.0.0.0"'),
+        (("run", "TLS=1", "NAMES=userId"), 'run --tls --names "userId"'),
+        (("run", "ARGS=--fresh"), "run --fresh"),
+        (("run", "PROJECT=../a", "DATA=/x"), 'run "../a/" --data "/x"'),
+        (("try", "DATA=/x", "BOTS=3"), 'try --bots "3" --data "/x"'),
+        (("check", "PROJECT=../my-clone", "ARGS=--strict"), 'check "../my-clone/" --strict'),
+        (("register", "PROJECT=../my-clone", "ARGS=--strict"), 'register "../my-clone/" --strict'),
+        (("data", "PROJECT=../a", "DATA=/x"), 'data "../a/" --from "/x"'),
+        (
+            ("deploy", "PROJECT=../a", "DOMAIN=a.org", "EMAIL=me@a.org"),
+            'deploy "../a/" --domain "a.org" --email "me@a.org"',
+        ),
+        (("plan", "PROJECT=../a", "DOMAIN=a.org"), 'plan --domain "a.org"'),
     ],
 )
 def test_variables_reach_the_command(arguments: tuple[str, ...], wanted: str) -> None:
-    assert re.search(wanted, make(*arguments))
+    assert f"-m hippodrome {wanted}" in " ".join(make(*arguments).split())
 
 
 def test_variables_that_are_not_given_are_not_passed_on() -> None:
@@ -50,7 +56,7 @@ def test_variables_that_are_not_given_are_not_passed_on() -> None:
 def test_a_variable_that_is_empty_in_the_environment_counts_as_not_given() -> None:
     """Otherwise the data would be in the current folder, or below the root."""
     for name in ("DATA", "PORT", "PROJECT"):
-        assert re.search(r'-m hippodrome run "\.?" +--port 8000 ', make("run", **{name: ""}))
+        assert make("run", **{name: " "}).split()[-3:] == ["-m", "hippodrome", "run"]
     assert "--data" not in make("try", DATA="")
     assert "--from" not in make("data", DATA="")
 
@@ -67,7 +73,8 @@ def refused(*arguments: str) -> str:
 def test_a_folder_without_project_is_refused(folder: str) -> None:
     """Else `make check ../trust` would find no mistakes in the example, and `make run ../trust` serve it."""
     for command in ("check", "run"):
-        assert f"The folder of a study is given by PROJECT={folder}" in refused(command, folder)
+        assert f"write: make {command} PROJECT={folder}." in refused(command, folder)
+    assert f"write: make run PROJECT={folder}." in refused(folder)
 
 
 @pytest.mark.parametrize("name", ["PROJECT", "DATA", "USER_ID", "PORT", "BOTS", "STACK"])
@@ -77,18 +84,10 @@ def test_a_variable_without_a_value_is_refused(name: str) -> None:
     assert f"{name}= has no value" in refused("data", f"{name}= ")
 
 
-@pytest.mark.parametrize(
-    "given", ["PORT=abc", "PORT=80 81", "PORT=8000x", "BOTS=abc", "BOTS=-3", "BOTS=2.5", "TIMES=ten"]
-)
-def test_a_number_that_is_none_is_refused(given: str) -> None:
-    assert f"{given} is not a whole number, and nothing was run" in refused("run", given)
-    assert "BOTS=0 sends nobody" in refused("try", "BOTS=0")
-
-
 def test_an_erasure_names_the_participant_after_all_options() -> None:
     """An id may begin with a dash."""
     erase = make("erase", "USER_ID=-a1", "PROJECT=../a", "DATA=/x", "ARGS=--yes").strip().splitlines()[-1]
-    assert re.search(r'-m hippodrome erase --project "\.\./a/" --from "/x" --yes -- "-a1"', erase)
+    assert '-m hippodrome erase --from "/x" --yes -- "-a1" "../a/"' in " ".join(erase.split())
 
 
 def test_an_unknown_variable_is_refused() -> None:

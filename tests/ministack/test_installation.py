@@ -503,15 +503,15 @@ def test_a_pair_has_one_server_and_each_member_an_answer(installed: MinistackIns
 def test_the_researcher_can_run_every_command_for_the_study(
     world: MinistackWorld, researcher: dict[str, str], people: People, tmp_path: Path
 ) -> None:
-    status = world.deploy("status", "--project", PROJECT, "--json", keys=researcher)
+    status = world.deploy("status", PROJECT, "--json", keys=researcher)
     assert status.code == 0, status.err
     assert "R_alice" not in status.out
-    logs = world.deploy("logs", "--since", "1h", "--json", keys=researcher)
+    logs = world.deploy("logs", "--all", "--since", "1h", "--json", keys=researcher)
     assert logs.code == 0, logs.err
     assert any("server ready" in line for line in logs.out.splitlines())
-    cost = world.deploy("cost", "--project", PROJECT, "--json", keys=researcher)
+    cost = world.deploy("cost", PROJECT, "--spent", "--json", keys=researcher)
     assert cost.code == 0, cost.err
-    data = world.deploy("data", str(tmp_path), "--project", PROJECT, "--format", "csv", keys=researcher)
+    data = world.deploy("data", PROJECT, "--to", str(tmp_path), "--format", "csv", keys=researcher)
     assert data.code == 0, data.err
     rows = list(csv.DictReader((tmp_path / "answers.csv").read_text().splitlines()))
     assert {row["2.word"] for row in rows} - {""} == {SECRET_WORD, "tea"}

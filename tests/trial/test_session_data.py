@@ -65,7 +65,7 @@ def store(launch: Any) -> Path:
 
 
 def data(store: Path, out: Path) -> dict[str, list[dict[str, str]]]:
-    code = main(["data", str(out), "--project", "study", "--from", str(store), "--format", "csv,parquet,minari"])
+    code = main(["data", "study", "--to", str(out), "--from", str(store), "--format", "csv,parquet,minari"])
     assert code == Exit.DONE
     found = {}
     for name in ("answers", "episodes", "problems"):
@@ -116,7 +116,7 @@ def test_erasing_a_member_removes_from_a_real_recording_what_is_theirs_alone(
     theirs, ours = entries_of_one_player(store, other), entries_of_one_player(store, mine)
     assert {"presence", "callback"} <= {each["kind"] for each in ours if isinstance(each, dict) and "kind" in each}
     assert {"key", "command", "action"} & {name for each in ours if isinstance(each, dict) for name in each}
-    assert main(["erase", user, "--project", "study", "--from", str(store), "--yes"]) == Exit.DONE
+    assert main(["erase", user, "study", "--from", str(store), "--yes"]) == Exit.DONE
     assert entries_of_one_player(store, mine) == []
     assert entries_of_one_player(store, other) == theirs
     (left,) = recordings(store).values()

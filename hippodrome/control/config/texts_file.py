@@ -18,7 +18,7 @@ project:
 
 
 def texts_file() -> str:
-    """Return the content of `docs/texts.en.yml`. Its `language` is empty, so that `make check` asks for it."""
+    """Return the content of `docs/texts.en.yml`. Its `language` is empty, so that `hippodrome check` asks for it."""
     groups = ("".join(_group(title, texts)) for title, texts in GROUPS.items())
     return HEAD + "\n".join(groups)
 

@@ -72,17 +72,17 @@ class _Explanation(NamedTuple):
     remedy: str
 
 
-_LOGS = "The last lines of its log are in `python -m deploy logs trial`."
+_LOGS = "The last lines of its log are in `hippodrome logs --all --function trial`."
 _EXPLANATIONS = {
     Cause.IMAGE: _Explanation(
         FailureCategory.IMAGE,
         "The image cannot be pulled: it is gone, was never pushed, or its registry cannot be reached.",
-        "Register the project again, which builds and pushes it; `python -m deploy doctor` says whether it exists.",
+        "Register the project again, which builds and pushes it; `hippodrome doctor --all` says whether it exists.",
     ),
     Cause.INITIALISATION: _Explanation(
         FailureCategory.INITIALISATION,
         "ECS could not prepare the container: its log group, its secrets, or the login to the image's registry.",
-        "`python -m deploy plan` shows what is missing and `apply` puts it back; with a network of your own, see "
+        "`hippodrome plan` shows what is missing and `apply` puts it back; with a network of your own, see "
         "whether its subnets reach the Internet.",
     ),
     Cause.CANNOT_BEGIN: _Explanation(
@@ -93,7 +93,7 @@ _EXPLANATIONS = {
     Cause.ENDED_AT_ONCE: _Explanation(
         FailureCategory.PROGRAM,
         "The program ended with an error before a participant could play: mostly the agent or the environment fails.",
-        f"{_LOGS} `make run` shows the same on your machine.",
+        f"{_LOGS} `hippodrome run` shows the same on your machine.",
     ),
     Cause.NEVER_READY: _Explanation(
         FailureCategory.PROGRAM,
@@ -104,12 +104,12 @@ _EXPLANATIONS = {
         FailureCategory.REFUSED,
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
-        "`python -m deploy apply --port 5000`, and register once more.",
+        "`hippodrome apply --port 5000`, and register once more.",
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
         "The program ended with an error, perhaps while a participant was playing.",
-        f"{_LOGS} `make run` may show the same on your machine.",
+        f"{_LOGS} `hippodrome run` may show the same on your machine.",
     ),
     Cause.OUT_OF_MEMORY: _Explanation(
         FailureCategory.MEMORY,
@@ -129,23 +129,23 @@ _EXPLANATIONS = {
     Cause.PERMISSION: _Explanation(
         FailureCategory.REFUSED,
         "AWS does not allow the installation to run servers.",
-        "`python -m deploy plan` shows which role has changed and `apply` puts it back; if AWS has blocked the "
+        "`hippodrome plan` shows which role has changed and `apply` puts it back; if AWS has blocked the "
         "account, its Support Center says why.",
     ),
     Cause.SIZE: _Explanation(
         FailureCategory.REFUSED,
         "Fargate has no servers with this number of CPUs and this much memory.",
-        "Choose a size in config.yml that `python -m deploy register` accepts, and register the project again.",
+        "Choose a size in config.yml that `hippodrome register` accepts, and register the project again.",
     ),
     Cause.QUOTA: _Explanation(
         FailureCategory.REFUSED,
         "A limit of the AWS account is reached: of CPUs or memory, or of addresses in the subnets.",
-        "`python -m deploy doctor` says how much there is and how to ask AWS for more.",
+        "`hippodrome doctor --all` says how much there is and how to ask AWS for more.",
     ),
     Cause.REFUSED: _Explanation(
         FailureCategory.REFUSED,
         "AWS refuses to run the server as it is configured.",
-        "`python -m deploy doctor --project` checks the project's task definition and image; register it again.",
+        "`hippodrome doctor STUDY` checks the project's task definition and image; register it again.",
     ),
     Cause.CAPACITY: _Explanation(
         FailureCategory.AWS,
@@ -165,7 +165,8 @@ _EXPLANATIONS = {
     Cause.VANISHED: _Explanation(
         FailureCategory.AWS,
         "The server had ended, no event of ECS was handled, and a sweep noticed it.",
-        "`python -m deploy logs task_changed --errors` shows whether an event came and could not be handled.",
+        "`hippodrome logs --all --function task_changed --errors` shows whether an event came and could not be "
+        "handled.",
     ),
     Cause.UNKNOWN: _Explanation(
         FailureCategory.AWS,

@@ -63,5 +63,5 @@ def _two_kinds(step: Step, groups: int) -> str:
     return (
         f"project.steps.{step.key}: both {step.page}.html and {step.page}-0.html have been uploaded. HIPPO Gym shows "
         f"the first to one more group; here groups are numbered: upload it as {step.page}-{groups}.html, remove "
-        f"{step.page}.html, and register with make register, since updateProject.py uploads it again"
+        f"{step.page}.html, and register with `hippodrome register`, since updateProject.py uploads it again"
     )

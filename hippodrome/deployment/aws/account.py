@@ -155,7 +155,7 @@ class Installation:
         except KeyError:
             raise Problem(
                 f"The stack {self.stack} has no output {output}.",
-                "Bring it up to date with `make deploy` or `python -m deploy apply`.",
+                "Bring it up to date with `hippodrome deploy` or `hippodrome apply`.",
             ) from None
 
     @property
@@ -271,16 +271,14 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
         raise Problem(
             f"There is no stack named {stack} in {account.region}.",
             elsewhere(account, stack)
-            or "Make it with `make deploy DOMAIN=…`; or name another region (AWS_REGION, --region) or installation "
-            "(STACK=, --stack).",
+            or "Make it with `hippodrome deploy --domain …`; or name another region (AWS_REGION, --region) or "
+            "installation (--stack).",
         )
     status = found["StackStatus"]
     if status == "DELETE_FAILED":
-        raise Problem(f"The stack {stack} is half deleted ({status}).", "Finish it with `python -m deploy destroy`.")
+        raise Problem(f"The stack {stack} is half deleted ({status}).", "Finish it with `hippodrome destroy`.")
     if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"}:
-        raise Problem(
-            f"The stack {stack} is in {status}: it does not work.", "Run `python -m deploy apply` to repair it."
-        )
+        raise Problem(f"The stack {stack} is in {status}: it does not work.", "Run `hippodrome apply` to repair it.")
     if status == "CREATE_IN_PROGRESS" or status.startswith(("ROLLBACK_IN", "DELETE_IN")):
         raise Problem(f"The stack {stack} is in {status}.", "Wait until CloudFormation is done, and try again.")
     return Installation.of(account, found)

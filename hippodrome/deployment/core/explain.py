@@ -60,7 +60,7 @@ def problem_from(error: BaseException) -> Problem | None:
     if isinstance(error, ModuleNotFoundError):
         return Problem(
             f"The package {error.name} is not installed.",
-            "Run the command with make, such as `make data`: it installs what is needed into .venv/.",
+            "Run the command with make, such as `hippodrome data`: it installs what is needed into .venv/.",
         )
     return None
 

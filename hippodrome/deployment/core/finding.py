@@ -12,6 +12,7 @@ from typing import TypeVar
 from rich.console import Console
 from rich.text import Text
 
+from hippodrome.console.program import as_typed
 from hippodrome.deployment.core import explain
 
 AT_ONCE = 8  # checks that run at the same time
@@ -62,9 +63,9 @@ def show(findings: Iterable[Finding], console: Console) -> None:
     """Print each finding on a line."""
     for finding in findings:
         mark = Text(f"{finding.mark.sign} ", style=STYLES[finding.mark])
-        console.print(mark + Text(f"{finding.check}: {finding.text}"))
+        console.print(mark + Text(as_typed(f"{finding.check}: {finding.text}")))
         if finding.advice and finding.mark is not Mark.GOOD:
-            console.print(Text(f"    → {finding.advice}"))
+            console.print(Text(as_typed(f"    → {finding.advice}")))
 
 
 Subject = TypeVar("Subject")

@@ -70,7 +70,8 @@ def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
     chosen = [project for project in projects if project.id == wanted]
     if not chosen:
         known = ", ".join(project.id for project in projects) or "none"
-        raise Problem(f"No project named {wanted} is registered.", f"Registered here: {known}.")
+        advice = f"Registered here: {known}. `hippodrome register STUDY` adds one."
+        raise Problem(f"No project named {wanted} is registered.", advice)
     return chosen
 
 

@@ -182,7 +182,7 @@ def _with_lines(folder: Path, found: list[tuple[KeyPath, str]], remark: bool = F
 def _agent(folder: Path, config: Config) -> Iterator[str]:
     """Yield a mistake if Python cannot parse agent.py, or if no server could start beside the files of its folder.
 
-    `make check` runs it, too.
+    `hippodrome check` runs it, too.
     """
     found = layout.find(folder)
     if found.agent is None or not config.game_steps:
@@ -201,6 +201,6 @@ def _mistakes(wrong: list[str]) -> Problem:
     count = "there is a mistake" if len(wrong) == 1 else f"there are {len(wrong)} mistakes"
     return Problem(
         f"The project cannot be registered: {count} in it.",
-        "docs/config.md explains every key; `make check` looks at the pages and at agent.py too.",
+        "docs/config.md explains every key; `hippodrome check` looks at the pages and at agent.py too.",
         wrong,
     )

@@ -19,7 +19,7 @@ def ask(account: Account, installation: Installation, event: Mapping[str, Any]) 
     if reply.get("FunctionError"):
         raise Problem(
             "The function that registers projects failed.",
-            "Run it again. If it fails again, `python -m deploy logs update_project_master_list` tells why.",
+            "Run it again. If it fails again, `hippodrome logs --all --function update_project_master_list` tells why.",
         )
     try:
         answer = json.loads(body)

@@ -1,4 +1,4 @@
-"""`deploy cost`: what a study will cost, and what it has cost."""
+"""`hippodrome cost`: what a study will cost, and what it has cost."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from hippodrome.deployment.aws.account import STACK, Account, find_installation,
 from hippodrome.deployment.aws.resource_names import TAG
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.server_records import Records
+from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.cost.billed import Billed, billed_or_why
 from hippodrome.deployment.cost.estimate import (
     CostLine,
@@ -41,7 +42,7 @@ PEOPLE = 100  # participants, if --participants is left out
 
 
 def command(
-    folder: options.Folder = Path(),
+    study: options.Study = None,
     *,
     people: Annotated[
         int, typer.Option("--participants", min=1, max=10_000_000, help="How many participants the study will have.")
@@ -51,15 +52,8 @@ def command(
         typer.Option("--minutes", min=0.1, max=1440, help="Mean minutes that a server runs.", show_default=False),
     ] = None,
     spot: Annotated[bool, typer.Option("--spot/--no-spot", help="Whether servers run on Fargate Spot.")] = True,
-    project: Annotated[
-        str | None,
-        typer.Option(
-            "--project",
-            callback=options.project_id,
-            help="What this project, named by its id or its folder, has cost, from its servers' records.",
-            show_default=False,
-        ),
-    ] = None,
+    after: Annotated[bool, typer.Option("--spent", help="What the study has cost, or with --all each.")] = False,
+    every: options.All = False,
     ask_aws: Annotated[
         bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")
     ] = False,
@@ -71,15 +65,21 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """What a study will cost, or with --project, what it has cost.
+    """Estimate what a study will cost, or with --spent, tell what it has cost.
 
-    Before: reads the config.yml of FOLDER (cpu, memory, maxRuntime, frame rate) and needs no AWS account. After: counts
-    the servers' time from their own records. Both are estimates from list prices; --billed tells what AWS has charged.
+    Before: reads the study's config.yml (cpu, memory, maxRuntime, frame rate) and needs no AWS account. After: counts
+    the servers' time from their own records. Both are estimates from list prices; --billed, with --spent, tells what
+    AWS has charged.
     """
-    if project is not None or ask_aws:
+    if after:
+        project = one_or_all(study, every)
         return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, now=now, as_json=as_json)
+    if every or ask_aws:
+        raise Problem(
+            f"{'--all' if every else '--billed'} is about what has been spent.", "Add --spent.", exit_code=Exit.MISUSE
+        )
     account = open_account(profile, region) if now else None
-    config = _read(folder)
+    config = _read(Path(study or "."))
     setup = config.project.aws_setup
     where = region or (account.region if account else os.environ.get("AWS_REGION")) or setup.region or REGION
     prices = _prices(account) if account else Prices()
@@ -92,6 +92,12 @@ def command(
 def _read(folder: Path) -> Config:
     """Read the config.yml in a folder. Raises `Problem` with every mistake in it."""
     from hippodrome.control.config import ConfigErrors, read_project  # noqa: PLC0415 - the checks of config.yml, only needed for this
+
+    if not folder.is_dir():
+        raise Problem(
+            f"There is no folder {folder}, and an estimate needs the study's config.yml.",
+            f"Name the study's folder. What it has cost: `hippodrome cost {folder} --spent`.",
+        )
 
     try:
         return read_project(folder)
@@ -249,7 +255,9 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         screen.result(note)
     if rows:
         screen.result(prices.note(account.region))
-        screen.result("Not in it: functions, requests and data, which cost little; see `cost` without --project.")
+        screen.result(
+            "Not in it: functions, requests and data, which cost little; see `hippodrome cost` without --spent."
+        )
     if now_warm:
         screen.result("")
         _show_warm(now_warm)

@@ -1,1 +1,1 @@
-"""An installation from the first `make deploy` until `make destroy`."""
+"""An installation from the first `hippodrome deploy` until `hippodrome destroy`."""

@@ -109,9 +109,7 @@ def command(
     if dry_run:
         code = plans.run(account, stack, settings, False, found)
         if found:
-            screen.info(
-                f"Then {found.id} would be registered: `python -m deploy register {folder} --dry-run` says how."
-            )
+            screen.info(f"Then {found.id} would be registered: `hippodrome register {folder} --dry-run` says how.")
         return code
     if may_apply(account, stack):
         request = applying.ApplyRequest(found, known, yes=yes, anyway=anyway)

@@ -95,7 +95,7 @@ def _ask(stack: str, data: bool, yes: bool) -> None:
         return
     extent = "everything, the participants' data included" if data else "all of this"
     if not sys.stdin.isatty():
-        advice = "Add --yes (with make: ARGS=--yes) to go on without."
+        advice = "Add --yes to go on without."
         raise Problem(f"There is no terminal in which to type {stack}.", advice, exit_code=Exit.DECLINED)
     screen.err.print(Text(f"To remove {extent}, type the stack's name: "), end="")
     if screen.read_line() != stack:

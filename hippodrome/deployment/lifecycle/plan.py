@@ -256,12 +256,12 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
     if act is not StackAction.UPDATE:
         raise Problem(
             f"The stack {stack} is in {prepared.status}: an update of it failed.",
-            "`python -m deploy apply` takes that back first.",
+            "`hippodrome apply` takes that back first.",
         )
     if prepared.unchanged():
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
     if not prepared.bucket.exists():
-        raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`python -m deploy apply` makes it anew.")
+        raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`hippodrome apply` makes it anew.")
     with change_set(prepared, keep=False) as made:
         changes = of_change_set(made.changes, prepared.template)
     if not changes:

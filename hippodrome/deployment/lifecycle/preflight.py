@@ -161,7 +161,7 @@ def _builds(checked: AccountCheck) -> Iterator[Finding]:
         yield bad(
             "CodeBuild",
             f"{missing}: the image of {study.id} cannot be built.",
-            f"{remedy} (`python -m deploy apply` makes the installation alone meanwhile)",
+            f"{remedy} (`hippodrome apply` makes the installation alone meanwhile)",
         )
     else:
         yield look("CodeBuild", f"{missing}: images of studies cannot be built.", remedy)
@@ -345,7 +345,7 @@ def _left_over(prepared: Prepared) -> Iterator[Finding]:
         yield bad(
             "left over",
             f"An earlier installation {name} has left {count(len(left), 'log group')}, such as {left[0]}.",
-            f"Finish its removal: `python -m deploy destroy --stack {name}`. The data stay.",
+            f"Finish its removal: `hippodrome destroy --stack {name}`. The data stay.",
         )
 
 

@@ -163,7 +163,7 @@ class Remains:
             _tell_kept(account, bucket, place)
         if self.after.data:
             screen.info("To delete what stays:")
-            screen.info(f"  python -m deploy destroy --stack {name} --data {place}")
+            screen.info(f"  hippodrome destroy --stack {name} --data {place}")
         return Exit.DONE
 
     def _problem(self) -> Problem:
@@ -192,4 +192,4 @@ def _tell_kept(account: Account, bucket: str, place: str) -> None:
         return
     screen.info(f"The participants' data stay in the bucket {bucket}. To fetch them:")
     for project in projects:
-        screen.info(f"  python -m deploy data --project {project} --bucket {bucket} {place}")
+        screen.info(f"  hippodrome data {project} --bucket {bucket} {place}")

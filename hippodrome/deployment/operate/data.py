@@ -1,4 +1,4 @@
-"""`data`: converts answers and recordings, from AWS or from a data folder of `make run`, into tables and datasets."""
+"""`hippodrome data`: converts answers and recordings, from AWS or this machine, into tables and datasets."""
 
 # ruff: noqa: PLC0415 - modules that only some runs need are imported there, so that the others start quickly
 
@@ -16,7 +16,6 @@ from hippodrome.deployment.aws import account
 from hippodrome.deployment.core import options
 
 if TYPE_CHECKING:
-    from hippodrome.deployment.core.study_selection import StudySelection
     from hippodrome.export.listing import Tally
     from hippodrome.export.source import Source
 
@@ -24,28 +23,24 @@ FORMATS = ("csv", "parquet", "minari")
 
 
 def command(
+    study_named: options.Study = None,
     *,
-    folder: Annotated[
-        Path | None, typer.Argument(help="The folder to write into; else data-<project> here.", show_default=False)
-    ] = None,
-    project: Annotated[
-        str | None,
+    to: Annotated[
+        Path | None,
         typer.Option(
-            "--project",
-            help="The project's id or its folder; if left out, the id in this folder's config.yml.",
-            show_default=False,
+            "--to", help="The folder to write into; else data-<id> in the study's folder.", show_default=False
         ),
     ] = None,
     from_: Annotated[
         Path | None,
         typer.Option(
             "--from",
-            help="Convert this data folder of `make run` or `make try`. Without --from and --aws, config.yml decides: "
-            "AWS if it says `useAWS: true`, else the folder data/ beside it if that is there.",
+            help="Convert this data folder of `run` or `try` on this machine. Without --from and --aws, the one place "
+            "is taken where the data can be; if they can be in both, you are asked.",
             show_default=False,
         ),
     ] = None,
-    aws: Annotated[bool, typer.Option("--aws", help="Fetch from AWS, whatever config.yml says.")] = False,
+    aws: Annotated[bool, typer.Option("--aws", help="Fetch the data from AWS.")] = False,
     bucket: Annotated[
         str | None,
         typer.Option(
@@ -82,7 +77,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Fetch a study's data and convert them: from AWS, or from this machine if the study runs here.
+    """Fetch a study's data and convert them: from AWS, or from a data folder of this machine.
 
     Answers become answers.csv and answers.parquet: a row per participant, a column per field. Recordings become
     Parquet files, with episodes.csv as their index, and with --format minari a Minari dataset. manifest.json lists
@@ -90,37 +85,35 @@ def command(
 
     These are personal data. With --identities apart, everything outside private/ names people by numbers only.
     """
-    from hippodrome.deployment.core.study_selection import folder_for
-    from hippodrome.deployment.core.study_selection import selected as study_of
+    from hippodrome.deployment.core.study_selection import folder_for, place_of_data, selected
     from hippodrome.export import run as work
     from hippodrome.export.source import Folder
 
     if from_ is not None and (bucket is not None or aws):
         other = "--bucket" if bucket is not None else "--aws"
-        raise Problem(f"--from and {other} name two places.", "Give one of the two.")
+        raise Problem(f"--from and {other} name two places.", "Give one of the two.", exit_code=Exit.MISUSE)
+    study = selected(study_named)
     if check:
-        return _check(folder or folder_for(study_of(project).id, from_), as_json)
+        return _check(to or folder_for(study, from_), as_json)
     chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
     if not chosen or not chosen <= set(FORMATS):
         raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
     if identities not in (None, "apart"):
         raise Problem(f"--identities {identities}: there is only `apart`.")
     _packages(chosen)
-    study = study_of(project)
-    name = study.id
     undecided = from_ is None and bucket is None and not aws  # no option says where the data are
-    local = _local(study) if undecided else from_
-    target = folder or folder_for(name, local)
+    local = place_of_data(study, "hippodrome data") if undecided else from_
+    target = to or folder_for(study, local)
     wishes = work.Options(chosen, identities == "apart", raw, long, spreadsheet)
     source: Source
     if local:
-        _refuse_outer(local, name)
+        _refuse_outer(local, study.id)
         source = Folder(local)
     else:
-        source = _bucket(_account(profile, region, study if undecided else None), stack, bucket, name)
+        source = _bucket(account.open_account(profile, region), stack, bucket, study.id)
     if dry_run:
-        return _dry_run(work.look(source, name, target, wishes), target, as_json)
-    made = work.run(source, name, target, wishes)
+        return _dry_run(work.look(source, study.id, target, wishes), target, as_json)
+    made = work.run(source, study.id, target, wishes)
     if as_json:
         screen.result_json(made)
     else:
@@ -134,57 +127,20 @@ def _packages(formats: frozenset[str]) -> None:
         if needed and importlib.util.find_spec(name) is None:
             raise Problem(
                 f"The package {name} is not installed, and --format {','.join(sorted(needed))} needs it.",
-                "`make data` installs it into .venv/ and does the same. `--format csv` needs no further package.",
+                'Install it: `pip install "hippodrome[data]"`, in a clone `make data`. Or leave it out: --format csv.',
             )
 
 
-def _local(study: StudySelection) -> Path | None:
-    """Find the study's data folder on this machine, if no option says where the data are; None: they are on AWS.
-
-    Prints the choice if this machine has data, and how to choose AWS or the folder. Raises `Problem` as `local_data`.
-    """
-    from hippodrome.deployment.core.study_selection import DATA, local_data
-
-    found = local_data(study)
-    if found is not None:
-        screen.info(
-            f"From the data folder {found} of this machine: config.yml does not say useAWS: true. "
-            "From AWS: --aws (with make: ARGS=--aws)"
-        )
-    elif study.folder is not None and (study.folder / DATA).is_dir():
-        local = study.folder / DATA
-        screen.info(f"From AWS: config.yml says useAWS: true. There are data on this machine too: --from {local}")
-    return found
-
-
 def _refuse_outer(folder: Path, project: str) -> None:
-    """Raise `Problem` for a folder that has the project's data in folders below it, as `make try` leaves them."""
+    """Raise `Problem` for a folder that has the project's data in folders below it, as `hippodrome try` leaves them."""
     inner = [] if (folder / project).exists() else sorted(path.parent for path in folder.glob(f"*/{project}/users"))
     if inner:
         last = inner[-1].parent
         raise Problem(
             f"The data of {project} are not in {folder}, but in a folder below it.",
-            f"Name that: --from {last} (with make: DATA={last}).",
+            f"Name that: --from {last}.",
             [f"{path.parent} has data of {project}." for path in inner[:20]] if len(inner) > 1 else [],
         )
-
-
-def _account(profile: str | None, region: str | None, undecided: StudySelection | None) -> account.Account:
-    """Open the account to fetch from. Raises `Problem` if it cannot be opened.
-
-    `undecided` is a study whose data may be on this machine instead. Then the problem is first about this machine: a
-    researcher who has never used AWS looks for a folder.
-    """
-    from hippodrome.deployment.core.project_folder import uses_aws
-    from hippodrome.deployment.core.study_selection import none_here
-
-    try:
-        return account.open_account(profile, region)
-    except Problem as problem:
-        if undecided is None or undecided.folder is None or uses_aws(undecided.folder):
-            raise
-        on_aws = f"If they are on AWS: {problem} {problem.advice}"
-        raise none_here(undecided.id, undecided.folder, on_aws) from None
 
 
 def _bucket(aws_account: account.Account, stack: str, kept: str | None, project: str) -> Source:

@@ -1,4 +1,4 @@
-"""`deploy erase`: deletes everything about one participant, and writes a receipt that does not name them."""
+"""`hippodrome erase`: deletes everything about one participant, and writes a receipt that does not name them."""
 
 from __future__ import annotations
 
@@ -21,31 +21,34 @@ from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.operate import receipt as receipts
 from hippodrome.deployment.operate.eraser import ROUNDS, Eraser, FoundOfParticipant
 
+_ONE = "Give one of the two."
+
 
 def command(
-    user: Annotated[str, typer.Argument(help="The participant's id (userId), exactly as in their link.")],
-    *,
-    project: Annotated[
+    user: Annotated[
+        str, typer.Argument(metavar="USER_ID", help="The participant's id (userId), exactly as in their link.")
+    ],
+    study: Annotated[
         str | None,
-        typer.Option(
-            "--project",
-            help="Erase only in this project, named by its id or its folder; if left out, on this machine in all "
-            "projects of the data folder, on AWS in the project of this folder's config.yml.",
+        typer.Argument(
+            metavar="STUDY",
+            help="The study: its folder or its id; else the one in this folder, or with --from all in that folder.",
             show_default=False,
         ),
     ] = None,
+    *,
     from_: Annotated[
         Path | None,
         typer.Option(
             "--from",
-            help="Erase from this data folder of `make run`. Without --from and --aws, config.yml decides: AWS, or "
-            "the folder data/ beside it if the study runs on this machine only.",
+            help="Erase from this data folder of `run` on this machine. Without --from and --aws, the one place is "
+            "taken where the data can be; if they can be in both, you are asked.",
             show_default=False,
         ),
     ] = None,
-    aws: Annotated[bool, typer.Option("--aws", help="Erase on AWS, whatever config.yml says.")] = False,
+    aws: Annotated[bool, typer.Option("--aws", help="Erase on AWS.")] = False,
     everywhere: Annotated[
-        bool, typer.Option("--everywhere", help="Erase in every project of the installation, not in one.")
+        bool, typer.Option("--everywhere", help="Erase on AWS, in every study of the installation.")
     ] = False,
     receipt: Annotated[
         Path | None,
@@ -61,26 +64,27 @@ def command(
 ) -> int:
     """Erase everything about one participant: documents in all their versions, recordings, their server and its traces.
 
-    This cannot be undone. On this machine, end `make run` first. On AWS, the receipt says what was deleted, when and by
+    This cannot be undone. On this machine, end `run` first. On AWS, the receipt says what was deleted, when and by
     whom, and that a last listing found nothing. It names the participant by a salted hash, which anyone who knows the
     id can check. Afterwards run `data` again for each folder with downloaded data of the study: it removes the
     participant there.
     """
-    from hippodrome.deployment.core.study_selection import project_id  # noqa: PLC0415 - only here
+    from hippodrome.deployment.core.study_selection import place_of_data, selected  # noqa: PLC0415 - the checks of config.yml
 
-    _must_fit(user, project, everywhere=everywhere, two_places=from_ is not None and aws)
-    data = from_ if from_ is not None or aws or everywhere else _data_here(project)
+    _must_fit(user, study, everywhere=everywhere, two_places=from_ is not None and (aws or everywhere))
+    undecided = from_ is None and not aws and not everywhere  # no option says where the data are
+    data = place_of_data(selected(study), "hippodrome erase USER_ID") if undecided else from_
     if data is not None:
         if everywhere or receipt is not None or with_id:
             raise Problem(
                 "On this machine there is no receipt, and a participant is erased in all projects of the data folder.",
-                "Leave out --everywhere, --receipt and --with-id; on AWS, add --aws (with make: ARGS=--aws).",
+                "Leave out --everywhere, --receipt and --with-id; on AWS, add --aws.",
             )
-        only = None if project is None else project_id(project)
+        only = None if study is None else selected(study).id
         return _from_folder(data, only, user, dry_run=dry_run, yes=yes, json=json)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    projects = _projects(account, installation) if everywhere else [project_id(project)]
+    projects = _projects(account, installation) if everywhere else [selected(study).id]
     erasers = [Eraser(account, installation, name, user) for name in projects]
     found = {eraser.project: eraser.look() for eraser in erasers}
     if not everywhere and not any(found.values()):
@@ -109,7 +113,7 @@ def command(
     _warn_of_unreadable(erasers)
     if concerned:
         screen.success(f"Everything is gone. The receipt: {target}")
-        screen.info("  Where this study was downloaded, run `python -m deploy data` again: it removes them there.")
+        screen.info("  Where this study was downloaded, run `hippodrome data` again: it removes them there.")
     else:
         screen.success(f"There is nothing of this participant. The receipt: {target}")
     return Exit.DONE
@@ -122,41 +126,17 @@ def _new_receipt(began: datetime) -> Path:
     return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
 
 
-def _must_fit(user: str, project: str | None, *, everywhere: bool, two_places: bool) -> None:
+def _must_fit(user: str, study: str | None, *, everywhere: bool, two_places: bool) -> None:
     """Raise `Problem` if nobody can have this id, or if these options do not go together."""
     if not ids.is_user_id(user):
         raise Problem(
             "This cannot be a participant's id.",
-            "Ids have letters, digits, dashes and underscores, 64 at most (with make: USER_ID=).",
+            "Ids have letters, digits, dashes and underscores, 64 at most.",
         )
-    if everywhere and project is not None:
-        raise Problem("--project names one project, --everywhere means all of them.", "Give one of the two.")
+    if everywhere and study is not None:
+        raise Problem("STUDY names one study, --everywhere means all of them.", _ONE, exit_code=Exit.MISUSE)
     if two_places:
-        raise Problem("--from and --aws name two places.", "Give one of the two.")
-
-
-def _data_here(project: str | None) -> Path | None:
-    """Find the study's data folder on this machine, if no option says where the data are; None: they are on AWS.
-
-    Raises `Problem` if the participant may be in both places, since then neither may count as all of their data.
-    """
-    from hippodrome.deployment.core.project_folder import may_use_aws  # noqa: PLC0415 - the checks of config.yml, only where a folder is read
-    from hippodrome.deployment.core.study_selection import DATA, local_data, selected  # noqa: PLC0415 - the same
-
-    study = selected(project)
-    data = local_data(study)
-    if study.folder is None:
-        return None
-    if data is None:
-        if (study.folder / DATA).is_dir():
-            screen.info(f"On AWS: config.yml says useAWS: true. Data on this machine: --from {study.folder / DATA}")
-    elif may_use_aws(study.folder):
-        raise Problem(
-            f"The data of {study.id} may be in two places: in {data} on this machine, and on AWS.",
-            f"Erase in both, or where the study has run: once with --from {data} (with make: DATA={data}), once with "
-            "--aws (with make: ARGS=--aws).",
-        )
-    return data
+        raise Problem("--from is on this machine; --aws and --everywhere are on AWS.", _ONE, exit_code=Exit.MISUSE)
 
 
 def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes: bool, json: bool) -> int:
@@ -187,7 +167,7 @@ def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes:
         for key in eraser.unreadable:
             screen.warning(f"{eraser.data / key} cannot be read, and may name this participant: look at it yourself.")
     if others:
-        screen.warning(f"They are also in {', '.join(sorted(others))}. Without --project, all projects are erased.")
+        screen.warning(f"They are also in {', '.join(sorted(others))}. Without STUDY, they are erased in all.")
     elif not dry_run:
         for path in (path for folder in folders for path in folder_eraser.mentions(folder, user)):
             screen.warning(f"{path} still names them: look at it, and delete it if you do not need it.")
@@ -197,7 +177,7 @@ def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes:
         screen.result_json({"found": amount, "deleted": files, "rewritten": rewritten})
     if done:
         screen.success(f"{count(files, 'file')} deleted, {count(rewritten, 'recording')} rewritten without them.")
-        screen.info("  Where this study was converted, run `python -m deploy data` again: it removes them there.")
+        screen.info("  Where this study was converted, run `hippodrome data` again: it removes them there.")
     elif not found:
         screen.success(f"There is nothing of this participant in {data}, in {only or ', '.join(sorted(present))}.")
         screen.info("  An id must be written exactly as in their link.")
@@ -209,12 +189,12 @@ def _must_hold(data: Path, only: str | None, present: list[str]) -> None:
     if not present:
         raise Problem(
             f"{data} is not a data folder: it holds no project.",
-            "Name the folder with the data of `make run`, such as ../my-study/data (--from, with make: DATA=).",
+            "Name the folder in which `hippodrome run` keeps data, such as --from ../my-study/data.",
         )
     if only not in (None, *present):
         raise Problem(
             f"{data} holds nothing of a project {only}.",
-            f"It holds: {', '.join(present)}. Without --project, the participant is erased in all of them.",
+            f"It holds: {', '.join(present)}. Without STUDY, the participant is erased in all of them.",
         )
 
 
@@ -230,7 +210,7 @@ def _must_be_known(project: str, known: list[str], stack: str) -> None:
     if project not in known:
         raise Problem(
             f"The installation {stack} holds nothing of a project {project}.",
-            f"Name another with --project, or take --everywhere. It holds: {', '.join(known) or 'nothing yet'}.",
+            f"Name another, or take --everywhere. It holds: {', '.join(known) or 'nothing yet'}.",
         )
 
 
@@ -248,7 +228,7 @@ def _erase(erasers: list[Eraser], found: Mapping[str, FoundOfParticipant]) -> No
 def _warn_of_unreadable(erasers: list[Eraser]) -> None:
     for key in itertools.chain.from_iterable(eraser.unreadable() for eraser in erasers):
         screen.warning(
-            f"{key} cannot be read, and may hold a hash of the id: `python -m deploy doctor` says what to do."
+            f"{key} cannot be read, and may hold a hash of the id: `hippodrome doctor --all` says what to do."
         )
 
 

@@ -1,7 +1,7 @@
-"""Erases one participant from a data folder of this machine, which `make run` or `make try` has filled.
+"""Erases one participant from a data folder of this machine, which `hippodrome run` or `hippodrome try` has filled.
 
-`make run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
-beside the data folder, in `.hippodrome/`, and there too the data that `make run ARGS=--fresh` has moved aside.
+`run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
+beside the data folder, in `.hippodrome/`, and there too the data that `hippodrome run --fresh` has moved aside.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from hippodrome.export import keys
 from hippodrome.protocol.keys import participant_folder, session_folder, sessions_folder
 
 STATE = ".hippodrome"
-"""Where `make run` keeps tasks, messages and unfinished recordings, beside the data folder."""
+"""Where `hippodrome run` keeps tasks, messages and unfinished recordings, beside the data folder."""
 EARLIER = "earlier"
-"""The folder in `STATE` to which `make run ARGS=--fresh` moves data and their state."""
+"""The folder in `STATE` to which `hippodrome run --fresh` moves data and their state."""
 _UNMISTAKABLE = 6  # characters from which an id cannot well be a part of other values
 
 
@@ -67,7 +67,7 @@ class FolderEraser:
         return [*self._own(), *self._lobby.look(), *self._cells.look()], self._sessions.sessions()
 
     def run(self) -> Erased:
-        """Erase the participant. Raises `Problem` if `make run` runs, or left a server or an unfinished recording."""
+        """Erase the participant. Raises `Problem` if `run` runs, or left a server or an unfinished recording."""
         with self._locked():
             sessions = self._sessions.sessions()
             self._must_be_over(sessions)
@@ -122,7 +122,7 @@ class FolderEraser:
                 self._folder.replace(version.key, body, to_json(held.without(self._label)))
 
     def _delete_state(self, note: Callable[[Sequence[Version]], None]) -> None:
-        """Delete what `make run` keeps of the participant alone: unfinished recordings, tasks and logs."""
+        """Delete what `hippodrome run` keeps of the participant alone: unfinished recordings, tasks and logs."""
         state, unfinished = DataFolder(self._state), f"spool/{participant_folder(self.project, self._user)}"
         for prefix in (unfinished, f"tasks/{self._label}", f"logs/{self._label}"):
             state.delete(state.versions(prefix), note)
@@ -132,7 +132,7 @@ class FolderEraser:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the lock of `make run`, if that has ever run. Raises `Problem` if it runs now."""
+        """Hold the lock of `hippodrome run`, if that has ever run. Raises `Problem` if it runs now."""
         lock = self._state.with_name(f"{self._state.name}.lock")
         if not lock.exists():
             yield
@@ -143,12 +143,12 @@ class FolderEraser:
             except BlockingIOError:
                 raise Problem(
                     f"The study runs now with the data in {self._folder.root}.",
-                    "End `make run` with Ctrl-C, then run the same command again.",
+                    "End `hippodrome run` with Ctrl-C, then run the same command again.",
                 ) from None
             yield
 
     def _must_be_over(self, sessions: Sequence[FoundSession]) -> None:
-        """Raise `Problem` if a killed `make run` has left a running server, or recordings that it has not moved."""
+        """Raise `Problem` if a killed `run` has left a running server, or recordings that it has not moved."""
         theirs = [session_folder(self.project, found.id) for found in sessions]
         folders = {participant_folder(self.project, self._user), *theirs}
         runs = any(_runs(path, folders) for path in sorted((self._state / "tasks").glob("*")))
@@ -156,8 +156,8 @@ class FolderEraser:
         unfinished = any(any(spool.versions(folder)) for folder in theirs)
         if runs or unfinished:
             raise Problem(
-                "Their server still runs, or its recording is unfinished: `make run` was killed. Nothing was touched.",
-                "Start `make run` once more and end it with Ctrl-C: it ends all servers and keeps what they recorded.",
+                "Their server still runs, or its recording is unfinished: `run` was killed. Nothing was touched.",
+                "Start `run` once more and end it with Ctrl-C: it ends all servers and keeps what they recorded.",
             )
 
 
@@ -174,12 +174,12 @@ def _runs(path: Path, folders: set[str]) -> bool:
 
 
 def folders(data: Path) -> list[Path]:
-    """Return the data folder, and the folders to which `make run ARGS=--fresh` has moved its earlier data.
+    """Return the data folder, and the folders to which `hippodrome run --fresh` has moved its earlier data.
 
     Raises `Problem` if there is no such folder.
     """
     if not data.is_dir():
-        raise Problem(f"There is no folder {data}.", "Name the data folder of `make run` (with make: DATA=).")
+        raise Problem(f"There is no folder {data}.", "Name the data folder of `hippodrome run`.")
     moved = data.resolve().parent / STATE / EARLIER
     return [data, *sorted(moved.glob(f"{data.resolve().name}-*/data"))]
 
@@ -218,7 +218,7 @@ def mentions(data: Path, user: str) -> list[Path]:
 
 
 def _state_of(data: Path) -> Path:
-    """Return the folder where `make run` keeps the state of this data folder. `--fresh` moves both side by side."""
+    """Return the folder where `run` keeps the state of this data folder. `--fresh` moves both side by side."""
     root = data.resolve()
     moved = root.parent.parent.name == EARLIER and root.parent.parent.parent.name == STATE
     return root.parent / "state" if moved else root.parent / STATE / root.name

@@ -22,6 +22,7 @@ from hippodrome.deployment.aws.account import STACK, find_installation, open_acc
 from hippodrome.deployment.code.template import Template
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.server_records import Records
+from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.operate.log_lines import TRIAL, LogLine, moment, read
 
 POLL = 5  # seconds between two looks; an account may call FilterLogEvents 5 times a second in most regions
@@ -145,19 +146,22 @@ def follow(
 
 
 def command(
+    study: options.Study = None,
+    *,
     function: Annotated[
         str | None,
-        typer.Argument(
-            help="A function, such as start_server, or `trial` for the servers; else all.", show_default=False
+        typer.Option(
+            "--function",
+            help="Only this function, such as start_server, or `trial` for the servers.",
+            show_default=False,
         ),
     ] = None,
-    *,
-    project: options.OneProject = None,
+    every: options.All = False,
     since: Annotated[str, typer.Option("--since", help="How far back: 90s, 30m, 1h, 2d, or a time (UTC).")] = "1h",
     following: Annotated[bool, typer.Option("--follow", "-f", help="Go on and show new lines until Ctrl-C.")] = False,
     errors: Annotated[bool, typer.Option("--errors", help="Only errors.")] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Also Lambda's START, END and REPORT, and metrics.")
+        bool, typer.Option("--everything", help="Also Lambda's START, END and REPORT, and metrics.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line, for scripts.")] = False,
     stack: options.Stack = STACK,
@@ -166,13 +170,14 @@ def command(
 ) -> int:
     """Show what functions and servers have logged, in the order of time.
 
-    No line has a participant's id or an answer; servers have their names, which are hashes. With --project, only lines
-    of its servers, and of functions about its servers.
+    No line has a participant's id or an answer; servers have their names, which are hashes. Of a study, there are only
+    lines of its servers, and of functions about its servers; --all shows every line of functions.
     """
     try:
         start = moment(since, datetime.now(UTC))
     except ValueError:
         raise Problem(f"--since {since} is no time.", "Write 90s, 30m, 1h, 2d, or 2026-11-21T09:30.") from None
+    project = one_or_all(study, every)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     reader = Reader(account.client("logs"), stack)

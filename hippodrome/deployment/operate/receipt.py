@@ -19,7 +19,7 @@ from hippodrome.deployment.aws.versions import Version
 from hippodrome.protocol.keys import QUESTIONS, groups_folder, participant_folder, sessions_folder
 
 NOT_COVERED = (
-    "Downloaded copies: `python -m deploy data` into the same folder removes this participant there too.",
+    "Downloaded copies: `hippodrome data` into the same folder removes this participant there too.",
     "Messages about their server that are still in a queue; SQS deletes them, dead letters after 14 days at most.",
     "Older versions of the lists of who holds a slot where slots are limited: hashes, soon deleted by the bucket.",
     "AWS's own records: ECS shows a stopped task for about an hour, CloudTrail may keep the call that ran it 90 days.",

@@ -31,7 +31,7 @@ from hippodrome.deployment.cost.prices import Prices
 from hippodrome.deployment.cost.spent import Spent, spent
 from hippodrome.deployment.stack.stack import Stack
 
-ASK = "`python -m deploy doctor` names them"
+ASK = "`hippodrome doctor --all` names them"
 DAY = timedelta(days=1)  # the age up to which failures are shown
 DAILY = timedelta(days=1)  # the interval of the function renew_certificate
 
@@ -266,7 +266,7 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
         names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         dns = tuple(names.get_values_for_type(x509.DNSName))
     except (ValueError, IndexError):
-        raise Problem(f"{key} in the bucket is no certificate.", "Order one: `python -m deploy certificate`.") from None
+        raise Problem(f"{key} in the bucket is no certificate.", "Order one: `hippodrome certificate`.") from None
     except x509.ExtensionNotFound:
         dns = ()
     # The issuers of Let's Encrypt's staging have names such as "(STAGING) …".

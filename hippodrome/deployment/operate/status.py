@@ -18,10 +18,12 @@ from rich.text import Text
 from hippodrome.console import screen
 from hippodrome.console.formatting import count, duration
 from hippodrome.console.problem import Exit, Problem
+from hippodrome.console.program import as_typed
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
 from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
 from hippodrome.deployment.core import options, participants
+from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.cost.billed import Billed, billed_or_why
 from hippodrome.deployment.operate.snapshot import InstallationMonitor, Snapshot
 from hippodrome.deployment.stack import states
@@ -31,8 +33,9 @@ MAX_SERVERS = 20  # servers that are shown one by one, the oldest first
 
 
 def command(
+    study: options.Study = None,
     *,
-    project: options.OneProject = None,
+    every: options.All = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Look again every few seconds, until Ctrl-C.")] = False,
     ask_aws: Annotated[
         bool, typer.Option("--billed", help="Also this month's bill so far: asks Cost Explorer, $0.01 a request.")
@@ -42,13 +45,14 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Show participants by step, servers by state, queues, certificate, alarms, and today's cost.
+    """Show participants by step, servers by state, queues, certificate, alarms, and today's cost, of a study or --all.
 
     It shows counts and no ids; servers have their names, which are hashes. It reads listings, the servers' records and
     the number of a session's members, never a participant's documents.
     """
     if watch and as_json:
         raise Problem("--watch and --json do not go together.", "For scripts, ask again: `status --json`.")
+    project = one_or_all(study, every)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     if project:
@@ -215,7 +219,7 @@ def _projects(look: Snapshot) -> list[RenderableType]:
     if "projects" in look.problems:
         return []
     if not look.projects:
-        return [Text("No project is registered yet: `python -m deploy register` does it.")]
+        return [Text(as_typed("No project is registered yet: `hippodrome register` does it."))]
     table = _table("project", "live", "participants", "today", "finished", "where they are")
     for project, counts in look.projects:
         where = ", ".join(
@@ -282,7 +286,7 @@ def _failures(look: Snapshot) -> list[RenderableType]:
         if failure.matters:
             number = count(failure.servers, "server")
             text = f"! {failure.project}: {number} failed, the last {failure.last:%H:%M} UTC ({failure.server}). "
-            lines.append(Text(text + failure.cause.sentence, style="red"))
+            lines.append(Text(as_typed(text + failure.cause.sentence), style="red"))
     if of_aws:
         counts = ", ".join(f"{failure.servers:,} {failure.cause} ({failure.project})" for failure in of_aws)
         lines.append(Text(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {counts}."))
@@ -322,7 +326,10 @@ def _parts(look: Snapshot) -> list[RenderableType]:
     if dead:
         messages = "message could" if dead == 1 else "messages could"
         parts.append(
-            Text(f"! {dead:,} {messages} not be dealt with: `python -m deploy logs --errors` says why.", style="red")
+            Text(
+                as_typed(f"! {dead:,} {messages} not be dealt with: `hippodrome logs --all --errors` says why."),
+                style="red",
+            )
         )
     certificate = look.certificate
     if certificate is not None:
@@ -334,7 +341,9 @@ def _parts(look: Snapshot) -> list[RenderableType]:
     elif "certificate" not in look.problems:
         parts.append(
             Text(
-                "! No certificate: servers cannot be reached. `python -m deploy certificate --production` orders one.",
+                as_typed(
+                    "! No certificate: servers cannot be reached. `hippodrome certificate --production` orders one."
+                ),
                 style="red",
             )
         )

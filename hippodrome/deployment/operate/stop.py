@@ -27,6 +27,7 @@ from hippodrome.deployment.core.captured_log import functions_log
 from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps
 from hippodrome.deployment.core.server_records import Records
 from hippodrome.deployment.core.stages import Executor, PlanStep, step
+from hippodrome.deployment.core.study_selection import one_or_all
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to store its recordings
 TOGETHER = 25  # servers stopped by one call: their DNS records go in one change of the zone
@@ -140,8 +141,9 @@ class Stopper:
 
 
 def command(
+    study: options.Study = None,
     *,
-    project: options.OneProject = None,
+    every: options.All = False,
     wait: Annotated[int, typer.Option("--wait", min=0, help="Seconds to wait until nothing is left.")] = WAIT,
     dry_run: options.DryRun = False,
     yes: options.Yes = False,
@@ -150,13 +152,14 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Stop every server now, and make sure that nothing of them is left.
+    """Stop every server of a study, or with --all of all studies, and make sure that nothing of them is left.
 
     A participant who plays loses the present game; all answers, and the recordings up to now, are kept. Their page
     says that the researchers have switched the server off. While the project is live, participants can start
     another server, and warm servers are started again: close the project first, with
-    `python -m deploy register FOLDER --no-live`.
+    `hippodrome register STUDY --no-live`.
     """
+    project = one_or_all(study, every)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     platform = account.platform(installation)
@@ -187,7 +190,7 @@ def command(
         )
     if stopper.unreadable:
         unread = count(stopper.unreadable, "record")
-        screen.warning(f"{unread} of servers cannot be read; `python -m deploy doctor` names them.")
+        screen.warning(f"{unread} of servers cannot be read; `hippodrome doctor --all` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.success(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
     if left.draining:

@@ -40,7 +40,7 @@ CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
 """By ACME directory, the names by which CAA records allow its authority to issue."""
 _UNKNOWN_AUTHORITY = ("<the authority>",)
 
-REAL = "python -m deploy certificate --production"
+REAL = "hippodrome certificate --production"
 _MAX_BUNDLE = 1_000_000  # bytes
 
 
@@ -225,7 +225,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
     if not zone.holds(domain):
         raise Problem(
             f"The hosted zone {zone.id} is for {zone.domain}, and {domain} does not lie in it.",
-            "Give the zone of your domain: `python -m deploy apply --zone …`.",
+            "Give the zone of your domain: `hippodrome apply --zone …`.",
         )
     if own:
         return
@@ -245,7 +245,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
         raise Problem(
             f"The hosted zone {zone.id} has a record {kind} of {name}, so no authority can see the proof, which is the "
             f"TXT record {proof}.",
-            "Remove that record from the zone, or let the servers' names lie elsewhere: `python -m deploy apply "
+            "Remove that record from the zone, or let the servers' names lie elsewhere: `hippodrome apply "
             "--servers …`.",
         )
     if authorities := CAA_NAMES.get(directory):
@@ -338,7 +338,7 @@ def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
     sentences: dict[FailureReason, tuple[str, str]] = {
         FailureReason.VALIDATION: (
             f"{authority} could not see the proof in DNS.",
-            f"Check that {wish.domain} leads to its hosted zone (`python -m deploy doctor`), and run this again.",
+            f"Check that {wish.domain} leads to its hosted zone (`hippodrome doctor --all`), and run this again.",
         ),
         FailureReason.CAA: (
             f"A CAA record of {wish.domain}, or of a domain above it, forbids {authority} to issue.",
@@ -367,7 +367,7 @@ def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
         ),
         FailureReason.OVERTAKEN: (
             "Another run was faster.",
-            "See what there is now: `python -m deploy certificate --dry-run`.",
+            "See what there is now: `hippodrome certificate --dry-run`.",
         ),
         FailureReason.BROKEN: (f"{authority} could not be understood.", "Is that the address of an ACME directory?"),
     }

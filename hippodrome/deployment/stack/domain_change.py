@@ -20,8 +20,8 @@ from hippodrome.deployment.stack.certificate import Choice
 from hippodrome.deployment.stack.changes import Prepared
 
 _WAIT = (
-    "Wait until they have ended, or end them with `python -m deploy stop`; then apply again. Warm servers end for good "
-    "when their study is closed (`python -m deploy register --no-live`)."
+    "Wait until they have ended, or end them with `hippodrome stop --all`; then apply again. Warm servers end for good "
+    "when their study is closed (`hippodrome register --no-live`)."
 )
 
 

@@ -19,7 +19,7 @@ from hippodrome.export import keys
 from hippodrome.export.source import Bucket
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # no ARN: that would hide the owner
-_WHICH = "`python -m deploy destroy --dry-run` names the buckets that it has kept (with --stack and --region)."
+_WHICH = "`hippodrome destroy --dry-run` names the buckets that it has kept (with --stack and --region)."
 
 
 def open_bucket(account: Account, name: str, project: str) -> Bucket:
@@ -37,7 +37,7 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
     if project not in present:
         raise Problem(
             f"The bucket {name} holds nothing of participants of {project}.",
-            f"It holds those of {', '.join(present)}: name one with --project."
+            f"It holds those of {', '.join(present)}: name one of them."
             if present
             else "It holds no participant's data at all: check the bucket's name.",
         )

@@ -138,7 +138,7 @@ class StackSettings:
         if not domain:
             raise Problem(
                 "Which domain? The first time it has to be told.",
-                "Such as --domain example.org (with make: DOMAIN=example.org). Its zone has to be in Route 53.",
+                "Such as --domain example.org. Its zone has to be in Route 53.",
             )
         if self.zone:
             zone = read_zone(account, self.zone)

@@ -75,5 +75,5 @@ def problem(stack: str, status: str) -> Problem:
     because = _BECAUSE.get(status, "is in a state that this version does not know")
     return Problem(
         f"The stack {stack} {because} ({status}).",
-        f"Remove it with `python -m deploy destroy --stack {stack}` (the data stay), then run the same command again.",
+        f"Remove it with `hippodrome destroy --stack {stack}` (the data stay), then run the same command again.",
     )

@@ -1,4 +1,4 @@
-"""`deploy links`: prints a signed link for each participant (`signedLinks: true`)."""
+"""`hippodrome links`: prints a signed link for each participant (`signedLinks: true`)."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ _ROUNDED = re.compile(r"[0-9][.,]?[0-9]*[Ee]\+?[0-9]+|[0-9]+\.0*")
 
 
 def command(
-    file: Annotated[
-        Path | None, typer.Argument(help="A file with an id on each line; - reads them from stdin.", show_default=False)
-    ] = None,
+    study: options.Study = None,
     *,
+    file: Annotated[
+        Path | None,
+        typer.Option("--ids", metavar="FILE", help="A file with an id on each line; - is stdin.", show_default=False),
+    ] = None,
     new: Annotated[int, typer.Option("--new", min=0, max=100_000, help="Make this many new ids.")] = 0,
-    project: options.ProjectId = None,
     as_json: options.Json = False,
     stack: options.Stack = STACK,
     region: options.Region = None,
@@ -48,15 +49,17 @@ def command(
     A person who opens a link is that participant: give each link to one person only. The same id always gives the same
     link, for as long as the project is registered.
     """
-    from hippodrome.deployment.core.study_selection import project_id  # noqa: PLC0415 - only here
+    from hippodrome.deployment.core.study_selection import selected  # noqa: PLC0415 - only here
 
     users = [*(_read(file) if file else ()), *(secrets.token_hex(12) for _ in range(new))]
     if not users:
-        raise Problem("No participants are named.", "Name a file with an id on each line, or make ids with --new 50.")
+        raise Problem(
+            "No participants are named.", "Give a file with an id on each line, --ids FILE, or make ids with --new 50."
+        )
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents
-    (found,) = participants.choose(participants.registered_projects(documents), project_id(project))
+    (found,) = participants.choose(participants.registered_projects(documents), selected(study).id)
     if not found.signed_links:
         screen.warning(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
     signatures = signed(account, installation, found.id, users)

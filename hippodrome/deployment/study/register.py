@@ -33,7 +33,7 @@ from hippodrome.deployment.study import definition, image, pages
 QR_FILES = {".svg", ".png", ".pdf"}
 NO_QR = (
     "There is no QR code for a study with signedLinks: each participant has a link of their own.",
-    "Leave out --qr; `python -m deploy links` makes the links.",
+    "Leave out --qr; `hippodrome links` makes the links.",
 )
 
 Base = Annotated[
@@ -293,11 +293,11 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
 def _advice(problems: Sequence[str]) -> str:
     """Advise on these problems. A function that does not know a key is older than this version."""
     if not problems:
-        return "Bring it up to date with `python -m deploy apply`."
+        return "Bring it up to date with `hippodrome apply`."
     if any("unknown key" in problem for problem in problems):
         return (
-            "The installation is older than this study: bring it up to date with `make deploy` "
-            "(or `python -m deploy apply`), or ask your administrator to. Then run this again."
+            "The installation is older than this study: bring it up to date with `hippodrome deploy` "
+            "(or `hippodrome apply`), or ask your administrator to. Then run this again."
         )
     return "Correct this and run it again."
 
@@ -339,10 +339,10 @@ def _tell(result: Mapping[str, Any]) -> None:
 
 def _tell_signed(project_id: str) -> None:
     """Print how to make signed links. An address without a signature is refused."""
-    command = f"python -m deploy links --project {project_id}"
+    command = f"hippodrome links {project_id}"
     screen.result("Links are signed: each participant needs one of their own.")
     screen.result(f"For new participants:  {command} --new 50")
-    screen.result(f"With ids of your own:  {command} ids.txt")
+    screen.result(f"With ids of your own:  {command} --ids ids.txt")
 
 
 def _tell_link(address: str) -> None:

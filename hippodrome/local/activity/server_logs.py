@@ -116,7 +116,7 @@ class ErrorReader:
 
 
 def _advice(line: str) -> str:
-    """The advice of `make check` for an error, by the last line of its traceback."""
+    """The advice of `hippodrome check` for an error, by the last line of its traceback."""
     found = _ERROR.match(line)
     return remedy(found["kind"], found["text"]) if found else ""
 

@@ -1,4 +1,4 @@
-"""A certificate authority of this machine, for `make run TLS=1`. Browsers that trust it trust names below localhost.
+"""A certificate authority of this machine, for `run --tls`. Browsers that trust it trust names below localhost.
 
 Its certificate allows it no other names (RFC 5280, 4.2.1.10), so its key is of no use to imitate other sites.
 Each name gets a certificate of its own: browsers and OpenSSL do not accept `*.localhost`.

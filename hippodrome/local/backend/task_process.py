@@ -1,7 +1,7 @@
 """One task: the process of its server, followed from its start to its end.
 
-No process is lost, even if `make run` is killed: the task's record is written before its process begins, and again with
-the process id. An event is sent before the record says so; if `make run` is killed in between, it is sent again.
+No process is lost, even if `run` is killed: the task's record is written before its process begins, and again with
+the process id. An event is sent before the record says so; if `hippodrome run` is killed in between, it is sent again.
 
 Each server has a thread that follows it. If this machine refuses something, the thread tries again until it succeeds
 (`retry.py`). So it notices the end of each server, even with a full disk.
@@ -124,7 +124,7 @@ class TaskProcess:
         self.task, self.unsaved = replace(self.task, pid=self._child.pid), True
 
     def take_up(self) -> None:
-        """Follow the process that an earlier `make run` has started; if it has ended, send the event of its end."""
+        """Follow the process that an earlier `run` has started; if it has ended, send the event of its end."""
         self._follow()
         self.begun.set()
 
@@ -204,7 +204,7 @@ class TaskProcess:
         self.gone.set()
 
     def _retry(self, act: Callable[[], T], seconds: float | None = None) -> T | None:
-        """Call `act` until it succeeds, and return its result; None if `make run` ends or the server is forgotten."""
+        """Call `act` until it succeeds, and return its result; None if `run` ends or the server is forgotten."""
 
         def over() -> bool:
             return self._shared.closed.is_set() or self.forgotten.is_set()
@@ -220,7 +220,7 @@ class TaskProcess:
             self._send()
         elif self.unsaved:
             self._save()
-        if self.task.asked:  # an earlier `make run` told it to stop, and was killed before it had ended
+        if self.task.asked:  # an earlier `hippodrome run` told it to stop, and was killed before it had ended
             self.end(self.task.asked, time.monotonic() + self._shared.stop_timeout)
         if self.task.status == "PROVISIONING" and self._listens():
             self._send(status="RUNNING", started=now())

@@ -1,7 +1,7 @@
 """Servers as processes of this machine, and their ECS events.
 
 Each server is `python -m hippodrome.trial` in a process of its own. `task_process.py` follows one from its start to its
-end; this module has the list of all. The next `make run` finds each server again by its file (`task_record.py`).
+end; this module has the list of all. The next `hippodrome run` finds each server again by its file (`task_record.py`).
 """
 
 from __future__ import annotations

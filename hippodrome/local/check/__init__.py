@@ -1,1 +1,1 @@
-"""`make check`: finds the mistakes of a project before participants come."""
+"""`hippodrome check`: finds the mistakes of a project before participants come."""

@@ -148,7 +148,7 @@ def _group() -> int | None:
 def _assigned(given: Handover) -> assignment.AssignmentDocument:
     """The document that says who plays: the handover itself, for one participant.
 
-    If the handover names a session, its document is made up, with no members: `make check` has no stored one.
+    If the handover names a session, its document is made up, with no members: `hippodrome check` has no stored one.
     """
     if not is_session_id(given.user_id):
         return given

@@ -14,11 +14,11 @@ from typing import Annotated
 
 import typer
 
+from hippodrome.console.arguments import StudyFolder
 from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
 from hippodrome.local import requirements
 from hippodrome.local.check import agent, agent_file
 from hippodrome.local.check.project import check_project
-from hippodrome.local.study_folder import StudyFolder
 
 
 def command(

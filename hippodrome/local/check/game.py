@@ -30,7 +30,7 @@ STAYS = 20  # steps for which a substitute plays in one place
 
 
 class CheckedGame:
-    """A game that `make check` plays: `load` its policies, `play` it, `close` it."""
+    """A game that `hippodrome check` plays: `load` its policies, `play` it, `close` it."""
 
     def __init__(
         self,

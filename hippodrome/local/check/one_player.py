@@ -1,4 +1,4 @@
-"""Calls an agent with one player as one with several is called, so that `make check` plays both in one way."""
+"""Calls an agent with one player as one with several is called, so that `hippodrome check` plays both in one way."""
 
 from __future__ import annotations
 

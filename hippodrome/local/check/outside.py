@@ -15,7 +15,7 @@ _LARGEST = 4096  # pixels of a sprite that has the size of its image
 
 
 class Outside:
-    """Finds the objects that are never in the picture, among the pictures of the episodes that `make check` plays."""
+    """Finds the objects that are never in the picture, among the pictures of the episodes that `check` plays."""
 
     def __init__(self, section: SceneSection | None) -> None:
         self._size = (section.width, section.height) if section and section.coordinates == "relative" else None

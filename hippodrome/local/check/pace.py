@@ -1,4 +1,4 @@
-"""How fast and how long an agent plays: its process measures it, and `make check` reports it."""
+"""How fast and how long an agent plays: its process measures it, and `hippodrome check` reports it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`make try`: simulated participants walk through a whole study, and all that they sent is looked for in the data."""
+"""`try`: simulated participants walk through a whole study, and all that they sent is looked for in the data."""

@@ -30,6 +30,8 @@ from hippodrome.bots.bot import Bot
 from hippodrome.bots.crowd import SIGNALS, interruptible, walk
 from hippodrome.bots.links import with_project
 from hippodrome.bots.report import BotReport
+from hippodrome.console.arguments import StudyFolder
+from hippodrome.console.program import as_typed
 from hippodrome.control.config import Config, ConfigErrors, read_project
 from hippodrome.local import requirements
 from hippodrome.local.rehearsal.crashes import ServerLogs
@@ -45,7 +47,6 @@ from hippodrome.local.rehearsal.study_process import (
     sessions_of,
     wait_until_gone,
 )
-from hippodrome.local.study_folder import StudyFolder
 
 
 @dataclass(frozen=True)
@@ -219,7 +220,7 @@ def _rehearse_and_report(
         logs = _keep_logs(study, folder)
         console.print(f"The logs of local mode and of the servers are in {logs}.", soft_wrap=True)
     if study and data:
-        console.print(_how_to_read(folder, data), markup=False, soft_wrap=True)
+        console.print(as_typed(_how_to_read(folder, data)), markup=False, soft_wrap=True)
     return fine
 
 

@@ -1,4 +1,4 @@
-"""Checks the data of `make try` for what the bots sent and played, and reads the logs of functions and servers."""
+"""Checks the data of `try` for what the bots sent and played, and reads the logs of functions and servers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs a study by `make run` in a process of its own, ends it, and looks at its servers and records."""
+"""Runs a study by `hippodrome run` in a process of its own, ends it, and looks at its servers and records."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Process(Protocol):
 
 
 class StudyProcess:
-    """Runs a study by `make run` in a process of its own. `link` is the study's link once the study has started.
+    """Runs a study by `hippodrome run` in a process of its own. `link` is the study's link once the study has started.
 
     If this process ends in whatever way, the study ends, too.
     """

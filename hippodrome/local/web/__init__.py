@@ -1,1 +1,1 @@
-"""The web server of `make run`."""
+"""The web server of `hippodrome run`."""

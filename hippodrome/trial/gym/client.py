@@ -64,7 +64,9 @@ class GymClient:
             raise ConnectionLost(f"There is no connection to {self.url}: {_reason(error)}.") from None
         if self._connection.subprotocol != SUBPROTOCOL:
             self._end(f"it does not speak {SUBPROTOCOL}")
-            raise ConnectionLost(f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `make gym` do.")
+            raise ConnectionLost(
+                f"The server at {self.url} does not speak {SUBPROTOCOL}. Servers of `hippodrome gym` do."
+            )
 
     def call(self, method: str, **params: Any) -> Any:
         """Send a request. Return its result. Raises RemoteError, and ConnectionLost."""
@@ -146,5 +148,5 @@ def _reason(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return "it took too long"
     if isinstance(error, ConnectionRefusedError):
-        return "no server listens there (`make gym` starts one)"
+        return "no server listens there (`hippodrome gym` starts one)"
     return str(error).rstrip(".") or type(error).__name__

@@ -1,4 +1,4 @@
-"""Records environments in the form of a study's recordings, and under the same keys, for `make data` (docs/data.md).
+"""Records environments in the form of a study's recordings, and under the same keys, for `data` (docs/data.md).
 
 The project's id is `gym`. Each connection stands for a participant, each environment for a server, and the id of the
 environment for the step: `gym/users/{connection}/trials/{environment}/{id}-trial.jsonl.gz`.

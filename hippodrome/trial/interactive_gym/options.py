@@ -259,7 +259,7 @@ OPTIONS: tuple[Option, ...] = (
     Option("final_page_text", "", "", "the text of the last page"),
     Option("reset_timeout", 3000, "trial.betweenEpisodes", "milliseconds there, seconds here; a page between two episodes stays until participants go on themselves", lambda config, _: number(config.reset_timeout / 1000)),
     # logging
-    Option("logfile", "./server_log.log", "", "", None, "the logs of a run are in the folder that it names, and those on AWS come from `make logs`"),
+    Option("logfile", "./server_log.log", "", "", None, "the logs of a run are in the folder that it names, and those on AWS come from `hippodrome logs`"),
     # pyodide
     Option("run_through_pyodide", False, "", "", None, "the environment runs on a participant's server, and not in the browser"),
     Option("environment_initialization_code", "", "", "without an `env_creator`, run on the server; its variable `env` is the environment"),

@@ -181,20 +181,20 @@ def test_status_names_unreadable_documents_and_goes_on(world: Installed, capsys:
     add_broken_entry(world)
     world.participant(USER)
     world.put(server.key(ids.server_label("maze", "bob")), b"{")
-    ran = world.run(capsys, "status", "--json")
+    ran = world.run(capsys, "status", "--all", "--json")
     assert ran.code == Exit.DONE
     assert [(one["id"], one["participants"]) for one in ran.json["projects"]] == [("maze", 1)]
     problems = ran.json["problems"]
     assert "counts as closed" in problems["project broken"]
     assert problems["records of servers"].startswith("1 record cannot be read")
-    assert "No project broken: The entry of" in " ".join(world.run(capsys, "status").out.split())
+    assert "No project broken: The entry of" in " ".join(world.run(capsys, "status", "--all").out.split())
 
 
 def test_stop_names_unreadable_documents_and_goes_on(world: Installed, capsys: Any) -> None:
     add_broken_entry(world)
     world.record(USER)
     world.put(server.key(ids.server_label("maze", "bob")), b"{")
-    ran = world.run(capsys, "stop", "--yes", "--json")
+    ran = world.run(capsys, "stop", "--all", "--yes", "--json")
     assert (ran.code, ran.json["stopped"]) == (Exit.DONE, 1)
     assert "The entry of the project broken" in " ".join(ran.err.split())
     assert "1 record of servers cannot be read" in " ".join(ran.err.split())
@@ -208,7 +208,7 @@ def test_erase_names_unreadable_documents_and_goes_on(
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)
     world.put("maze/slots/3.json", b"[")
-    ran = world.run(capsys, "erase", USER, "--project", "maze", "--yes")
+    ran = world.run(capsys, "erase", USER, "maze", "--yes")
     assert ran.code == Exit.DONE, ran.err
     assert not [key for key in world.keys("maze/users/") if USER in key]
     assert "maze/slots/3.json cannot be read" in " ".join(ran.err.split())
@@ -221,7 +221,7 @@ def test_data_names_unreadable_entries_of_its_own_project_alone(
     add_broken_entry(world)
     world.participant(USER, answered=2)
     world.participant(USER, answered=2, project=study(id="broken"))
-    ran = world.run(capsys, "data", str(tmp_path / "out"), "--project", project)
+    ran = world.run(capsys, "data", project, "--to", str(tmp_path / "out"))
     assert ran.code == Exit.DONE, ran.err
     assert USER in (tmp_path / "out" / "answers.csv").read_text()
     assert ("cannot be read" in ran.err) is warned

@@ -356,14 +356,14 @@ def test_spending_has_a_line_for_waiting_and_the_present_cost_of_live_projects(
         warm_server_name="s-1",
         spot=False,
     )
-    ran = installed.run(capsys, "cost", "--project", "maze", "--json").json
+    ran = installed.run(capsys, "cost", "maze", "--spent", "--json").json
     maze = ran["projects"]["maze"]
     assert (maze["servers"], maze["waiting"]["servers"]) == (1, 1)
     assert maze["hours"] == pytest.approx(0.5, rel=0.02)
     assert maze["waiting"]["hours"] == pytest.approx(1 / 6, rel=0.02)
     assert [(one["project"], one["servers"]) for one in ran["warmServers"]] == [("maze", 4)]
-    assert installed.run(capsys, "cost", "--project", "closed", "--json").json["warmServers"] == []
-    text = installed.run(capsys, "cost", "--project", "maze").out
+    assert installed.run(capsys, "cost", "closed", "--spent", "--json").json["warmServers"] == []
+    text = installed.run(capsys, "cost", "maze", "--spent").out
     assert "of it, waiting (warm servers)" in text
     assert "4 of 1 vCPU, 2 GB, on Spot" in text
 
@@ -408,21 +408,21 @@ def test_cost_counts_the_servers_of_one_project(installed: Installed, capsys: An
         installed.record(f"p{number}", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
     installed.record("x", ServerState.CLOSED, project=other, closed=datetime.now(UTC), reason=Reason.ENDED, spot=False)
     installed.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"?")
-    found = installed.run(capsys, "cost", "--project", "maze", "--json").json
+    found = installed.run(capsys, "cost", "maze", "--spent", "--json").json
     assert set(found["projects"]) == {"maze"}
     maze = found["projects"]["maze"]
     assert (maze["servers"], found["unreadable"]) == (3, 1)
     assert maze["usd"]["likely"] == pytest.approx(0.5 * (HOUR + 0.005), rel=0.02)
-    text = installed.run(capsys, "cost", "--project", "maze").out
+    text = installed.run(capsys, "cost", "maze", "--spent").out
     assert "1 records cannot be read" in text.replace("\n", " ")
-    assert "No project named labyrinth" in installed.run(capsys, "cost", "--project", "labyrinth").err
+    assert "No project named labyrinth" in installed.run(capsys, "cost", "labyrinth", "--spent").err
 
 
 def test_cost_takes_the_folder_of_a_project(installed: Installed, capsys: Any, tmp_path: Path) -> None:
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     (tmp_path / "config.yml").write_text("project:\n  id: maze\n")
-    ran = installed.run(capsys, "cost", "--project", f"{tmp_path}/", "--json")
+    ran = installed.run(capsys, "cost", f"{tmp_path}/", "--spent", "--json")
     assert (ran.code, list(ran.json["projects"])) == (Exit.DONE, ["maze"])
 
 
@@ -444,7 +444,7 @@ def test_cost_shows_what_aws_has_billed(installed: Installed, capsys: Any) -> No
         {"Amazon Elastic Container Service": 12.5},
     )
     with installed.recording() as calls:
-        found = installed.run(capsys, "cost", "--billed", "--json").json["billed"]
+        found = installed.run(capsys, "cost", "--spent", "--all", "--billed", "--json").json["billed"]
     asked = [call.params["Filter"] for call in calls if call.operation == "GetCostAndUsage"]
     assert asked[0]["Tags"] == {"Key": "hippodrome:stack", "Values": ["hippodrome"], "MatchOptions": ["EQUALS"]}
     assert found["tagged"] == {"AWS Lambda": 0.25, "Amazon Simple Storage Service": 0.5}
@@ -464,10 +464,10 @@ def test_without_cost_explorer_only_the_bill_is_missing(
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     installed.fail("ce:GetCostAndUsage", code, times=2)
-    ran = installed.run(capsys, "cost", "--billed", "--json")
+    ran = installed.run(capsys, "cost", "--spent", "--all", "--billed", "--json")
     assert (ran.code, ran.json["projects"]["maze"]["servers"], ran.json["billed"]) == (Exit.DONE, 1, None)
     assert says in ran.json["problems"]["bill"]
-    shown = installed.run(capsys, "cost", "--billed")
+    shown = installed.run(capsys, "cost", "--spent", "--all", "--billed")
     assert (shown.code, "✗" in shown.err) == (Exit.DONE, False)
     assert "Servers, from their own records" in shown.out
     assert f"! No bill: {says}" in shown.out
@@ -489,8 +489,8 @@ def test_as_a_process(installed: Installed) -> None:
     installed.register(study())
     installed.record("alice", ServerState.CLOSED, closed=datetime.now(UTC), reason=Reason.ENDED)
     with installed.served() as env:
-        ran = process(env, "cost", "--project", "maze", "--json")
-        plain = process(env, "cost", "--project", "maze")
+        ran = process(env, "cost", "maze", "--spent", "--json")
+        plain = process(env, "cost", "maze", "--spent")
     assert (ran.code, ran.json["projects"]["maze"]["servers"]) == (Exit.DONE, 1)
     assert "Servers, from their own records" in plain.out
 

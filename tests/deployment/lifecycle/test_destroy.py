@@ -139,7 +139,7 @@ def test_destroy_deletes_all_but_the_data(
 
 def last_commands(said: str) -> list[list[str]]:
     """Return the commands that the output names at its end, split as a shell would split them."""
-    return [shlex.split(line)[3:] for line in said.splitlines() if line.startswith("  python -m deploy ")]
+    return [shlex.split(line)[1:] for line in said.splitlines() if line.startswith("  hippodrome ")]
 
 
 def test_the_commands_that_destroy_names_fetch_and_delete_the_kept_data(

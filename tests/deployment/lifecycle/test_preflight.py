@@ -455,7 +455,7 @@ def test_remains_of_an_unfinished_destroy_are_a_problem(world: World) -> None:
     world.account.client("logs").create_log_group(logGroupName="/hippodrome/hippodrome/sweep")
     found = only(findings(world))
     assert (found.mark, "An earlier installation hippodrome has left 1 log group" in found.text) == (Mark.BAD, True)
-    assert "python -m deploy destroy --stack hippodrome" in found.advice
+    assert "hippodrome destroy --stack hippodrome" in found.advice
 
 
 # -- roles that were just made -----------------------------------------------------------------------------------------

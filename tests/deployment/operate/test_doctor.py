@@ -117,7 +117,7 @@ def only(findings: Iterable[Finding]) -> Finding:
 
 
 def doctor(world: Installed, capsys: Any, *arguments: str) -> dict[str, tuple[str, str]]:
-    ran = world.run(capsys, "doctor", "--only-aws", "--json", *arguments)
+    ran = world.run(capsys, "doctor", "--only-aws", "--json", *(arguments or ["--all"]))
     found = ran.json
     assert (ran.code == Exit.DONE) is found["good"]
     return {one["check"]: (one["mark"], one["text"]) for one in found["checks"]}
@@ -127,7 +127,7 @@ def doctor(world: Installed, capsys: Any, *arguments: str) -> dict[str, tuple[st
 
 
 def test_doctor_finds_nothing_bad_in_a_healthy_installation(world: Installed, capsys: Any) -> None:
-    ran = world.run(capsys, "doctor", "--only-aws")
+    ran = world.run(capsys, "doctor", "--all", "--only-aws")
     assert ran.code == Exit.DONE, ran.out
     assert "✗" not in ran.out
     for line in (
@@ -199,7 +199,7 @@ def test_without_a_stack_or_credentials_doctor_says_so(world: Installed, capsys:
     found = doctor(world, capsys, "--stack", "nowhere")
     assert set(found) == {"credentials", "region", "stack"}
     world.fail("sts:GetCallerIdentity", "ExpiredToken", status=403)
-    ran = world.run(capsys, "doctor")
+    ran = world.run(capsys, "doctor", "--all")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "credentials have expired" in ran.err
 
@@ -207,7 +207,7 @@ def test_without_a_stack_or_credentials_doctor_says_so(world: Installed, capsys:
 @pytest.mark.parametrize("code", ["OptInRequired", "SubscriptionRequiredException", "NotSignedUp"])
 def test_commands_say_that_aws_has_not_activated_the_account_yet(world: Installed, capsys: Any, code: str) -> None:
     world.fail("cloudformation:DescribeStacks", code, status=403)
-    ran = world.run(capsys, "status")
+    ran = world.run(capsys, "status", "--all")
     assert ran.code == Exit.FAILED
     assert "✗ AWS has not activated this account yet." in ran.err
     assert "→ Finish the sign-up in AWS's console" in ran.err
@@ -216,17 +216,11 @@ def test_commands_say_that_aws_has_not_activated_the_account_yet(world: Installe
 def test_the_project_can_be_named_by_its_folder(world: Installed, capsys: Any, tmp_path: Path) -> None:
     for name in ("steps", "agent.py", "config.yml"):
         (shutil.copytree if name == "steps" else shutil.copy)(ROOT / name, tmp_path / name)
-    config = tmp_path / "config.yml"
-    as_it_is = config.read_text()
-    config.write_text(as_it_is.replace("  awsSetup:", "  useAWS: false\n  awsSetup:"))
-    ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
-    assert (ran.code, ran.out) == (Exit.FAILED, "")
-    assert "useAWS" in ran.err  # this study is for one machine
-    config.write_text(as_it_is)
-    ran = world.run(capsys, "doctor", "--only-aws", "--project", str(tmp_path))
-    assert "The project ms-pacman is not registered" in ran.err
+    ran = world.run(capsys, "doctor", "--only-aws", str(tmp_path))
+    assert "No project named ms-pacman is registered" in ran.err
+    assert "`hippodrome register STUDY` adds one" in ran.err
     world.register(project(world), project(world, id="ms-pacman", live=False))
-    assert set(doctor(world, capsys, "--project", str(tmp_path))) >= {"project ms-pacman"}
+    assert set(doctor(world, capsys, str(tmp_path))) >= {"project ms-pacman"}
 
 
 # Addresses
@@ -706,10 +700,10 @@ def test_a_rehearsal_decides_how_the_command_ends(
 ) -> None:
     """Other problems are still reported."""
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
-    assert world.run(capsys, "doctor", "--only-aws").code == Exit.FAILED
+    assert world.run(capsys, "doctor", "--all", "--only-aws").code == Exit.FAILED
     rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
     monkeypatch.setattr("hippodrome.deployment.operate.doctor._rehearse", lambda context: [rehearsed])
-    ran = world.run(capsys, "doctor", "--only-aws", "--rehearse")
+    ran = world.run(capsys, "doctor", "--all", "--only-aws", "--rehearse")
     assert ran.code == code
     assert "✗ certificate: It expired" in ran.out
     last = "The rehearsal succeeded; 1 to mend" if mark is Mark.GOOD else "2 to mend"
@@ -727,8 +721,8 @@ def test_a_rehearsal_without_a_live_project_is_bad(world: Installed, capsys: Any
 def test_as_a_process(world: Installed) -> None:
     world.register(project(world, task_definition=definition(world, image=f"{world.repository}:latest")))
     with world.served() as env:
-        ran = process(env, "doctor", "--only-aws", "--json")
-        plain = process(env, "doctor", "--only-aws")
+        ran = process(env, "doctor", "--all", "--only-aws", "--json")
+        plain = process(env, "doctor", "--all", "--only-aws")
         nowhere = process({**env, "AWS_REGION": "eu-west-1"}, "doctor", "--json")
     found = {one["check"]: one for one in ran.json["checks"]}
     # Moto has neither quotas nor a policy that asks for TLS.

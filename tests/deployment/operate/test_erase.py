@@ -51,7 +51,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: N
 
 
 def run(world: Installed, capsys: Any, *more: str, user: str = ANN, project: str = "maze") -> CommandResult:
-    where = () if "--everywhere" in more else ("--project", project)
+    where = () if "--everywhere" in more else (project,)
     return world.run(capsys, "erase", user, *where, "--yes", *more)
 
 
@@ -176,12 +176,12 @@ def test_a_second_run_says_that_there_is_nothing(world: Installed, capsys: Any) 
 
 def test_a_mistyped_participant_needs_no_confirmation_and_changes_nothing(world: Installed, capsys: Any) -> None:
     before = versions(world)
-    assert world.run(capsys, "erase", "no-such-person", "--project", "maze").code == Exit.DONE
+    assert world.run(capsys, "erase", "no-such-person", "maze").code == Exit.DONE
     assert versions(world) == before
-    assert world.run(capsys, "erase", "../ann", "--project", "maze").code == Exit.FAILED
-    assert world.run(capsys, "erase", ANN, "--project", "maze", "--everywhere").code == Exit.FAILED
+    assert world.run(capsys, "erase", "../ann", "maze").code == Exit.FAILED
+    assert world.run(capsys, "erase", ANN, "maze", "--everywhere").code == Exit.FAILED
     assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # there is no config.yml here
-    dry = world.run(capsys, "erase", "no-such-person", "--project", "maze", "--dry-run")
+    dry = world.run(capsys, "erase", "no-such-person", "maze", "--dry-run")
     assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this participant in maze.\n")
 
 
@@ -198,8 +198,8 @@ def test_a_dry_run_and_a_missing_yes_change_nothing(world: Installed, capsys: An
     world.participant(ANN, answered=2)
     start(world)
     with world.recording() as calls:
-        dry = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run", "--json")
-        asked = world.run(capsys, "erase", ANN, "--project", "maze")
+        dry = world.run(capsys, "erase", ANN, "maze", "--dry-run", "--json")
+        asked = world.run(capsys, "erase", ANN, "maze")
     assert (dry.code, asked.code) == (Exit.CHANGES, Exit.DECLINED)
     assert dry.json["found"]["maze"]["tasks"] == 1
     assert not [c for c in calls if not c.operation.startswith(("Get", "List", "Describe", "Head"))]

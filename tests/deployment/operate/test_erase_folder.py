@@ -44,7 +44,7 @@ class Machine:
         self.put = into_folder(self.data)
 
     def erase(self, *more: str, user: str = ANN) -> CommandResult:
-        return self.run("--project", "maze", "--from", str(self.data), *more, user=user)
+        return self.run("maze", "--from", str(self.data), *more, user=user)
 
     def run(self, *more: str, user: str = ANN) -> CommandResult:
         self._capsys.readouterr()
@@ -190,7 +190,7 @@ def test_an_erasure_in_one_project_says_where_else_the_participant_is(machine: M
 def test_a_project_or_folder_that_is_not_there_is_no_erasure(machine: Machine, data: str) -> None:
     pair(machine.put, machine.tmp)
     before = machine.contents()
-    ran = machine.run("--from", str(machine.tmp / data), "--yes", *(["--project", "mase"] if data == "data" else []))
+    ran = machine.run("--from", str(machine.tmp / data), "--yes", *(["mase"] if data == "data" else []))
     told = "holds nothing of a project mase" if data == "data" else "is not a data folder: it holds no project"
     assert (ran.code, told in ran.err) == (Exit.FAILED, True)
     assert ("It holds: maze" in ran.err) == (data == "data")
@@ -311,7 +311,7 @@ def test_a_dry_run_and_a_missing_yes_change_nothing(machine: Machine) -> None:
     assert machine.erase().code == Exit.DECLINED
     assert machine.erase("--everywhere").code == Exit.FAILED
     assert machine.contents() == before
-    assert main(["erase", ANN, "--project", "maze", "--from", str(machine.tmp / "none")]) == Exit.FAILED
+    assert main(["erase", ANN, "maze", "--from", str(machine.tmp / "none")]) == Exit.FAILED
 
 
 def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:

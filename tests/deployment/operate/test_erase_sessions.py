@@ -67,7 +67,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: N
 
 
 def erase(world: Installed, capsys: Any, user: str = ANN, *more: str) -> CommandResult:
-    return world.run(capsys, "erase", user, "--project", "maze", "--yes", *more)
+    return world.run(capsys, "erase", user, "maze", "--yes", *more)
 
 
 def contents(world: Installed) -> dict[tuple[str, str], bytes]:
@@ -152,7 +152,7 @@ def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path,
 
     pair(world.put, tmp_path, observe=True)
     out = tmp_path / "out"
-    made = ["data", str(out), "--project", "maze", "--aws", "--format", "csv,parquet,minari"]
+    made = ["data", "maze", "--to", str(out), "--aws", "--format", "csv,parquet,minari"]
     assert world.run(capsys, *made).code == Exit.DONE
     assert erase(world, capsys).code == Exit.DONE
     for folder in (out, tmp_path / "anew"):
@@ -441,8 +441,8 @@ def test_a_member_is_erased_from_a_kept_bucket_as_documented(
 def test_a_dry_run_counts_sessions_and_changes_nothing(world: Installed, tmp_path: Path, capsys: Any) -> None:
     pair(world.put, tmp_path)
     before = contents(world)
-    dry = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run", "--json")
+    dry = world.run(capsys, "erase", ANN, "maze", "--dry-run", "--json")
     assert (dry.code, dry.json["found"]["maze"]["sessions"]) == (Exit.CHANGES, 1)
-    shown = world.run(capsys, "erase", ANN, "--project", "maze", "--dry-run")
+    shown = world.run(capsys, "erase", ANN, "maze", "--dry-run")
     assert "sessions" in shown.out + shown.err
     assert contents(world) == before

@@ -52,8 +52,10 @@ def test_each_log_group_of_the_template_has_a_source() -> None:
 def test_the_sites_access_log_is_read_with_the_others(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "next_step", log_message("INFO", "first"), ago=50)
     put_messages(installed, "api", '{"route":"GET /next","status":"200"}', ago=40)
-    assert [one["source"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["next_step", "api"]
-    assert [one["source"] for one in lines(installed.run(capsys, "logs", "api", "--json"))] == ["api"]
+    assert [one["source"] for one in lines(installed.run(capsys, "logs", "--all", "--json"))] == ["next_step", "api"]
+    assert [one["source"] for one in lines(installed.run(capsys, "logs", "--all", "--function", "api", "--json"))] == [
+        "api"
+    ]
 
 
 def lines(ran: Any) -> list[dict[str, Any]]:
@@ -67,14 +69,14 @@ def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, cap
         installed, "next_step", "START RequestId: 1 Version: 1", log_message("ERROR", "third", code="SlowDown"), ago=30
     )
     put_messages(installed, "start_server", "fourth, of no known form", ago=20, stream="b")
-    ran = installed.run(capsys, "logs", "--json")
+    ran = installed.run(capsys, "logs", "--all", "--json")
     assert [(one["source"], one["level"], one["message"]) for one in lines(ran)] == [
         ("start_server", "INFO", "first"),
         ("trial", "WARNING", "second"),
         ("next_step", "ERROR", "third"),
         ("start_server", "", "fourth, of no known form"),
     ]
-    text = installed.run(capsys, "logs", "--all").out
+    text = installed.run(capsys, "logs", "--all", "--everything").out
     assert "START RequestId" in text
     assert "ERROR   third  code=SlowDown" in text
 
@@ -82,16 +84,16 @@ def test_lines_of_all_groups_come_in_the_order_of_time(installed: Installed, cap
 def test_lines_with_metrics_are_not_shown(installed: Installed, capsys: Any) -> None:
     metrics = json.dumps({"_aws": {"CloudWatchMetrics": []}, "Stack": "hippodrome", "Servers": [4.0]})
     put_messages(installed, "sweep", log_message("INFO", "swept", tasks=0), metrics)
-    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["swept"]
-    assert "metrics  Stack=hippodrome Servers=[4.0]" in installed.run(capsys, "logs", "--all").out
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--all", "--json"))] == ["swept"]
+    assert "metrics  Stack=hippodrome Servers=[4.0]" in installed.run(capsys, "logs", "--all", "--everything").out
 
 
 def test_logs_says_that_there_are_no_lines(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "sweep", log_message("INFO", "swept"))
-    ran = installed.run(capsys, "logs", "--errors", "--since", "10m")
+    ran = installed.run(capsys, "logs", "--all", "--errors", "--since", "10m")
     assert (ran.code, ran.out) == (Exit.DONE, "")
     assert "No errors were logged since" in ran.err
-    assert installed.run(capsys, "logs").err == ""
+    assert installed.run(capsys, "logs", "--all").err == ""
 
 
 def test_events_without_ids_are_followed() -> None:
@@ -102,7 +104,7 @@ def test_events_without_ids_are_followed() -> None:
 
 def test_lines_of_more_than_a_page_are_all_shown(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "next_step", *[log_message("INFO", f"line {n}") for n in range(10_500)], ago=600)
-    ran = installed.run(capsys, "logs", "next_step", "--json")
+    ran = installed.run(capsys, "logs", "--all", "--function", "next_step", "--json")
     assert [one["message"] for one in lines(ran)] == [f"line {n}" for n in range(10_500)]
 
 
@@ -127,7 +129,7 @@ def test_errors_can_be_shown_alone_with_the_tracebacks_of_trials(installed: Inst
     put_messages(
         installed, "stop_server", json.dumps({"type": "platform.report", "record": {"status": "success"}}), stream="k"
     )
-    ran = installed.run(capsys, "logs", "--errors", "--json")
+    ran = installed.run(capsys, "logs", "--all", "--errors", "--json")
     assert sorted(one["message"] for one in lines(ran)) == [
         "  KeyError",
         "2026-11-21T10:00:00Z 1-2 Task timed out after 30.03 seconds",
@@ -151,29 +153,32 @@ def test_the_lines_of_one_project_can_be_shown_alone(installed: Installed, capsy
     )
     put_messages(installed, "trial", "2026-11-21 17:26:57 INFO mine", stream="maze/trial/1")
     put_messages(installed, "trial", "2026-11-21 17:26:57 INFO theirs", stream="other/trial/2")
-    shown = lines(installed.run(capsys, "logs", "--project", "maze", "--json"))
+    shown = lines(installed.run(capsys, "logs", "maze", "--json"))
     assert [(one["message"], one.get("fields", {}).get("server")) for one in shown] == [
         ("starting", mine.name),
         ("mine", None),
     ]
-    assert "No project named labyrinth" in installed.run(capsys, "logs", "--project", "labyrinth").err
+    assert "No project named labyrinth" in installed.run(capsys, "logs", "labyrinth").err
 
 
 def test_without_permission_to_list_groups_those_of_the_template_are_read(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "stop_server", log_message("INFO", "hello"))
     installed.fail("logs:DescribeLogGroups", "AccessDeniedException", status=400)
-    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["hello"]
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--all", "--json"))] == ["hello"]
 
 
 def test_since_says_how_far_back_lines_are_shown(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "sweep", log_message("INFO", "old"), ago=7200)
     put_messages(installed, "sweep", log_message("INFO", "new"), ago=5)
-    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json"))] == ["new"]
-    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--json", "--since", "3h"))] == ["old", "new"]
-    ran = installed.run(capsys, "logs", "--since", "yesterday")
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--all", "--json"))] == ["new"]
+    assert [one["message"] for one in lines(installed.run(capsys, "logs", "--all", "--json", "--since", "3h"))] == [
+        "old",
+        "new",
+    ]
+    ran = installed.run(capsys, "logs", "--all", "--since", "yesterday")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "--since yesterday is no time" in ran.err
-    assert "There is: sweep" in installed.run(capsys, "logs", "nonsense").err
+    assert "There is: sweep" in installed.run(capsys, "logs", "--all", "--function", "nonsense").err
 
 
 @pytest.mark.parametrize(
@@ -238,8 +243,8 @@ def test_as_a_process(installed: Installed) -> None:
         installed, "start_server", log_message("INFO", "starting", server="s"), log_message("ERROR", "it failed")
     )
     with installed.served() as env:
-        ran = process(env, "logs", "--json")
-        plain = process(env, "logs", "--errors")
+        ran = process(env, "logs", "--all", "--json")
+        plain = process(env, "logs", "--all", "--errors")
     assert (ran.code, [one["message"] for one in lines(ran)]) == (Exit.DONE, ["starting", "it failed"])
     assert plain.code == Exit.DONE
     assert plain.out.endswith("start_server   ERROR   it failed\n")

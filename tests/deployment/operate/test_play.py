@@ -90,7 +90,7 @@ def running_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ru
 
 
 def play(running: RunningInstallation, capsys: Any, *arguments: str) -> CommandResult:
-    return running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
+    return running.run(capsys, "doctor", "--all", "--only-aws", "--rehearse", "--play", "1", "--yes", *arguments)
 
 
 def documents(running: RunningInstallation) -> set[str]:
@@ -267,14 +267,14 @@ def test_unreadable_entries_of_the_list_of_projects_stay_unchanged() -> None:
 
 def test_a_rehearsal_needs_a_yes(running: RunningInstallation, capsys: Any) -> None:
     before = documents(running)
-    ran = running.run(capsys, "doctor", "--only-aws", "--rehearse", "--play", "3")
+    ran = running.run(capsys, "doctor", "--all", "--only-aws", "--rehearse", "--play", "3")
     assert ran.code == Exit.DECLINED
     assert re.search(r"3 bots and three servers more, .* It costs about \$0\.\d\d, \$0\.\d\d at most", ran.err), ran.err
     assert documents(running) == before
 
 
 def test_play_needs_rehearse(running: RunningInstallation, capsys: Any) -> None:
-    ran = running.run(capsys, "doctor", "--play", "1")
+    ran = running.run(capsys, "doctor", "--all", "--play", "1")
     assert (ran.code, "--rehearse --play" in ran.err) == (Exit.FAILED, True)
 
 

@@ -35,7 +35,7 @@ def world(installed: Installed) -> Installed:
 
 
 def look(world: Installed, capsys: Any, *arguments: str) -> Any:
-    ran = world.run(capsys, "status", "--json", *arguments)
+    ran = world.run(capsys, "status", "--json", *(arguments or ["--all"]))
     assert ran.code == Exit.DONE, ran.err
     return ran.json
 
@@ -54,9 +54,9 @@ def test_participants_stand_at_the_first_step_without_an_answer(world: Installed
         ("finalStep", 2),
     ]
     assert (old["live"], old["participants"]) == (False, 1)
-    text = " ".join(world.run(capsys, "status").out.split())
+    text = " ".join(world.run(capsys, "status", "--all").out.split())
     assert "1 consent: 2, 2 questionnaire: 1, 3 game: 1, 4 survey: 1" in text
-    assert "person-" not in text + world.run(capsys, "status", "--json").out
+    assert "person-" not in text + world.run(capsys, "status", "--all", "--json").out
 
 
 def test_unknown_objects_in_the_bucket_count_as_no_participants(world: Installed, capsys: Any) -> None:
@@ -101,7 +101,7 @@ def test_status_shows_the_age_and_the_minutes_left_of_servers(world: Installed, 
     world.record("carol", ServerState.CLOSED, reason=Reason.LOST, closed=datetime.now(UTC))
     world.put("_servers/sbbbbbbbbbbbbbbbbbbbb.json", b"not a record")
     before = datetime.now(UTC)
-    found, shown = look(world, capsys)["servers"], world.run(capsys, "status").out
+    found, shown = look(world, capsys)["servers"], world.run(capsys, "status", "--all").out
     ages = [(now - ready.requested) / timedelta(minutes=1) for now in (before, datetime.now(UTC))]
     assert found["byState"] == {"ready": 1, "starting": 1}
     assert found["closedToday"] == {"lost": 1}
@@ -109,7 +109,7 @@ def test_status_shows_the_age_and_the_minutes_left_of_servers(world: Installed, 
     assert one["server"] == ready.name
     assert round(ages[0], 1) <= one["ageMinutes"] <= round(ages[1], 1)
     assert round(30 - ages[1], 1) <= one["minutesLeft"] <= round(30 - ages[0], 1)
-    assert look(world, capsys, "--project", "old")["servers"]["byState"] == {}
+    assert look(world, capsys, "old")["servers"]["byState"] == {}
     minutes = range(round(30 - ages[1]), round(30 - ages[0]) + 1)
     assert any(f" {left} min" in shown for left in minutes)
 
@@ -130,7 +130,7 @@ def test_status_says_why_servers_failed_and_what_to_do(world: Installed, capsys:
     assert (image["project"], image["cause"], image["servers"], image["lastServer"]) == ("maze", "image", 2, last.name)
     assert image["matters"]
     assert (spot["cause"], spot["servers"], spot["matters"]) == ("spot", 1, False)
-    text = " ".join(world.run(capsys, "status").out.split())
+    text = " ".join(world.run(capsys, "status", "--all").out.split())
     assert f"! maze: 2 servers failed, the last {now:%H:%M} UTC ({last.name})." in text
     assert Cause.IMAGE.sentence in text
     assert "by no fault of yours, and replaced where AWS could: 1 spot (maze)." in text
@@ -151,7 +151,7 @@ def test_status_warns_only_of_a_stack_whose_last_operation_failed_or_goes_on(sta
 def test_without_failures_status_says_nothing_of_them(world: Installed, capsys: Any) -> None:
     world.record("alice")
     assert look(world, capsys)["servers"]["failed"] == []
-    assert "fault" not in world.run(capsys, "status").out
+    assert "fault" not in world.run(capsys, "status", "--all").out
 
 
 WARM_SERVERS = [f"~{number:020x}" for number in range(5)]
@@ -172,7 +172,7 @@ def test_warm_servers_are_counted_separately_and_not_as_participants(world: Inst
     assert found["servers"]["byState"] == {"ready": 4, "starting": 1}
     assert sorted(server["warm"] for server in found["servers"]["open"]) == [False, True, True, True, True]
     assert found["servers"]["closedToday"] == {}  # a participant plays on it
-    text = world.run(capsys, "status").out
+    text = world.run(capsys, "status", "--all").out
     assert "maze: 3 of 4 warm servers ready; 1 assigned today." in text
     assert "4 ready, 1 starting, 4 of them warm" in text
     assert text.count("Spot, warm") == 4
@@ -189,7 +189,7 @@ def test_servers_of_sessions_are_shown_with_the_number_of_their_members(world: I
     world.put(session_key("maze", formed), SessionDocument(formed, 2, members).to_json())
     found = look(world, capsys)["servers"]["open"]
     assert sorted((one["session"], one["members"]) for one in found) == [(True, 0), (True, 2)]
-    text = world.run(capsys, "status").out
+    text = world.run(capsys, "status", "--all").out
     assert "2 ready, 2 of sessions with 2 members" in text
     assert "Spot, session of 2" in text
     assert "Spot, started ahead" in text
@@ -206,7 +206,7 @@ def test_warm_servers_of_a_closed_study_are_shown(world: Installed, capsys: Any)
     world.register(study(warm_servers=4, live=False))
     world.record(WARM_SERVERS[0], ServerState.DRAINING)
     assert look(world, capsys)["projects"][0]["warmServers"]["wanted"] == 0
-    assert "maze: 1 warm server on the way out." in world.run(capsys, "status").out
+    assert "maze: 1 warm server on the way out." in world.run(capsys, "status", "--all").out
 
 
 def test_todays_spending_counts_the_time_of_servers_today(world: Installed, capsys: Any) -> None:
@@ -245,7 +245,7 @@ def test_status_shows_queues_alarms_and_the_certificate(world: Installed, capsys
     assert found["alarms"] == ["hippodrome-dead-letters"]
     assert (found["certificate"]["daysLeft"], found["certificate"]["staging"]) == (60, False)
     assert found["queues"][0]["waiting"] == 1
-    text = world.run(capsys, "status").out
+    text = world.run(capsys, "status", "--all").out
     assert "1 message could not be dealt with" in text
     assert "Certificate: 60 days left (*.servers.example.org)" in text
 
@@ -258,7 +258,7 @@ def test_status_names_expired_and_staging_certificates(
     world: Installed, capsys: Any, days: int, issuer: str, says: str
 ) -> None:
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=days, issuer=issuer))
-    assert says in world.run(capsys, "status").out
+    assert says in world.run(capsys, "status", "--all").out
 
 
 def test_status_shows_the_rest_if_a_part_is_refused(world: Installed, capsys: Any) -> None:
@@ -281,7 +281,7 @@ def test_without_cost_explorer_only_the_bill_is_missing(world: Installed, capsys
     found = look(world, capsys, "--billed")
     assert found["projects"][0]["participants"] == 1
     assert (found["billedThisMonth"], list(found["problems"])) == (None, ["bill"])
-    text = " ".join(world.run(capsys, "status", "--billed").out.split())
+    text = " ".join(world.run(capsys, "status", "--all", "--billed").out.split())
     assert "! No bill: These credentials may not get cost and usage." in text
     assert "Alarms: none fires." in text
 
@@ -293,7 +293,7 @@ def test_a_broken_list_of_projects_is_reported_in_a_sentence(world: Installed, c
 
 def test_status_of_an_installation_without_projects_says_so(installed: Installed, capsys: Any) -> None:
     assert look(installed, capsys)["projects"] == []
-    assert "No project is registered yet" in installed.run(capsys, "status").out
+    assert "No project is registered yet" in installed.run(capsys, "status", "--all").out
 
 
 def test_a_second_look_reads_only_changed_records(world: Installed, monkeypatch: Any) -> None:
@@ -328,15 +328,15 @@ def test_watching_ends_at_ctrl_c(world: Installed, capsys: Any, monkeypatch: Any
             raise KeyboardInterrupt
 
     monkeypatch.setattr(status.time, "sleep", sleep)
-    ran = world.run(capsys, "status", "--watch")
+    ran = world.run(capsys, "status", "--all", "--watch")
     assert ran.code == Exit.DONE
     assert "maze" in ran.out
     assert "Interrupted" not in ran.err
 
 
 def test_wrong_options_of_status_are_reported_in_a_sentence(world: Installed, capsys: Any) -> None:
-    assert world.run(capsys, "status", "--watch", "--json").code == Exit.FAILED
-    ran = world.run(capsys, "status", "--json", "--project", "labyrinth")
+    assert world.run(capsys, "status", "--all", "--watch", "--json").code == Exit.FAILED
+    ran = world.run(capsys, "status", "--json", "labyrinth")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "No project named labyrinth" in ran.err
 
@@ -344,7 +344,7 @@ def test_wrong_options_of_status_are_reported_in_a_sentence(world: Installed, ca
 def test_status_in_another_region_says_where_the_installation_is(world: Installed, capsys: Any) -> None:
     name = "hippodrome-code-123456789012-ca-central-1"
     world.client("s3").create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": "ca-central-1"})
-    ran = world.run(capsys, "status", "--region", "eu-west-1")
+    ran = world.run(capsys, "status", "--all", "--region", "eu-west-1")
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "There is no stack named hippodrome in eu-west-1." in ran.err
     assert "→ Something of that name is in another region: say AWS_REGION=ca-central-1." in ran.err
@@ -360,7 +360,7 @@ def test_without_permission_to_list_buckets_status_says_how_to_name_another_regi
             raise denied
 
     monkeypatch.setattr(Account, "fail_fast_client", lambda *_: Denied())
-    ran = world.run(capsys, "status", "--region", "eu-west-1")
+    ran = world.run(capsys, "status", "--all", "--region", "eu-west-1")
     assert ran.code == Exit.FAILED
     assert "or name another region (AWS_REGION, --region)" in ran.err
 
@@ -369,9 +369,9 @@ def test_as_a_process(world: Installed) -> None:
     world.participant("alice", answered=2)
     world.record("alice")
     with world.served() as env:
-        ran = process(env, "status", "--json")
-        plain = process(env, "status")
-        nowhere = process(env, "status", "--stack", "nowhere")
+        ran = process(env, "status", "--all", "--json")
+        plain = process(env, "status", "--all")
+        nowhere = process(env, "status", "--all", "--stack", "nowhere")
     assert ran.code == plain.code == Exit.DONE
     assert ran.json["projects"][0]["participants"] == 1
     assert ran.json["problems"] == {}

@@ -72,7 +72,7 @@ def test_from_any_state_a_run_or_the_advised_remedy_and_a_run_succeed(
     except Problem as problem:
         assert states.action_for(end or status) is StackAction.STOP
         assert str(problem).count(". ") == 0, "one sentence"
-        assert problem.advice.startswith("Remove it with `python -m deploy destroy --stack hippodrome` (the data stay)")
+        assert problem.advice.startswith("Remove it with `hippodrome destroy --stack hippodrome` (the data stay)")
         assert not world.cloud.called("create_change_set")
         world.cloud.operations = [list(DELETED)]
         world.cloud.delete_stack(StackName="hippodrome")  # destroy does this

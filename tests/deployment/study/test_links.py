@@ -33,13 +33,13 @@ def world(register_world: RegisterWorld) -> RegisterWorld:
 
 
 def run(world: RegisterWorld, capsys: Any, *more: str, project: str = "maze") -> CommandResult:
-    return world.run(capsys, "links", "--project", project, *more)
+    return world.run(capsys, "links", project, *more)
 
 
 def test_each_line_is_the_link_of_one_participant(world: RegisterWorld, capsys: Any, tmp_path: Path) -> None:
     file = tmp_path / "ids.txt"
     file.write_text("\ufeffann\n\n  bob \nann\n", encoding="utf-8")
-    ran = run(world, capsys, str(file))
+    ran = run(world, capsys, "--ids", str(file))
     assert ran.code == Exit.DONE
     rows = list(csv.DictReader(io.StringIO(ran.out)))
     assert [row["userId"] for row in rows] == ["ann", "bob"]
@@ -123,7 +123,7 @@ def test_ids_from_stdin_may_begin_with_a_byte_order_mark(
     world: RegisterWorld, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"\xef\xbb\xbfP01\n")))
-    assert [one["userId"] for one in run(world, capsys, "-", "--json").json] == ["P01"]
+    assert [one["userId"] for one in run(world, capsys, "--ids", "-", "--json").json] == ["P01"]
 
 
 @pytest.mark.parametrize(

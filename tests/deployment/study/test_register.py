@@ -413,8 +413,8 @@ def test_for_signed_links_register_shows_no_link_without_a_signature(
     ran = register()
     assert "/next?" not in ran.out
     assert not re.search("[▀▄█]", ran.out)
-    assert "python -m deploy links --project maze --new 50" in ran.out
-    made = register_world.run(capsys, "links", "--project", "maze", "--new", "50")
+    assert "hippodrome links maze --new 50" in ran.out
+    made = register_world.run(capsys, "links", "maze", "--new", "50")
     assert made.out.count("&signature=") == 50
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,7 @@ def test_recorded_episodes_load_in_minari(tmp_path: Path, monkeypatch: pytest.Mo
         client.ask("close", instance_id=made)
     out = tmp_path / "out"
     formats = ("--format", "csv,parquet,minari", "--json")
-    assert main(["data", str(out), "--project", "gym", "--from", str(tmp_path / "data"), *formats]) == Exit.DONE
+    assert main(["data", "gym", "--to", str(out), "--from", str(tmp_path / "data"), *formats]) == Exit.DONE
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(out / "minari"))
     dataset = minari.load_dataset("gym-CartPole-v1-v0")
     episode = dataset[0]
@@ -59,9 +58,9 @@ def test_an_environment_without_whole_numbers_as_actions_is_not_named_as_a_datas
         client.ask("close", instance_id=made)
     command = [
         "data",
-        str(tmp_path / "out"),
-        "--project",
         "gym",
+        "--to",
+        str(tmp_path / "out"),
         "--from",
         str(tmp_path / "data"),
         "--format",
@@ -74,10 +73,8 @@ def test_an_environment_without_whole_numbers_as_actions_is_not_named_as_a_datas
 
 
 def test_the_command_of_the_documentation_converts_the_recordings() -> None:
-    (command,) = re.findall(r"^make data .*$", (ROOT / "docs/gym.md").read_text(), re.M)
-    done = subprocess.run([*shlex.split(command), "-n"], cwd=ROOT, capture_output=True, text=True, check=True)
-    _, _, arguments = done.stdout.splitlines()[-1].partition(" -m deploy data ")
-    assert shlex.split(arguments)[:6] == ["--from", "recordings", "--project", "gym", "--format", "parquet,minari"]
+    (command,) = re.findall(r"^hippodrome data .*$", (ROOT / "docs/gym.md").read_text(), re.M)
+    assert shlex.split(command)[2:] == ["gym", "--from", "recordings", "--format", "parquet,minari"]
 
 
 def test_each_environment_of_a_connection_is_recorded(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hippodrome.control.model.project import Project
 from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
 from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, good, look, show
+from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.operate.doctor import addresses, capacity, documents, images, safety
 from hippodrome.deployment.operate.doctor.check_context import Check, CheckContext
 from hippodrome.deployment.operate.doctor.play import MAX_BOTS, WITHIN
@@ -43,13 +44,9 @@ CHECKS: dict[str, Check] = {
 
 
 def command(
+    study: options.Study = None,
     *,
-    project: Annotated[
-        str | None,
-        typer.Option(
-            "--project", help="Look at this project: its id, or its folder; else at all live ones.", show_default=False
-        ),
-    ] = None,
+    every: options.All = False,
     at_once: Annotated[int, typer.Option("--at-once", min=1, help="How many servers a study may need together.")] = 20,
     rehearse: Annotated[
         bool, typer.Option("--rehearse", help="Also start and stop one real server; costs less than a cent.")
@@ -85,7 +82,7 @@ def command(
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
-    """Check whether a study can be held: a line for each check, with advice if something is wrong.
+    """Check whether a study, or with --all each live one, can be held: a line for each check, with advice.
 
     ✓ good, ! worth a look, ✗ participants would be affected. The exit code is 1 if there is a ✗. Nothing is changed,
     except with --rehearse, which starts a server without a participant and removes it; then only its ✗ count.
@@ -93,6 +90,7 @@ def command(
     """
     if play and not rehearse:
         raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
+    project = one_or_all(study, every)
     rehearsal: list[Finding] = []
     document: dict[str, Any] = {}
     account = open_account(profile, region)
@@ -156,7 +154,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
             look(
                 "stack",
                 f"{stack} works as before its last update, which failed.",
-                "`python -m deploy plan` says whether something is still to be changed.",
+                "`hippodrome plan` says whether something is still to be changed.",
             )
         )
     else:
@@ -164,7 +162,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
             look(
                 "stack",
                 f"{stack} is in {installation.status}.",
-                "`python -m deploy apply` finishes or repairs what was begun.",
+                "`hippodrome apply` finishes or repairs what was begun.",
             )
         )
     try:
@@ -184,7 +182,7 @@ def _version(account: Account, stack: str) -> Iterator[Finding]:
         yield look(
             "version",
             "The stack was made by another version of this command.",
-            "`python -m deploy plan` shows what differs.",
+            "`hippodrome plan` shows what differs.",
         )
 
 
@@ -193,20 +191,12 @@ def _plain(template: str) -> str:
     return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
 
 
-def _wanted(context: CheckContext, given: str | None) -> Project | None:
-    """Find the registered project with the id or folder `given`. Raises `Problem` if it is not registered."""
-    if given is None:
+def _wanted(context: CheckContext, project_id: str | None) -> Project | None:
+    """Find the registered project with this id; None: all are wanted. Raises `Problem` if it is not registered."""
+    if project_id is None:
         return None
-    registered = participants.registered_projects(context.platform.documents, [])
-    if not options.is_folder(given):
-        return participants.choose(registered, given)[0]
-    from hippodrome.deployment.core import project_folder  # noqa: PLC0415 - the checks of config.yml
-
-    project_id = project_folder.read(Path(given)).id
-    found = next((one for one in registered if one.id == project_id), None)
-    if found is None:
-        raise Problem(f"The project {project_id} is not registered.", f"Run `python -m deploy register {given}`.")
-    return found
+    (project,) = participants.choose(participants.registered_projects(context.platform.documents, []), project_id)
+    return project
 
 
 def _rehearse(context: CheckContext) -> list[Finding]:

@@ -30,14 +30,14 @@ def zone(context: CheckContext) -> Iterator[Finding]:
         yield bad(
             "hosted zone",
             str(problem),
-            "The servers' names are written there: run `python -m deploy apply` with --zone.",
+            "The servers' names are written there: run `hippodrome apply` with --zone.",
         )
         return
     if not found.holds(domain):
         yield bad(
             "hosted zone",
             f"{found.id} is for {found.domain}, not for {domain}.",
-            "Give `python -m deploy apply` its zone.",
+            "Give `hippodrome apply` its zone.",
         )
         return
     if context.delegation is None:
@@ -58,7 +58,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
     stack = Stack(context.account, context.installation.stack)
     arns = stack.ids_of("AWS::CertificateManager::Certificate")
     if not arns:
-        yield look("site certificate", "The stack has none.", "Bring it up to date with `python -m deploy apply`.")
+        yield look("site certificate", "The stack has none.", "Bring it up to date with `hippodrome apply`.")
     for arn in arns:
         found = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
         status, name = found["Status"], found["DomainName"]
@@ -74,7 +74,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
             yield bad(
                 "site certificate",
                 f"{name}: {status}.",
-                "See it in the ACM console, then run `python -m deploy apply`.",
+                "See it in the ACM console, then run `hippodrome apply`.",
             )
 
 
@@ -93,7 +93,7 @@ def site(context: CheckContext) -> Iterator[Finding]:
         yield bad("site", f"{address} cannot be reached: {type(error).__name__}.", "Look at the hosted zone first.")
         return
     if status >= 500:
-        yield bad("site", f"{address} answers {status}.", "See `python -m deploy logs next_step --errors`.")
+        yield bad("site", f"{address} answers {status}.", "See `hippodrome logs --all --function next_step --errors`.")
     else:
         yield good("site", f"{address} answers.")
 
@@ -124,7 +124,7 @@ def authorities() -> ssl.SSLContext:
 
 def certificate(context: CheckContext) -> Iterator[Finding]:
     """Check whether the servers' wildcard certificate is in place, valid, and renewed in time."""
-    order = "Order one: `python -m deploy certificate --production`."
+    order = "Order one: `hippodrome certificate --production`."
     try:
         found = snapshot.certificate(context.installation, context.platform.documents, context.now)
     except Problem as problem:
@@ -144,13 +144,13 @@ def certificate(context: CheckContext) -> Iterator[Finding]:
         yield bad(
             "certificate",
             f"{found.days_left} days left, and it was not renewed.",
-            f"{order} See `python -m deploy logs renew_certificate --errors`.",
+            f"{order} See `hippodrome logs --all --function renew_certificate --errors`.",
         )
     elif found.overdue(context.now):
         yield look(
             "certificate",
             f"{found.days_left} days left: it should be renewed by now.",
-            "See `python -m deploy logs renew_certificate`.",
+            "See `hippodrome logs --all --function renew_certificate`.",
         )
     else:
         yield good("certificate", f"{', '.join(found.names)}: {found.days_left} days left.")

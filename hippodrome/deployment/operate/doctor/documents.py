@@ -63,7 +63,7 @@ def _secret(context: CheckContext) -> Iterator[Finding]:
         yield bad(
             "secret",
             f"{secret.KEY} is gone: pages answer with an error.",
-            f"{OLDER}. Else `python -m deploy register` makes another: signed links and completion codes change.",
+            f"{OLDER}. Else `hippodrome register` makes another: signed links and completion codes change.",
         )
 
 
@@ -78,7 +78,7 @@ def _servers(context: CheckContext) -> Iterator[Finding]:
         "servers",
         f"{count(records.unreadable, 'record')} cannot be read ({', '.join([*shown, *more])}): these participants get "
         "no server, and the resources of their servers are not removed.",
-        f"{OLDER}; or delete it, then run `python -m deploy stop`, which ends servers without a record.",
+        f"{OLDER}; or delete it, then run `hippodrome stop --all`, which ends servers without a record.",
     )
 
 
@@ -89,7 +89,7 @@ def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
         yield bad(
             check,
             f"{limits.server_slots_key(project.id)} cannot be read, so no server of this project starts.",
-            f"{OLDER}; or delete it while none of its servers runs (`python -m deploy stop --project {project.id}`): "
+            f"{OLDER}; or delete it while none of its servers runs (`hippodrome stop {project.id}`): "
             "the count begins anew, and with it the hours of maxServerHours.",
         )
     limited = project.max_participants is not None
@@ -105,7 +105,7 @@ def _shared(documents: Documents, project: Project) -> Iterator[Finding]:
         yield look(
             check,
             f"{warm_pool.pool_key(project.id)} cannot be read: it is made anew, and its warm servers are replaced.",
-            "Nothing needs to be done; if it comes back, see `python -m deploy logs sweep`.",
+            "Nothing needs to be done; if it comes back, see `hippodrome logs --all --function sweep`.",
         )
 
 
@@ -116,7 +116,7 @@ def _sessions(documents: Documents, project: Project) -> Iterator[Finding]:
         yield look(
             check,
             f"{key} cannot be read: it is made anew, and servers that were started ahead are replaced.",
-            "Nothing needs to be done; if it comes back, see `python -m deploy logs sweep`.",
+            "Nothing needs to be done; if it comes back, see `hippodrome logs --all --function sweep`.",
         )
     entries = (entry for entry in documents.list(sessions_folder(project.id)) if entry.key.endswith("/session.json"))
     read = _read_latest(documents, entries, parse)
@@ -207,4 +207,4 @@ def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Find
 
 
 def _again(project: Project) -> str:
-    return f"Mend it in the folder of {project.id} (`make check` shows the line), and register the project again."
+    return f"Mend it in the folder of {project.id} (`hippodrome check` shows the line), and register the project again."

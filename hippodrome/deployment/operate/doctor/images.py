@@ -17,15 +17,13 @@ from hippodrome.deployment.study.definition import STOP_TIMEOUT, port
 
 OLD = 120  # days after which an image's packages probably need updates
 MAX_RUNTIME = 1440  # minutes, the most that `apply --max-runtime` takes
-AGAIN = "Run `python -m deploy register` in the project's folder."
+AGAIN = "Run `hippodrome register` in the project's folder."
 
 
 def projects(context: CheckContext) -> Iterator[Finding]:
     """Check whether the servers of each live project, or of the wanted one, can start."""
     if not context.projects:
-        yield look(
-            "projects", "None is live.", "`python -m deploy register` in a project's folder opens it to participants."
-        )
+        yield look("projects", "None is live.", "`hippodrome register` in a project's folder opens it to participants.")
     for project in context.projects:
         if project.game_steps:
             yield from _project(context, project)
@@ -40,7 +38,7 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
             check,
             f"maxRuntime is {project.max_runtime} minutes; the installation stops servers after "
             f"{context.platform.settings.max_runtime}.",
-            "Give `python -m deploy apply` a longer --max-runtime, or the project a shorter one.",
+            "Give `hippodrome apply` a longer --max-runtime, or the project a shorter one.",
         )
     yield from _warm(context, project, check)
     if not project.task_definition:
@@ -88,7 +86,7 @@ def _warm(context: CheckContext, project: Project, check: str) -> Iterator[Findi
         check,
         f"{effect}: the installation stops servers after {settings.max_runtime} minutes, and maxRuntime is "
         f"{project.max_runtime} of them.",
-        f"Give `python -m deploy apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
+        f"Give `hippodrome apply` --max-runtime {needed}, or register the project with a shorter maxRuntime "
         "or warmServers: 0."
         if needed <= MAX_RUNTIME
         else "Register the project with a shorter maxRuntime or warmServers: 0.",

@@ -110,7 +110,7 @@ class Rehearsal:
             if record is None and seconds > CLAIM:
                 raise CheckFailed(
                     f"No function acted on the start message for {CLAIM:.0f} seconds.",
-                    "See `python -m deploy logs start_server`, and the dead letters of its queue.",
+                    "See `hippodrome logs --all --function start_server`, and the dead letters of its queue.",
                 )
             if seconds > WAIT:
                 raise self._late(record)
@@ -123,18 +123,19 @@ class Rehearsal:
                 return CheckFailed(
                     f"Its task was started {WAIT:.0f} seconds ago, and no event of it has arrived.",
                     "See the task in the ECS console; if it runs, its event is missing: "
-                    "`python -m deploy logs task_changed`.",
+                    "`hippodrome logs --all --function task_changed`.",
                 )
             return CheckFailed(
                 f"There is no task after {WAIT:.0f} seconds.",
-                "It was not run, or it ended at once: see `python -m deploy logs start_server` and `… logs trial`.",
+                "It was not run, or it ended at once: see `hippodrome logs --all --function start_server` and "
+                "`… --function trial`.",
             )
         if record is not None and record.state is ServerState.NAMING:
             return CheckFailed(
                 f"It runs, and its name is not known everywhere after {WAIT:.0f} seconds.",
-                "See `python -m deploy logs task_changed`.",
+                "See `hippodrome logs --all --function task_changed`.",
             )
-        return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `python -m deploy logs --errors`.")
+        return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `hippodrome logs --all --errors`.")
 
     def _visit(self) -> list[Finding]:
         """Connect to the server by its name, as a browser does, which proves DNS, the port, TLS and the certificate."""
@@ -180,7 +181,7 @@ class Rehearsal:
                 bad(
                     CHECK,
                     f"Not gone after {LEAVE:.0f} seconds: {', '.join(left)}.",
-                    "Run `python -m deploy stop`; the sweep removes it too.",
+                    "Run `hippodrome stop --all`; the sweep removes it too.",
                 )
             ]
         ran = self._record is not None and self._record.running is not None
@@ -191,7 +192,7 @@ class Rehearsal:
                 look(
                     CHECK,
                     "No function has acted on the stop message, so this command stopped the server.",
-                    "See `python -m deploy logs stop_server`.",
+                    "See `hippodrome logs --all --function stop_server`.",
                 )
             )
         return found
@@ -232,7 +233,7 @@ def write_session(documents: Documents, project_id: str, session: SessionDocumen
 
 def _why(record: Server) -> str:
     cause = causes.parse_cause(record.cause)
-    return cause.sentence if cause else "See `python -m deploy logs --errors`."
+    return cause.sentence if cause else "See `hippodrome logs --all --errors`."
 
 
 def project_for(context: CheckContext) -> Project | None:

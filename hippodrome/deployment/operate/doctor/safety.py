@@ -12,7 +12,7 @@ from hippodrome.deployment.core.finding import Finding, bad, good, look
 from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 
-APPLY = "Run `python -m deploy apply`: it puts this right."
+APPLY = "Run `hippodrome apply`: it puts this right."
 
 
 def bucket(context: CheckContext) -> Iterator[Finding]:
@@ -87,7 +87,7 @@ def queues(context: CheckContext) -> Iterator[Finding]:
         yield bad(
             "queues",
             f"Messages that could not be dealt with: {', '.join(full)}.",
-            "`python -m deploy logs --errors` says why; SQS's console can send them again (redrive).",
+            "`hippodrome logs --all --errors` says why; SQS's console can send them again (redrive).",
         )
     else:
         waiting = sum(queue.waiting for queue in found)
@@ -120,4 +120,4 @@ def listeners(context: CheckContext) -> Iterator[Finding]:
     if confirmed:
         yield good("alarm e-mail", f"Alarms go to {', '.join(confirmed)}.")
     elif not pending:
-        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `python -m deploy apply` an --email.")
+        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `hippodrome apply` an --email.")

@@ -65,7 +65,7 @@ class ImageRepository:
             if errors.code(error) != "RepositoryNotFoundException":
                 raise
             raise Problem(
-                f"The repository {self.name} is not there any more.", "Run `python -m deploy apply` to make it again."
+                f"The repository {self.name} is not there any more.", "Run `hippodrome apply` to make it again."
             ) from None
         return Images(self.uri, sorted(found))
 

@@ -21,8 +21,9 @@ LIMIT_BYTES = 1024**3  # the size of a project's own files, which each server pu
 LIMIT_FILES = 20_000
 
 # Left out at the top of the folder only. A server gets config.yml when it starts (TRIAL), and the bucket has the pages.
-# `make run` keeps participants' data in `data`, and `make try` keeps its bots' data in `data-try`.
-_TOP = {*layout.CONFIGS, *layout.PAGES, "data", "data-try", REQUIREMENTS}
+# `run` keeps participants' data in `data`; `try` and `data` write to folders that begin with `data-`; `erase` writes
+# receipts.
+_TOP = (*layout.CONFIGS, *layout.PAGES, "data", "data-*", "erased-*.json", REQUIREMENTS)
 _ANYWHERE = {"__pycache__", "node_modules"}
 # Left out of the folder App of a clone of HIPPO Gym: its recordings, and the certificate that updateProject.py fetches.
 # They may still be there if agent.py was moved to the folder above.
@@ -153,14 +154,18 @@ def _never_included(root: Path, path: Path) -> bool:
         path.name.startswith(".")
         or path.name in _ANYWHERE
         or fnmatch.fnmatchcase(path.name, "*.py[co]")
-        or (path.parent == root and path.name in _TOP)
+        or (path.parent == root and _at_top(path))
         or (path.parent in _apps(root) and _left_in_app(root, path))
     )
 
 
 def _left_in_app(root: Path, path: Path) -> bool:
     """Whether a file or folder in App/ is left out. If agent.py is in App/, App/ counts as the top of the folder."""
-    return path.name in _OF_HIPPO or (path.name in _TOP and path.parent == layout.agent_folder(root))
+    return path.name in _OF_HIPPO or (_at_top(path) and path.parent == layout.agent_folder(root))
+
+
+def _at_top(path: Path) -> bool:
+    return any(fnmatch.fnmatchcase(path.name, pattern) for pattern in _TOP)
 
 
 def _apps(root: Path) -> list[Path]:

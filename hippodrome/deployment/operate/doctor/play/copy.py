@@ -159,7 +159,7 @@ def remove(
         progress(f"removing what is left of bot {number} of {len(known)}")
         eraser = Eraser(account, installation, project_id, user, late=False)
         if eraser.run():
-            raise Problem("Something of a bot is still there.", f"Run `python -m deploy stop --project {project_id}`.")
+            raise Problem("Something of a bot is still there.", f"Run `hippodrome stop {project_id}`.")
         deleted += sum(sum(counts.values()) - counts["bytes"] for counts in eraser.receipt.deleted.values())
     progress("removing the pages")
     return deleted + bucket.delete(bucket.versions(f"{project_id}/"))

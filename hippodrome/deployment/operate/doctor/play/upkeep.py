@@ -67,11 +67,13 @@ class Timer:
             self._ready,
             "waiting for the server that its timer is to end",
             READY,
-            CheckFailed("Its server was not ready in time.", "See `python -m deploy logs start_server`."),
+            CheckFailed("Its server was not ready in time.", "See `hippodrome logs --all --function start_server`."),
         )
         self.record = record
         if self._set_for(record) != record.deadline.astimezone(UTC).replace(microsecond=0):
-            raise CheckFailed("It has no timer at its deadline.", "See `python -m deploy logs start_server`.")
+            raise CheckFailed(
+                "It has no timer at its deadline.", "See `hippodrome logs --all --function start_server`."
+            )
         at = platform.now() + SOON
         platform.timers.set(
             record.name, at, to_message(StopServer(scene.copy.id, self.user, record.attempt, Reason.DEADLINE))
@@ -81,17 +83,18 @@ class Timer:
             "waiting for the timer to fire",
             FIRED,
             CheckFailed(
-                "Its timer has not fired.", "See `python -m deploy logs stop_server`, and the schedule's role."
+                "Its timer has not fired.",
+                "See `hippodrome logs --all --function stop_server`, and the schedule's role.",
             ),
         )
         if closed.reason is not Reason.DEADLINE:
-            raise CheckFailed(f"It ended before its timer fired: {closed.reason}.", "See `python -m deploy status`.")
+            raise CheckFailed(f"It ended before its timer fired: {closed.reason}.", "See `hippodrome status --all`.")
         late = ((closed.closed or at) - at).total_seconds()
         scene.wait(
             lambda: None if left(scene, self.user) else True,
             "waiting until its task is gone",
             TASK_GONE,
-            CheckFailed("Its timer fired, and something of the server is left.", "Run `python -m deploy stop`."),
+            CheckFailed("Its timer fired, and something of the server is left.", "Run `hippodrome stop --all`."),
         )
         self.record = closed
         text = f"It stood at the deadline; moved nearer, it ended the server {late:.0f} s after its time."
@@ -137,12 +140,14 @@ def sweep(scene: RehearsalContext, closed: Server | None) -> None:
     payload = answer["Payload"].read()
     if answer.get("FunctionError"):
         kind = _type_of(payload)
-        raise CheckFailed(f"The sweep failed{kind}.", "See `python -m deploy logs sweep --errors`.")
+        raise CheckFailed(f"The sweep failed{kind}.", "See `hippodrome logs --all --function sweep --errors`.")
     scene.wait(
         lambda: None if left(scene, closed.user_id) else True,
         "waiting until the leftovers are gone",
         SEEN,
-        CheckFailed("The sweep has left something of a closed server.", "See `python -m deploy logs sweep`."),
+        CheckFailed(
+            "The sweep has left something of a closed server.", "See `hippodrome logs --all --function sweep`."
+        ),
     )
     scene.transcript.good("sweep", "It removed a timer and a name that a closed server had left.")
 
@@ -168,7 +173,7 @@ def alarm(scene: RehearsalContext) -> None:
         if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
     ]
     if not quiet:
-        raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `python -m deploy apply`.")
+        raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `hippodrome apply`.")
     chosen = min(quiet, key=lambda one: str(one["AlarmName"]))
     name, before, began = chosen["AlarmName"], chosen.get("StateValue", "OK"), datetime.now(UTC) - timedelta(seconds=5)
     cloudwatch.set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason=REASON)
@@ -198,7 +203,7 @@ def alarm(scene: RehearsalContext) -> None:
             "alarm",
             Mark.LOOK,
             "An alarm was set off and reached its topic, which has no subscriber.",
-            "Give `python -m deploy apply` an --email, and follow the link in AWS's e-mail.",
+            "Give `hippodrome apply` an --email, and follow the link in AWS's e-mail.",
         )
 
 

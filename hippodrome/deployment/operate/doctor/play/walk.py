@@ -33,7 +33,7 @@ KILLED = "Rehearsal: killed, as when a Spot task is interrupted"
 """The reason that StopTask gets. ECS puts it into the task's `stoppedReason` (ECS API Reference, StopTask). It counts
 as a Spot interruption in `hippodrome/control/model/messages.py`, whatever the stop code: the server is lost."""
 
-LOGS = "See `python -m deploy logs --errors`."
+LOGS = "See `hippodrome logs --all --errors`."
 
 
 class Walk:
@@ -77,7 +77,7 @@ class Walk:
             scene.transcript.bad(
                 "links",
                 f"A link without its own signature was answered with {statuses}.",
-                "Run `python -m deploy apply`.",
+                "Run `hippodrome apply`.",
             )
 
     def site(self) -> None:
@@ -163,7 +163,7 @@ class Walk:
             transcript.bad(
                 "servers",
                 f"{len(waited)} of {len(self.bots)} bots got a server ({', '.join(reasons) or 'none was asked for'}).",
-                "See `python -m deploy logs start_server` and `… logs task_changed`.",
+                "See `hippodrome logs --all --function start_server` and `… --function task_changed`.",
             )
             return
         spot = sum(record.spot for record in self.ran)
@@ -186,7 +186,8 @@ class Walk:
         self._scene.transcript.bad(
             "game",
             f"{done} of {len(plays)} games came to their end, with {frames} frames: {troubles or 'nothing was said'}.",
-            "See `python -m deploy logs trial`. If no connection succeeds, this network may close the servers' port.",
+            "See `hippodrome logs --all --function trial`. If no connection succeeds, this network may close the "
+            "servers' port.",
         )
 
     def killed(self) -> None:
@@ -201,7 +202,7 @@ class Walk:
             transcript.bad(
                 "killed",
                 f"The task was killed, and its server not replaced: {record.reason or record.state}.",
-                "See `python -m deploy logs task_changed`.",
+                "See `hippodrome logs --all --function task_changed`.",
             )
             return
         again = (record.ready or record.requested) - (lost.closed or record.requested)
@@ -215,7 +216,7 @@ class Walk:
     def end(self) -> None:
         """Check that the stop step ended every server, and that nothing of the servers is left."""
         scene, users = self._scene, [bot.report.user_id for bot in self.all]
-        late = CheckFailed("Something is left of a server: ", "Run `python -m deploy stop`; the sweep removes it too.")
+        late = CheckFailed("Something is left of a server: ", "Run `hippodrome stop --all`; the sweep removes it too.")
         for bot in self.all:
             if not bot.report.finished:  # it has not come to the step that stops its server
                 stop = StopServer(scene.copy.id, bot.report.user_id)
@@ -234,7 +235,7 @@ class Walk:
         reasons = sorted({str(record.reason) for record in self.ran})
         wanted = {Reason.STOPPED, Reason.ENDED}
         if not all(record.reason in wanted for record in self.ran):
-            scene.transcript.bad("end", f"The servers ended as {', '.join(reasons)}.", "See `python -m deploy status`.")
+            scene.transcript.bad("end", f"The servers ended as {', '.join(reasons)}.", "See `hippodrome status --all`.")
             return
         scene.transcript.good(
             "end", f"{count(len(self.ran), 'server')} ended ({', '.join(reasons)}); nothing of them is left."
@@ -275,7 +276,9 @@ class Walk:
             missing.append(f"{counts['participants']} participants")
         if missing:
             scene.transcript.bad(
-                "data", f"Of {len(self.all)} bots: {'; '.join(missing)}.", "See `python -m deploy logs trial`."
+                "data",
+                f"Of {len(self.all)} bots: {'; '.join(missing)}.",
+                "See `hippodrome logs --all --function trial`.",
             )
             return
         answers = sum(one.answers + one.games for one in found)

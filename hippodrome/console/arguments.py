@@ -1,4 +1,4 @@
-"""The argument with which the commands for this machine name a study."""
+"""The argument with which commands that read a study's folder name it."""
 
 from __future__ import annotations
 
