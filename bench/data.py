@@ -1,4 +1,4 @@
-"""Measures `python -m deploy data`, with a bucket on moto's server in a process of its own.
+"""Measures `hippodrome data`, with a bucket on moto's server in a process of its own.
 
 `python -m bench.data N` is that server: it fills a bucket with N participants, prints the environment for its clients,
 and ends when its input ends.

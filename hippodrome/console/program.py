@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 import shlex
 import shutil
@@ -22,7 +21,6 @@ def as_typed(text: str) -> str:
     return _SHOWN.sub(f"{_program()} ".replace("\\", r"\\"), text) if "hippodrome " in text else text
 
 
-@functools.cache
 def _program() -> str:
     """`hippodrome`, or where it lies if it is beside this Python and not on PATH."""
     ours = Path(sys.executable).with_name("hippodrome")

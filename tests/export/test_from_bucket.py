@@ -1,4 +1,4 @@
-"""`deploy data` on a bucket, also on one that has outlived its installation."""
+"""`hippodrome data` on a bucket, also on one that has outlived its installation."""
 
 from __future__ import annotations
 
@@ -232,4 +232,4 @@ def test_a_run_that_was_interrupted_twice_is_finished_by_the_next(world: Install
         assert whole.json["run"]["new"] == dry.json["new"]
     assert len(rows(out / "answers.csv")) == 30
     assert len(rows(out / "episodes.csv")) == 29
-    assert process(environment(), "data", str(out), "--check").code == Exit.DONE
+    assert process(environment(), "data", "--to", str(out), "--check").code == Exit.DONE

@@ -1,4 +1,4 @@
-"""`deploy data` on a folder: runs that repeat, are interrupted, or find damaged files or broken input."""
+"""`hippodrome data` on a folder: runs that repeat, are interrupted, or find damaged files or broken input."""
 
 from __future__ import annotations
 
@@ -638,4 +638,7 @@ def test_another_missing_package_is_no_traceback(place: Place, monkeypatch: Any)
 
     monkeypatch.setattr(Folder, "list", without)
     ran = place.run()
-    assert (ran.code, "The package msgspec is not installed." in ran.err) == (Exit.FAILED, True)
+    assert (ran.code, "`hippodrome data` needs the package msgspec, which is not installed." in ran.err) == (
+        Exit.FAILED,
+        True,
+    )

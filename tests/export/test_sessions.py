@@ -1,4 +1,4 @@
-"""Sessions in `deploy data`: each recording is read once, and each row names its participant."""
+"""Sessions in `hippodrome data`: each recording is read once, and each row names its participant."""
 
 from __future__ import annotations
 

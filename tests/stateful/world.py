@@ -449,7 +449,7 @@ class World:
                 self.wrong.append("sweep: nothing has gone wrong, and there are names that were left over")
 
     def stop_all(self, fault: FaultAt | None = None) -> None:
-        """Stop all open servers at once from the administrator's machine, as `deploy stop` does."""
+        """Stop all open servers at once from the administrator's machine, as `hippodrome stop` does."""
         self.calm = False
         wanted = [r for r in self.records() if not r.is_closed]
         stops = [StopServer(r.project_id, r.user_id, r.attempt, Reason.STOPPED) for r in wanted]

@@ -1,4 +1,4 @@
-"""Turns errors of AWS, of the network and of missing packages into sentences with advice."""
+"""Turns errors of AWS and of the network into sentences with advice."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SLOW_DOWN = {"Throttling", "ThrottlingException", "TooManyRequestsException", "
 
 
 def problem_from(error: BaseException) -> Problem | None:
-    """Explain an error of AWS, the network or a missing package by a problem with advice; None for other errors."""
+    """Explain an error of AWS or the network by a problem with advice; None for other errors."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, boto.ClientError):
@@ -56,11 +56,6 @@ def problem_from(error: BaseException) -> Problem | None:
             f"The AWS library refused: {error}.",
             "If that names an option or a setting of ~/.aws/config, correct it. Otherwise run the command again with "
             "HIPPODROME_DEBUG=1 and send us what it prints.",
-        )
-    if isinstance(error, ModuleNotFoundError):
-        return Problem(
-            f"The package {error.name} is not installed.",
-            "Run the command with make, such as `hippodrome data`: it installs what is needed into .venv/.",
         )
     return None
 

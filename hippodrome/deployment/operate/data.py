@@ -92,15 +92,15 @@ def command(
     if from_ is not None and (bucket is not None or aws):
         other = "--bucket" if bucket is not None else "--aws"
         raise Problem(f"--from and {other} name two places.", "Give one of the two.", exit_code=Exit.MISUSE)
-    study = selected(study_named)
     if check:
-        return _check(to or folder_for(study, from_), as_json)
+        return _check(to or folder_for(selected(study_named), from_), as_json)
     chosen = frozenset(part.strip().lower() for part in formats.split(",") if part.strip())
     if not chosen or not chosen <= set(FORMATS):
         raise Problem(f"--format {formats}: there are {', '.join(FORMATS)}.")
     if identities not in (None, "apart"):
         raise Problem(f"--identities {identities}: there is only `apart`.")
     _packages(chosen)
+    study = selected(study_named)
     undecided = from_ is None and bucket is None and not aws  # no option says where the data are
     local = place_of_data(study, "hippodrome data") if undecided else from_
     target = to or folder_for(study, local)

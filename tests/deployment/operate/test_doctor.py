@@ -1,4 +1,4 @@
-"""`deploy doctor`: each problem that would stop a study is a line, with its remedy."""
+"""`hippodrome doctor`: each problem that would stop a study is a line, with its remedy."""
 
 from __future__ import annotations
 
@@ -463,7 +463,7 @@ def test_a_study_on_another_port_than_the_installation_is_a_remark(world: Instal
     world.register(project(world, server_port=5000))
     (found,) = [one for one in images.projects(context(account)) if one.mark is Mark.LOOK]
     assert found.text == "its servers listen on port 5000, and the installation's port is 443."
-    assert "deploy register" in found.advice
+    assert "hippodrome register" in found.advice
     world.change(ServerPort="5000")
     assert {one.mark for one in images.projects(context(account))} == {Mark.GOOD}
 
@@ -712,7 +712,7 @@ def test_a_rehearsal_decides_how_the_command_ends(
 
 def test_a_rehearsal_without_a_live_project_is_bad(world: Installed, capsys: Any) -> None:
     world.register(project(world, live=False))
-    assert doctor(world, capsys, "--rehearse")["rehearsal"][0] == "bad"
+    assert doctor(world, capsys, "--all", "--rehearse")["rehearsal"][0] == "bad"
 
 
 # As a process
@@ -723,7 +723,7 @@ def test_as_a_process(world: Installed) -> None:
     with world.served() as env:
         ran = process(env, "doctor", "--all", "--only-aws", "--json")
         plain = process(env, "doctor", "--all", "--only-aws")
-        nowhere = process({**env, "AWS_REGION": "eu-west-1"}, "doctor", "--json")
+        nowhere = process({**env, "AWS_REGION": "eu-west-1"}, "doctor", "--all", "--json")
     found = {one["check"]: one for one in ran.json["checks"]}
     # Moto has neither quotas nor a policy that asks for TLS.
     assert ran.code == plain.code == nowhere.code == Exit.FAILED

@@ -174,13 +174,16 @@ def test_a_second_run_says_that_there_is_nothing(world: Installed, capsys: Any) 
     assert json.loads(Path("again.json").read_text())["projects"][0]["deleted"] == {}
 
 
-def test_a_mistyped_participant_needs_no_confirmation_and_changes_nothing(world: Installed, capsys: Any) -> None:
+def test_a_mistyped_participant_needs_no_confirmation_and_changes_nothing(
+    world: Installed, capsys: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = versions(world)
     assert world.run(capsys, "erase", "no-such-person", "maze").code == Exit.DONE
     assert versions(world) == before
     assert world.run(capsys, "erase", "../ann", "maze").code == Exit.FAILED
-    assert world.run(capsys, "erase", ANN, "maze", "--everywhere").code == Exit.FAILED
-    assert world.run(capsys, "erase", ANN).code == Exit.FAILED  # there is no config.yml here
+    assert world.run(capsys, "erase", ANN, "maze", "--everywhere").code == Exit.MISUSE
+    monkeypatch.chdir(tmp_path)
+    assert world.run(capsys, "erase", ANN).code == Exit.MISUSE  # there is no config.yml here
     dry = world.run(capsys, "erase", "no-such-person", "maze", "--dry-run")
     assert (dry.code, dry.out) == (Exit.DONE, "There is nothing of this participant in maze.\n")
 

@@ -37,7 +37,7 @@ LABEL = ids.server_label("maze", ANN)
 
 
 class Machine:
-    """A study's folder with data of `make run`."""
+    """A study's folder with data of `hippodrome run`."""
 
     def __init__(self, tmp: Path, capsys: Any) -> None:
         self.data, self.tmp, self._capsys = tmp / "data", tmp, capsys
@@ -119,7 +119,7 @@ def test_a_study_that_is_running_is_not_changed(machine: Machine) -> None:
         fcntl.flock(file, fcntl.LOCK_EX)
         ran = machine.erase("--yes")
     assert ran.code == Exit.FAILED
-    assert "End `make run` with Ctrl-C" in ran.err
+    assert "End `hippodrome run` with Ctrl-C" in ran.err
     assert machine.contents() == before
     assert machine.erase("--yes").code == Exit.DONE
 
@@ -136,7 +136,7 @@ def test_erase_first_finishes_what_a_killed_run_has_left(machine: Machine, left:
     else:
         put(f"spool/{recording_key()}.part", b"")
     ran = machine.erase("--yes")
-    assert (ran.code, "Start `make run` once more" in ran.err) == (Exit.FAILED, True)
+    assert (ran.code, "Start `hippodrome run` once more" in ran.err) == (Exit.FAILED, True)
     assert machine.contents() == before
 
 
@@ -309,7 +309,7 @@ def test_a_dry_run_and_a_missing_yes_change_nothing(machine: Machine) -> None:
     dry = machine.erase("--dry-run", "--json")
     assert (dry.code, dry.json["found"]) == (Exit.CHANGES, 7)
     assert machine.erase().code == Exit.DECLINED
-    assert machine.erase("--everywhere").code == Exit.FAILED
+    assert machine.erase("--everywhere").code == Exit.MISUSE
     assert machine.contents() == before
     assert main(["erase", ANN, "maze", "--from", str(machine.tmp / "none")]) == Exit.FAILED
 

@@ -156,7 +156,7 @@ def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path,
     assert world.run(capsys, *made).code == Exit.DONE
     assert erase(world, capsys).code == Exit.DONE
     for folder in (out, tmp_path / "anew"):
-        ran = world.run(capsys, "data", str(folder), *made[2:])
+        ran = world.run(capsys, "data", "maze", "--to", str(folder), *made[4:])
         assert ran.code == Exit.DONE, ran.err
         assert [row["participant"] for row in rows(folder / "answers.csv")] == [BOB]
         assert [(row["participant"], row["score"]) for row in rows(folder / "episodes.csv")] == [

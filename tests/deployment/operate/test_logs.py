@@ -1,4 +1,4 @@
-"""`deploy logs`: it shows the lines of all functions and servers in the order of time."""
+"""`hippodrome logs`: it shows the lines of all functions and servers in the order of time."""
 
 from __future__ import annotations
 

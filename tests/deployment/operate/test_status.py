@@ -1,4 +1,4 @@
-"""`deploy status`: where participants are and which servers run, from listings, without any id of a participant."""
+"""`hippodrome status`: where participants are and which servers run, from listings, without any id of a participant."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def test_without_cost_explorer_only_the_bill_is_missing(world: Installed, capsys
     world.participant("alice")
     for _ in range(2):
         world.fail("ce:GetCostAndUsage", "AccessDeniedException", status=403)
-    found = look(world, capsys, "--billed")
+    found = look(world, capsys, "--all", "--billed")
     assert found["projects"][0]["participants"] == 1
     assert (found["billedThisMonth"], list(found["problems"])) == (None, ["bill"])
     text = " ".join(world.run(capsys, "status", "--all", "--billed").out.split())

@@ -1,4 +1,4 @@
-"""`deploy stop`: it stops every server, leaves nothing of it, and can be repeated."""
+"""`hippodrome stop`: it stops every server, leaves nothing of it, and can be repeated."""
 
 from __future__ import annotations
 

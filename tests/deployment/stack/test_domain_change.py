@@ -48,7 +48,7 @@ def test_running_servers_stop_a_change_of_their_domain(world: Installed, moved: 
     world.record("alice")
     with pytest.raises(Problem, match=r"Servers run below games\.example\.org") as caught:
         domain_change.check(prepared(world, **moved))
-    assert "deploy stop" in caught.value.advice
+    assert "hippodrome stop --all" in caught.value.advice
     world.record("alice", ServerState.CLOSED)
     domain_change.check(prepared(world, **moved))
 
@@ -59,7 +59,7 @@ def test_running_servers_stop_a_change_of_the_site(world: Installed, state: Serv
     for moved in (prepared(world, SiteHost="lab"), prepared(world, RootDomain="pilot.example.org")):
         with pytest.raises(Problem, match=r"by way of study\.example\.org, which would be gone") as caught:
             domain_change.check_site(moved)
-        assert "deploy stop" in caught.value.advice
+        assert "hippodrome stop --all" in caught.value.advice
         assert caught.value.details == ("1 of them",)
     with world.recording() as calls:
         domain_change.check_site(prepared(world))
@@ -76,7 +76,7 @@ def test_running_servers_stop_a_change_of_the_network(world: Installed) -> None:
     assert calls == []
     with pytest.raises(Problem, match="lose their way out") as caught:
         domain_change.check_network(prepared(world, VpcId="vpc-1"))
-    assert "deploy stop" in caught.value.advice
+    assert "hippodrome stop --all" in caught.value.advice
     world.record("alice", ServerState.CLOSED)
     domain_change.check_network(prepared(world, VpcId="vpc-1"))
 

@@ -1,4 +1,4 @@
-"""`deploy links`: the links that it prints open the study, and changed ones do not."""
+"""`hippodrome links`: the links that it prints open the study, and changed ones do not."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_new_ids_are_all_different(world: RegisterWorld, capsys: Any) -> None:
 @pytest.mark.parametrize("text", ["ann@example.org\n", "userId,link\n", "a b\n", "x" * 65])
 def test_an_invalid_id_is_reported_with_its_line(world: RegisterWorld, capsys: Any, tmp_path: Path, text: str) -> None:
     (tmp_path / "ids.txt").write_text(f"ann\n{text}")
-    ran = run(world, capsys, str(tmp_path / "ids.txt"))
+    ran = run(world, capsys, "--ids", str(tmp_path / "ids.txt"))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert "ids.txt:2" in ran.err
     assert text.strip() not in ran.err
@@ -86,7 +86,7 @@ def test_a_heading_is_not_invited_and_the_researcher_is_told(
     world: RegisterWorld, capsys: Any, tmp_path: Path, heading: str
 ) -> None:
     (tmp_path / "ids.csv").write_text(f"{heading}\r\nP01\r\n")
-    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    ran = run(world, capsys, "--ids", str(tmp_path / "ids.csv"), "--json")
     assert [one["userId"] for one in ran.json] == ["P01"]
     assert "ids.csv:1: this line is taken as the heading" in " ".join(ran.err.split())
 
@@ -94,7 +94,7 @@ def test_a_heading_is_not_invited_and_the_researcher_is_told(
 @pytest.mark.parametrize("first", ["david", "ann", "P01", "5f3c", "astrid", "userid7"])
 def test_an_id_in_the_first_line_is_no_heading(world: RegisterWorld, capsys: Any, tmp_path: Path, first: str) -> None:
     (tmp_path / "ids.csv").write_text(f"{first}\nP02\n")
-    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    ran = run(world, capsys, "--ids", str(tmp_path / "ids.csv"), "--json")
     assert [one["userId"] for one in ran.json] == [first, "P02"]
 
 
@@ -115,7 +115,7 @@ def test_ids_are_read_as_spreadsheets_write_them(
     world: RegisterWorld, capsys: Any, tmp_path: Path, data: bytes
 ) -> None:
     (tmp_path / "ids.csv").write_bytes(data)
-    ran = run(world, capsys, str(tmp_path / "ids.csv"), "--json")
+    ran = run(world, capsys, "--ids", str(tmp_path / "ids.csv"), "--json")
     assert [one["userId"] for one in ran.json] == ["P01", "P02"]
 
 
@@ -141,7 +141,7 @@ def test_a_line_with_more_or_less_than_an_id_is_refused(
     world: RegisterWorld, capsys: Any, tmp_path: Path, line: str, said: str
 ) -> None:
     (tmp_path / "ids.csv").write_text(f"P01\n{line}\n")
-    ran = run(world, capsys, str(tmp_path / "ids.csv"))
+    ran = run(world, capsys, "--ids", str(tmp_path / "ids.csv"))
     assert (ran.code, ran.out) == (Exit.FAILED, "")
     assert f"ids.csv:2: {said}" in " ".join(ran.err.split())
 
@@ -150,7 +150,7 @@ def test_links_needs_participants_and_a_known_project_and_says_if_links_are_not_
     world: RegisterWorld, capsys: Any, tmp_path: Path
 ) -> None:
     assert run(world, capsys).code == Exit.FAILED
-    assert run(world, capsys, str(tmp_path / "none.txt")).code == Exit.FAILED
+    assert run(world, capsys, "--ids", str(tmp_path / "none.txt")).code == Exit.FAILED
     assert "No project named" in run(world, capsys, "--new", "1", project="other").err
     ran = run(world, capsys, "--new", "1", project="open")
     assert (ran.code, "signedLinks" in ran.err) == (Exit.DONE, True)
