@@ -176,7 +176,7 @@ class TrialSection(Section):
     record_observations: bool = keyed.flag(
         False,
         "Whether recordings hold the full observations, which can be very large. HIPPO saved them "
-        "always, so `make check` remarks on it in a project of HIPPO's layout.",
+        "always, so `hippodrome check` remarks on it in a project of HIPPO's layout.",
         example="true",
     )
     lossless: bool = keyed.flag(

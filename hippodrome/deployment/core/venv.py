@@ -18,6 +18,6 @@ def go_on(root: Path = ROOT) -> NoReturn:
         os.execv(python, [python, "-m", "deploy", *sys.argv[1:]])  # noqa: S606 - no shell is wanted
     sys.stderr.write(
         "✗ The packages that this command needs are not installed.\n"
-        "→ Run a command with make first, such as `data` or `hippodrome doctor`: it installs them into .venv/.\n"
+        "→ Run a command with make first, such as `make data` or `make doctor`: it installs them into .venv/.\n"
     )
     sys.exit(1)

@@ -157,7 +157,8 @@ class FolderEraser:
         if runs or unfinished:
             raise Problem(
                 "Their server still runs, or its recording is unfinished: `run` was killed. Nothing was touched.",
-                "Start `run` once more and end it with Ctrl-C: it ends all servers and keeps what they recorded.",
+                "Start `hippodrome run` once more and end it with Ctrl-C: it ends all servers and keeps what they "
+                "recorded.",
             )
 
 
