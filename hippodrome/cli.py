@@ -102,7 +102,7 @@ class _Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, listed, rest = super().resolve_command(ctx, args)
-        return name, listed and _load(str(name)), rest
+        return name, listed and load(str(name)), rest
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         for heading, commands in GROUPS.items():
@@ -110,7 +110,7 @@ class _Commands(TyperGroup):
                 formatter.write_dl([(f"{name:11}", summary) for name, (_, summary) in commands.items()])
 
 
-def _load(name: str) -> Any:
+def load(name: str) -> Any:
     """Import a command's module, which may take time, and make the typer command of its function `command`."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     app.command(name)(importlib.import_module(f"hippodrome.{COMMANDS[name]}").command)
@@ -139,5 +139,5 @@ def _app() -> typer.Typer:
     app.callback()(_options)
     for group in GROUPS.values():
         for name, (_, summary) in group.items():
-            app.command(name, cls=TyperCommand, help=summary)(lambda: None)  # replaced by `_load`
+            app.command(name, cls=TyperCommand, help=summary)(lambda: None)  # replaced by `load`
     return app

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from hippodrome.cli import COMMANDS, GROUPS, main
+from hippodrome.console import program
+from hippodrome.console.program import as_typed
 
 ROOT = Path(__file__).resolve().parent.parent
 NARROW = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
@@ -62,3 +64,33 @@ def completions(words: str) -> list[str]:
 def test_commands_and_options_are_completed() -> None:
     assert completions("hippodrome de") == ["deploy", "destroy"]
     assert "--fresh" in completions("hippodrome run --f")
+
+
+def test_advice_names_the_program_as_it_can_be_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = tmp_path / ".venv" / "bin" / "hippodrome"
+    ours.parent.mkdir(parents=True)
+    monkeypatch.setattr("sys.executable", str(ours.with_name("python")))
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.chdir(tmp_path)
+    advice = "Run `hippodrome data maze`.\n  hippodrome run a\nThe stack hippodrome stays, and ../hippodrome run too."
+    assert as_typed(advice) == advice  # it was not installed as a program: nothing better is known
+    ours.touch()
+    ours.chmod(0o755)
+    assert as_typed(advice).splitlines()[:2] == [
+        "Run `.venv/bin/hippodrome data maze`.",
+        "  .venv/bin/hippodrome run a",
+    ]
+    assert as_typed(advice).splitlines()[2] == advice.splitlines()[2]
+    monkeypatch.setenv("PATH", str(ours.parent))
+    assert as_typed(advice) == advice
+
+
+def test_the_program_and_the_advice_know_the_same_commands() -> None:
+    assert set(program.COMMANDS) == set(COMMANDS)
+
+
+def test_python_m_deploy_is_the_same_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "deploy", "stop", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("Usage: hippodrome stop ")

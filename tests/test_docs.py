@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from hippodrome.cli import COMMANDS, load
 from tests.test_first_hour import says
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -205,3 +206,42 @@ def test_the_agent_shown_for_games_without_an_idle_action_passes_the_check(tmp_p
     config = read_project(tmp_path)
     assert remarks.without_a_key(config) is None
     assert try_agent(tmp_path, config) == []
+
+
+def shown_commands(text: str) -> list[tuple[str, list[str]]]:
+    """Return each command `hippodrome …` that a text shows in backticks or on a line of its own, with its options."""
+    lines = re.findall(r"`hippodrome ([^`\n]+)`|^(?: {4}|\$ |)hippodrome ([a-z][^\n|>]*)", text, re.MULTILINE)
+    words = [(quoted or line).split("#")[0].split() for quoted, line in lines]
+    return [(name, re.findall(r"(?<!\S)--[a-z-]+", " ".join(rest))) for name, *rest in words]
+
+
+COMMANDS_SHOWN = [
+    *PAGES,
+    *sorted((ROOT / "examples").glob("*/README.md")),
+    *sorted((ROOT / "examples").glob("*/config.yml")),
+    *sorted((ROOT / "hippodrome").rglob("*.py")),
+    *sorted((ROOT / "infra").glob("*.yml")),
+]
+
+
+def test_every_command_that_is_shown_exists_with_its_options() -> None:
+    wrong, seen = [], set()
+    for page in COMMANDS_SHOWN:
+        for name, options in shown_commands(page.read_text()):
+            if name.startswith("-") or name in (
+                "COMMAND",
+                "…",
+                "{command}",
+                "in",
+            ):  # "hippodrome in eu-west-1": a stack
+                continue
+            seen.add(name)
+            if name not in COMMANDS:
+                wrong.append(f"{page.name}: hippodrome {name}")
+                continue
+            known = {option for part in load(name).params for option in (*part.opts, *part.secondary_opts)}
+            wrong += [
+                f"{page.name}: hippodrome {name} {option}" for option in options if option not in known | {"--help"}
+            ]
+    assert wrong == []
+    assert len(seen) > 12

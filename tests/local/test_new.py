@@ -105,12 +105,12 @@ def test_only_the_id_changes_in_the_file(root: Path, tmp_path: Path) -> None:
 def test_commands_and_links_of_the_copy_are_adapted(root: Path, tmp_path: Path) -> None:
     (root / "docs").mkdir()
     (root / "docs" / "objects.md").write_text("# Objects")
-    readme = "make run PROJECT=examples/maze, or (examples/maze).\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
+    readme = "hippodrome run examples/maze, or (examples/maze).\n`python examples/maze/draw.py` tests/examples/maze [objects](../../docs/objects.md#types)"
     (root / "examples" / "maze" / "README.md").write_text(readme)
     folder = tmp_path / "deep" / "mine"
     new.make_study(new.templates(root)["maze"], folder)
     command, rest = (folder / "README.md").read_text().split("\n")
-    assert command == f"make run PROJECT={folder}, or ({folder})."
+    assert command == f"hippodrome run {folder}, or ({folder})."
     assert rest == f"`python {folder}/draw.py` tests/examples/maze [objects](../../clone/docs/objects.md#types)"
 
 
@@ -120,7 +120,7 @@ def test_the_links_of_each_copy_lead_somewhere(tmp_path: Path, name: str) -> Non
     text = (tmp_path / "mine" / "README.md").read_text()
     links = re.findall(r"\]\((?!http)([^)#]+)", text)
     assert [link for link in links if not (tmp_path / "mine" / link).exists()] == []
-    assert f"make run PROJECT={tmp_path}/mine" in text
+    assert f"hippodrome run {tmp_path}/mine" in text
 
 
 def test_a_study_can_be_made_in_an_empty_folder(root: Path, tmp_path: Path) -> None:

@@ -25,9 +25,7 @@ _ONE = "Give one of the two."
 
 
 def command(
-    user: Annotated[
-        str, typer.Argument(metavar="USER_ID", help="The participant's id (userId), exactly as in their link.")
-    ],
+    user_id: Annotated[str, typer.Argument(help="The participant's id (userId), exactly as in their link.")],
     study: Annotated[
         str | None,
         typer.Argument(
@@ -71,7 +69,7 @@ def command(
     """
     from hippodrome.deployment.core.study_selection import place_of_data, selected  # noqa: PLC0415 - the checks of config.yml
 
-    _must_fit(user, study, everywhere=everywhere, two_places=from_ is not None and (aws or everywhere))
+    _must_fit(user_id, study, everywhere=everywhere, two_places=from_ is not None and (aws or everywhere))
     undecided = from_ is None and not aws and not everywhere  # no option says where the data are
     data = place_of_data(selected(study), "hippodrome erase USER_ID") if undecided else from_
     if data is not None:
@@ -81,11 +79,11 @@ def command(
                 "Leave out --everywhere, --receipt and --with-id; on AWS, add --aws.",
             )
         only = None if study is None else selected(study).id
-        return _from_folder(data, only, user, dry_run=dry_run, yes=yes, json=json)
+        return _from_folder(data, only, user_id, dry_run=dry_run, yes=yes, json=json)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     projects = _projects(account, installation) if everywhere else [selected(study).id]
-    erasers = [Eraser(account, installation, name, user) for name in projects]
+    erasers = [Eraser(account, installation, name, user_id) for name in projects]
     found = {eraser.project: eraser.look() for eraser in erasers}
     if not everywhere and not any(found.values()):
         _must_be_known(projects[0], _projects(account, installation), stack)
@@ -105,7 +103,7 @@ def command(
         whole = True
     finally:
         parts = [eraser.receipt for eraser in erasers]
-        made = receipts.receipt(parts, user, account, installation, began=began, whole=whole, with_id=with_id)
+        made = receipts.receipt(parts, user_id, account, installation, began=began, whole=whole, with_id=with_id)
         if whole or any(part.deleted for part in parts):
             receipts.write(target, made)
     if json:

@@ -65,6 +65,11 @@ def test_hidden_generated_and_unrelated_files_stay_out(folder: Path) -> None:
         maps__data__three_DOT_txt="3",
         data__maze__users__ada__answers__1_DOT_json="{}",
         **{"data-try__try-1__maze__users__bot__answers__1_DOT_json": "{}"},
+        **{
+            "data-maze__answers_DOT_csv": "",
+            "data-maze-try-1__answers_DOT_csv": "",
+            "erased-20261121T101112Z_DOT_json": "{}",
+        },
         _DOT_git__HEAD="x",
         _DOT_env="AWS_SECRET_ACCESS_KEY=1",
         maps___DOT_hidden="x",
