@@ -94,3 +94,12 @@ def test_python_m_deploy_is_the_same_command() -> None:
         [sys.executable, "-m", "deploy", "stop", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith("Usage: hippodrome stop ")
+
+
+def test_a_mistyped_folder_is_not_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "my-stduy"]) == 1
+    assert "There is no study in my-stduy: it has no config.yml." in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -18,6 +18,8 @@ import psutil
 import typer
 
 from hippodrome.console.arguments import StudyFolder
+from hippodrome.console.problem import Problem
+from hippodrome.control.config import layout
 from hippodrome.local import requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
@@ -69,6 +71,11 @@ def command(
 
     Answers and recordings are kept in its folder data/ from run to run. Ctrl-C ends the study.
     """
+    if not layout.has_config(folder):  # else a mistyped folder would be made, for the data
+        raise Problem(
+            f"There is no study in {folder}: it has no config.yml.",
+            "Name a study's folder, or make one: `hippodrome new` lists the templates.",
+        )
     requirements.prepare(folder)
     os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
     data = folder / "data" if data is None else data

@@ -236,7 +236,7 @@ def test_the_data_of_bots_stay_apart_and_can_be_read(project: Any, tmp_path: Pat
     assert f"hippodrome data {folder} --from {data}" in text
     monkeypatch.chdir(tmp_path)
     assert main(["data", f"{folder}/", "--from", str(data)]) == 0
-    with (tmp_path / f"data-tiny-{data.name}" / "answers.csv").open(newline="") as table:
+    with (folder / f"data-tiny-{data.name}" / "answers.csv").open(newline="") as table:
         assert len(list(csv.DictReader(table))) == 2
     assert [*copy_of(folder, tmp_path / "copy")]
     assert not (tmp_path / "copy" / "data-try").exists()

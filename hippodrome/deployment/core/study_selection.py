@@ -107,7 +107,9 @@ def place_of_data(study: StudySelection, command: str) -> Path | None:
         screen.info(f"On this machine, in {data}: by its config.yml, {study.id} is not on AWS.")
         return data
     if not data.is_dir():
-        screen.info(f"On AWS, since there is no folder {data} on this machine.")
+        tried = _rehearsals(study.folder)
+        hint = f" The last rehearsal's data: --from {shlex.quote(str(tried[-1]))}" if tried else ""
+        screen.info(f"On AWS, since there is no folder {data} on this machine (`hippodrome run` makes it).{hint}")
         return None
     places = {"here": f"on this machine, in {data}", "aws": "on AWS"}
     answer = screen.choose(f"The data of {study.id} may be in two places. Which are meant?", places)
@@ -127,12 +129,16 @@ def place_of_data(study: StudySelection, command: str) -> Path | None:
 def none_here(study: StudySelection, on_aws: str) -> Problem:
     """Explain that a study has no data on this machine. `on_aws` is the advice for data that are on AWS."""
     folder = study.folder or Path()
-    tried = sorted((folder / TRIED).glob("try-*"))
+    tried = _rehearsals(folder)
     return Problem(
         f"There are no data of {study.id} on this machine: there is no folder {folder / DATA}.",
         f"`hippodrome run` makes it. If the data are in another folder, name that with --from. {on_aws}",
         [f"The last rehearsal's data are in {tried[-1]}."] if tried else [],
     )
+
+
+def _rehearsals(folder: Path) -> list[Path]:
+    return sorted((folder / TRIED).glob("try-*"))
 
 
 def folder_for(study: StudySelection, source: Path | None) -> Path:

@@ -325,7 +325,7 @@ def test_a_missing_server_gets_a_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
     with pytest.raises(
-        ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}/: no server listens .*`make gym`"
+        ConnectionLost, match=f"no connection to ws://127.0.0.1:{port}/: no server listens .*`hippodrome gym`"
     ):
         RemoteEnv(f"ws://127.0.0.1:{port}/", "CartPole-v1")
 
