@@ -57,5 +57,5 @@ def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(local: M
     (here.place / "file").write_text("no folder")
     assert here.begin("--data", where).wait(60) == 1
     assert f"The study cannot run with the data in {where}: Not a directory." in here.text()
-    assert "DATA=FOLDER" in here.text()
+    assert "--data FOLDER" in here.text()
     assert "Traceback" not in here.text()
