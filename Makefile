@@ -148,7 +148,7 @@ $(VENV)/requirements/%.txt: requirements/%.txt requirements/intel-mac.txt | $(VE
 	@awk 'NR == FNR { if ($$0 !~ /^#/) { split($$0, pin, "=="); older[pin[1]] = $$0 } next } \
 		{ split($$0, pin, "=="); if (pin[1] in older) print older[pin[1]]; else print $$0 }' requirements/intel-mac.txt $< > $@
 
-$(VENV)/local: $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas constraints) | $(VENV)/bin/python
+$(VENV)/local: pyproject.toml $(patsubst %,$(REQUIREMENTS)/%.txt,local trial lambdas constraints) | $(VENV)/bin/python
 	@echo 'Installing what a study needs (once; a minute or two) …'
 	@$(INSTALL) $(WHEELS) -r $(REQUIREMENTS)/local.txt $(NOT_INSTALLED)
 	@$(INSTALL) --no-deps --editable . $(NOT_INSTALLED)

@@ -5,7 +5,7 @@ import sys
 try:
     from hippodrome.cli import main
 except ModuleNotFoundError:
-    from hippodrome.deployment.core import venv
+    from deploy import venv
 
     venv.go_on()
 

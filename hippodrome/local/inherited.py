@@ -13,12 +13,6 @@ _OWNER = (*environment.PARTICIPANT, environment.SESSION)
 
 
 def inherited_environment() -> dict[str, str]:
-    """Return this process's variables without AWS's and those of a server's owner.
-
-    A clone that is not installed is in PYTHONPATH, so that servers find it. The folder of installed packages is not:
-    there it would come before Python's own modules.
-    """
+    """Return this process's variables without AWS's and those of a server's owner, so that servers find Hippodrome."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(_AWS) and name not in _OWNER}
-    if not places.IS_CLONE:
-        return kept
-    return {**kept, "PYTHONPATH": os.pathsep.join([str(places.PACKAGES), *filter(None, [kept.get("PYTHONPATH")])])}
+    return places.for_child(kept)

@@ -109,6 +109,7 @@ def test_what_the_commands_read_from_the_environment_may_be_given_to_make(given:
 def somewhere(tmp_path: Path) -> Path:
     """A clone in which nothing is installed, with the test's own `uname`, `python3` and pip."""
     (tmp_path / "Makefile").write_text((ROOT / "Makefile").read_text())
+    (tmp_path / "pyproject.toml").write_text((ROOT / "pyproject.toml").read_text())
     shutil.copytree(ROOT / "requirements", tmp_path / "requirements")
     (tmp_path / "bin").mkdir()
     return tmp_path

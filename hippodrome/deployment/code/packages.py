@@ -18,6 +18,7 @@ import io
 import os
 import platform
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -45,7 +46,9 @@ IN_RUNTIME = {"boto3", "botocore", "jmespath", "python-dateutil", "s3transfer", 
 
 _GLIBC = range(34, 16, -1)  # Lambda's python3.13 runs on Amazon Linux 2023, which has glibc 2.34
 _PIN_AGAIN = "`python -m hippodrome.deployment.code.packages`"
-_ANEW = "Run `.venv/bin/python -m pip cache purge`, then the same command again: it downloads the file anew."
+_ANEW = (
+    f"Run `{shlex.quote(sys.executable)} -m pip cache purge`, then the same command again: it downloads the file anew."
+)
 _LEAVE_OUT = re.compile(  # not needed to run: stubs, C sources, tests, metadata
     r"(^|/)(tests?|__pycache__)/|\.(pyi|c|h|pyx|pxd|cpp|rs|pyc)$|(^|/)py\.typed$|^[^/]+\.dist-info/|\.libs/.*\.debug$"
 )

@@ -79,8 +79,7 @@ class StudyProcess:
             begin = log.tell()
             self._process = self._begin(
                 [str(self.folder), "--port", "0", "--data", str(self.data), "--starter", str(os.getpid())],
-                cwd=places.ROOT,
-                env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
+                env={**places.for_child(os.environ), "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C must not reach it: `interrupt` ends it
@@ -100,7 +99,7 @@ class StudyProcess:
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         """Start `hippodrome run`; `options` are those of `subprocess.Popen`."""
-        command = [sys.executable, "-m", "hippodrome", "run", *arguments]
+        command = [sys.executable, "-P", "-m", "hippodrome", "run", *arguments]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)  # noqa: S603 - our own command
 
     def interrupt(self, seconds: float = END_SECONDS) -> bool:

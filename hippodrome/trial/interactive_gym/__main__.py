@@ -11,8 +11,6 @@ from pathlib import Path
 from hippodrome.trial.interactive_gym.options import Unplayable
 from hippodrome.trial.interactive_gym.project import make, study_id
 
-_HIPPODROME = Path(__file__).resolve().parents[3]
-
 
 def main() -> None:
     """Make the project of the script that the command line names, print its folder, and run it until Ctrl-C."""
@@ -33,24 +31,12 @@ def main() -> None:
         sys.exit(f"This experiment cannot be played here: {error}")
     for remark in remarks:
         print(f"Remark: {remark}")
-    check = f"make -C {shlex.quote(str(_HIPPODROME))} check PROJECT={shlex.quote(str(folder))}"
+    check = shlex.join([sys.executable, "-m", "hippodrome", "check", str(folder)])
     print(f"The project is in {folder}.")
     print(f"Check it with `{check}`; deploy it as docs/aws-project.md says.", flush=True)
     if not options.no_run:
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "hippodrome",
-            "run",
-            str(folder),
-            "--port",
-            str(config.port),
-            "--data",
-            f"{folder}/data",
-        ]
-        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(_HIPPODROME), os.environ.get("PYTHONPATH"))))
-        os.execv(sys.executable, command)  # noqa: S606 - ours
+        run = [sys.executable, "-m", "hippodrome", "run", str(folder), "--port", str(config.port)]
+        os.execv(sys.executable, [*run, "--data", f"{folder}/data"])  # noqa: S606 - ours
 
 
 if __name__ == "__main__":

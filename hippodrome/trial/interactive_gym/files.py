@@ -101,10 +101,13 @@ def _is_installed(file: Path) -> bool:
 
 
 def requirements(files: Mapping[str, bytes], others: Iterable[str]) -> bytes:
-    """Write requirements.txt: the packages that the modules import, in the versions here, and the lines `others`."""
+    """Write requirements.txt: the packages that the modules import, in the versions here, and the lines `others`.
+
+    Hippodrome itself is left out: the servers' image has it, and a package index may not.
+    """
     names = {name for path, data in files.items() if path.endswith(".py") for name in _imports(data)}
     distributions = metadata.packages_distributions()
-    packages = {package for name in names for package in distributions.get(name, ())[:1]}
+    packages = {package for name in names - {"hippodrome"} for package in distributions.get(name, ())[:1]}
     lines = [f"{package}=={metadata.version(package)}" for package in sorted(packages)]
     if any(path.endswith(".onnx") for path in files):
         lines.append(ONNXRUNTIME)

@@ -166,8 +166,6 @@ OF_SEVERAL = ("pettingzoo", "onnxruntime")
 """Further packages whose versions a recording names if several players play."""
 
 
-REQUIRED = Path(__file__).resolve().parents[3] / "requirements/project.txt"
-"""In the servers' image: a copy of the project's requirements.txt."""
 _PACKAGE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _MAX_PACKAGES = 100
 
@@ -176,10 +174,10 @@ _MAX_PACKAGES = 100
 def packages(agent_dir: Path) -> tuple[str, ...]:
     """Return the packages that the project's requirements.txt names, such as the packages of its games."""
     names: dict[str, None] = {}
-    for file in (agent_dir / "requirements.txt", REQUIRED):
-        with contextlib.suppress(OSError, UnicodeDecodeError):
-            matches = map(_PACKAGE.match, map(str.strip, file.read_text(encoding="utf-8-sig").splitlines()))
-            names |= dict.fromkeys(match[0] for match in matches if match)
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        text = (agent_dir / "requirements.txt").read_text(encoding="utf-8-sig")
+        matches = map(_PACKAGE.match, map(str.strip, text.splitlines()))
+        names = dict.fromkeys(match[0] for match in matches if match)
     return tuple(names)[:_MAX_PACKAGES]
 
 

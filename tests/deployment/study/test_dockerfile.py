@@ -77,6 +77,7 @@ def test_the_dockerfile_copies_first_what_changes_least(recipe: Recipe, folder: 
         "requirements/project.txt",
         "hippodrome/",
         "project/",
+        "requirements/project.txt",
     ]
     runs = [index for index, (word, _) in enumerate(recipe.steps) if word == "RUN"]
     assert max(runs) < recipe.steps.index(("COPY", "hippodrome/ /hippodrome/hippodrome/"))

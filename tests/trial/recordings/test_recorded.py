@@ -9,7 +9,6 @@ from collections import UserDict, deque
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.util import find_spec
-from pathlib import Path
 from typing import NamedTuple
 
 import attrs
@@ -517,7 +516,7 @@ def test_an_array_that_contains_itself_does_not_end_the_game():
     assert recording.plain({"a": itself}) == {"a": "<ndarray>"}
 
 
-def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_the_head(tmp_path, monkeypatch):
+def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_the_head(tmp_path):
     (tmp_path / "requirements.txt").write_text(
         "# games\npillow>=9 # pictures\n  PyYAML ; python_version > '3'\n-r other.txt\nno-such-package-there-is==1\n"
         "git+https://example.org/x\n"
@@ -526,9 +525,6 @@ def test_the_packages_that_a_projects_requirements_name_have_their_versions_in_t
     assert names == ("pillow", "PyYAML", "no-such-package-there-is", "git")
     found = recording.versions(names)
     assert found.keys() - recording.versions().keys() == {"pillow", "PyYAML"}
-    (tmp_path / "image").mkdir()
-    monkeypatch.setattr(recording, "REQUIRED", tmp_path / "requirements.txt")
-    assert recording.packages(tmp_path / "image") == names
 
 
 def test_a_recording_names_at_most_a_hundred_packages_whatever_is_written_in_the_file(tmp_path):
@@ -537,7 +533,6 @@ def test_a_recording_names_at_most_a_hundred_packages_whatever_is_written_in_the
     (tmp_path / "other").mkdir()
     (tmp_path / "other/requirements.txt").write_bytes(b"pillow\n\xff\n")
     assert recording.packages(tmp_path / "other") == ()
-    assert Path(__file__).parents[3] / "requirements/project.txt" == recording.REQUIRED
 
 
 def test_the_versions_include_the_trial_python_and_its_packages():
