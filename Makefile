@@ -117,7 +117,7 @@ format: $(VENV)/dev ## format the code with ruff
 
 .PHONY: clean
 clean: ## remove the virtual environments and caches; data/ stays
-	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots
+	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots dist
 
 # NEWEST: the newest Python 3 for which all pinned packages have wheels. Intel Macs get older versions of some packages, in
 # copies of the requirement files.

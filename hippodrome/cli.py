@@ -86,9 +86,10 @@ def _problem_from(error: Exception, command: str) -> Problem | None:
         return error
     if isinstance(error, ModuleNotFoundError):
         extra = "aws" if command in GROUPS["AWS"] or command == "links" else "data"
+        target = "plan" if command in ("apply", "links") else command  # these two have no target of their own
         return Problem(
             f"`hippodrome {command}` needs the package {error.name}, which is not installed.",
-            f'Install it with `pip install "hippodrome[{extra}]"`; in a clone, `make {command}` does.',
+            f'Install it with `pip install "hippodrome[{extra}]"`; in a clone, `make {target}` does.',
         )
     if "botocore" not in sys.modules:
         return None
