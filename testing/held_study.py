@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +27,9 @@ class HeldStudy(StudyProcess):
         self._port, self._stalled = port, stalled
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
-        options["env"] = {
-            **options["env"],
-            "PYTHONPATH": os.environ.get("PYTHONPATH") or str(processes.ROOT),
-            environment.STALLED_SECONDS: str(self._stalled),
-        }
+        options["env"] = {**options["env"], environment.STALLED_SECONDS: str(self._stalled)}
         arguments = [*arguments, "--port", str(self._port)]  # the last --port counts
-        return processes.start("hippodrome", ["run", *arguments], **options)
+        return processes.start("hippodrome", ["run", *arguments], cwd=processes.ROOT, **options)
 
     def steps_written(self, owner: str = "*") -> int:
         """Count the steps in the unfinished recordings of the servers of this participant or session; `*` means all."""
