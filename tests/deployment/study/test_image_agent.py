@@ -75,6 +75,12 @@ def test_an_agent_that_imports_gym_passes(recipe: Recipe, folder: Path, tmp_path
     assert tried(recipe, folder, tmp_path, game="MsPacman-v0") == (0, WELL)
 
 
+def test_an_agents_own_modules_win_over_installed_ones(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
+    write_study(folder, agent_DOT_py="import responses\nassert responses.MINE\n" + grid_agent(20))
+    (folder / "responses.py").write_text("MINE = True\n")  # a package of this name is installed here
+    assert tried(recipe, folder, tmp_path, game="grid") == (0, WELL)
+
+
 def test_the_agent_is_told_its_game_and_options(recipe: Recipe, folder: Path, tmp_path: Path) -> None:
     said = "import json, os\nassert json.loads(os.environ['TRIAL']) == {'game': 'grid', 'options': {'speed': 3}}\n"
     write_study(folder, agent_DOT_py=said + grid_agent(20))

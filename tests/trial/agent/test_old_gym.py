@@ -267,7 +267,7 @@ def test_an_installed_gym_is_imported_instead(tmp_path: Path) -> None:
         + "".join(f"def {name}(*a): pass\n" for name in ("start", "step", "render", "reset", "close"))
     )
     code = f"""
-import sys; sys.path[:0] = [{str(OLD_GYM.parents[2])!r}, {str(tmp_path / "site")!r}]
+import sys; sys.path[:0] = [{str(OLD_GYM.parents[3])!r}, {str(tmp_path / "site")!r}]
 from pathlib import Path; from hippodrome.trial.agent.agent import load
 load(Path({str(tmp_path / "agent")!r}))
 """
