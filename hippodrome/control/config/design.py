@@ -65,6 +65,9 @@ class Design:
     blocks: tuple[Block, ...] = ()
     ends: tuple[End, ...] = ()
     mistakes: list[Mistake] = field(default_factory=list)
+    remarks: list[Mistake] = field(default_factory=list)
+    unknown: set[str] = field(default_factory=set)
+    """Names in braces in `trial` that are no factors."""
     own_trial: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     paths: dict[str, KeyPath] = field(default_factory=dict)
     trial: Any = None
@@ -80,9 +83,9 @@ class Design:
     def first_trial(self) -> Any:
         """The section `trial` with the first level of each factor filled in."""
         factors = [*self.conditions, *(factor for block in self.blocks for factor in block.factors)]
-        return filled(
-            self.trial, {factor.name: next(iter(factor.levels.values())) for factor in factors if factor.levels}
-        )
+        levels = {factor.name: next(iter(factor.levels.values())) for factor in factors if factor.levels}
+        levels |= dict.fromkeys(self.unknown, "x")  # a mistake already, and not another one of the key
+        return filled(self.trial, levels) if levels else self.trial
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,8 @@ class _Reader:
     def __init__(self, trial: Any) -> None:
         self.design = Design(trial=trial)
         self._factors: dict[str, KeyPath] = {}
+        self._all_names: set[str] = set()
+        self._block_now: int | None = None
 
     def read(self, project: dict[str, Any]) -> None:
         found = self.design
@@ -171,10 +176,35 @@ class _Reader:
                         (*STEPS, key),
                         f"settings need the list form, in which steps have names: - {name}: {{…}} instead of {key}: …",
                     )
-        self._ends(project.get("ends"))
+        if not found.mistakes:  # otherwise a rule would ask about steps that could not be read
+            self._ends(project.get("ends"))
+            self._unknown_factors()
+            self._checks_without_an_end()
 
     def _wrong(self, path: KeyPath, message: str) -> None:
         self.design.mistakes.append(Mistake(path, message))
+
+    def _unknown_factors(self) -> None:
+        """Note each name in braces in `trial` that is no factor. In a study without factors braces are plain text."""
+        if not self._factors and not self.design.is_named:
+            return
+        for path, text in _texts(self.design.trial, ()):
+            for name in set(_FACTOR.findall(text)) - self._factors.keys():
+                self.design.unknown.add(name)
+                near = did_you_mean(name, self._factors)
+                add = "" if near else f"; add it to conditions, such as conditions: {{{name}: [a, b]}}"
+                self._wrong(("trial", *path), f"there is no factor {name}{near or add}")
+
+    def _checks_without_an_end(self) -> None:
+        """Remark on a check with limited tries, if no end asks who has passed."""
+        asked = {name for end in self.design.ends for rule in end.when for name in rules.steps_mentioned(rule)}
+        for step in self.design.steps:
+            if step.tries and step.key not in asked:
+                message = (
+                    f"no end asks for answers.{step.key}.passed: who fails goes on like everybody, and the column "
+                    f"{step.key}.passed tells"
+                )
+                self.design.remarks.append(Mistake((*self.design.paths[step.key], "tries"), message))
 
     # Factors
 
@@ -216,6 +246,7 @@ class _Reader:
     # Steps
 
     def _steps(self, items: list[Any]) -> None:
+        self._all_names = {name for item in items for name in _names_in(item)}
         for place, item in enumerate(items):
             path: KeyPath = (*STEPS, place)
             if isinstance(item, dict) and "each" in item:
@@ -251,7 +282,7 @@ class _Reader:
         if len(block.runs) > 1000 or (order == design.LATIN and len(block.runs) > 50):
             most = 50 if order == design.LATIN else 1000
             self._wrong((*path, "each"), f"makes {len(block.runs)} runs; with order: {order} at most {most}")
-        number = len(self.design.blocks)
+        self._block_now = number = len(self.design.blocks)
         self.design.blocks = (*self.design.blocks, block)
         if not isinstance(steps, list) or not steps:
             self._wrong((*path, "steps"), "must be a list of the steps that are repeated, such as [game, rate]")
@@ -263,6 +294,7 @@ class _Reader:
                 )
                 continue
             self._step(inner, (*path, "steps", place), number)
+        self._block_now = None
 
     def _step(self, item: Any, path: KeyPath, block: int | None) -> None:
         """Read a step: a name, or a name with its settings."""
@@ -363,22 +395,42 @@ class _Reader:
             if isinstance(given, dict | list):
                 raise rules.BadRule('must be one rule, such as answers.consent.agree == "yes"')
             for asked in rules.mentioned(rule):
-                self._check_names(asked)
+                self._check_names(asked, rule)
         except rules.BadRule as error:
-            self._wrong(path, str(error))
+            first = re.match(r"(?:not\s+)?([A-Za-z]\w*)[.\s]", rule)
+            if first and first[1] in self._all_names:
+                self._wrong(path, f"{first[1]} is a step; write answers.{first[1]}")
+            else:
+                self._wrong(path, str(error))
             return ""
         return rule
 
-    def _check_names(self, asked: tuple[str, ...]) -> None:
+    def _check_names(self, asked: tuple[str, ...], rule: str) -> None:
         """Raise `BadRule` if a rule asks about a step or a factor that is not there, or comes later."""
         design_ = self.design
         keys = {step.key for step in design_.steps}
         if asked[0] == "answers" and len(asked) > 1 and (design_.is_named and asked[1] not in keys):
-            near = did_you_mean(asked[1], keys)
-            raise rules.BadRule(f"there is no earlier step {asked[1]}{near}; a rule may ask about earlier steps only")
+            if asked[1] in self._all_names:
+                raise rules.BadRule(f"{asked[1]} is asked later; a rule may ask about earlier steps only")
+            raise rules.BadRule(f"there is no step {asked[1]}{did_you_mean(asked[1], keys)}")
+        if asked[0] == "answers" and len(asked) == 3 and not _is_over_runs(asked, rule):
+            self._check_run(asked)
         if asked[0] in ("condition", "order") and (len(asked) != 2 or asked[1] not in self._factors):
             name = asked[1] if len(asked) > 1 else ""
             raise rules.BadRule(f"there is no factor {name}{did_you_mean(name, self._factors)}")
+
+    def _check_run(self, asked: tuple[str, ...]) -> None:
+        """Raise `BadRule` if a rule outside of a block asks for a field of its steps, and not for that of one run."""
+        step = next((step for step in self.design.steps if step.key == asked[1]), None)
+        if step is None or step.block is None or step.block == self._block_now:
+            return
+        block = self.design.blocks[step.block]
+        level = "-".join(block.runs[0])
+        factors = " and ".join(factor.name for factor in block.factors)
+        raise rules.BadRule(
+            f"answers.{step.key} has an answer for each {factors}; write answers.{step.key}.{level}.{asked[2]}, or "
+            f"sum(answers.{step.key}.{asked[2]})"
+        )
 
     def _ends(self, given: Any) -> None:
         if is_blank(given):
@@ -429,6 +481,22 @@ class _Reader:
         except ValueError as error:
             self._wrong(path, str(error))
             return None
+
+
+def _names_in(item: Any) -> Iterator[str]:
+    """The names of the steps in an item of the list, also of those in a block."""
+    if isinstance(item, dict) and "each" in item:
+        for inner in item["steps"] if isinstance(item.get("steps"), list) else ():
+            yield from _names_in(inner)
+    elif isinstance(item, dict):
+        yield from (str(name).removesuffix(".html") for name in item)
+    elif not isinstance(item, list) and not is_blank(item):
+        yield _text(item).removesuffix(".html")
+
+
+def _is_over_runs(asked: tuple[str, ...], rule: str) -> bool:
+    """Whether the rule asks for a field of all runs, such as `sum(answers.trust.q1)`."""
+    return re.search(rf"\b({'|'.join(rules.FUNCTIONS)})\(\s*{re.escape('.'.join(asked))}\s*\)", rule) is not None
 
 
 def _page_name(value: Any) -> str:

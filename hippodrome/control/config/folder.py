@@ -94,7 +94,8 @@ def read_project(folder: Path) -> Config:
         checked.project = replace(checked.project, allowed_hosts=loaded)
         message = f"allowedHosts is not given: the pages may load from {', '.join(loaded)}, as with HIPPO Gym"
         agent.append(source.diagnostic(("project",), message, remark=True))
-    return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *agent]))
+    design = [source.diagnostic(path, message, remark=True) for path, message, *_ in checked.design.remarks]
+    return Config.of(checked, steps, game_pages, in_order([*source.remarks(), *design, *agent]))
 
 
 def _agent_problems(source: ConfigSource, *, others: bool) -> Iterator[Diagnostic]:

@@ -196,8 +196,11 @@ def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
     if "expected <block end>" in problem and "<scalar>" not in problem:
         message = "the indentation does not match the lines above; a section's keys start in one column"
         return UnreadableConfig(message, number + 1)
-    where = f'"{printable(source.strip())}", column {mark.column + 1}: {printable(problem)}'
-    return UnreadableConfig(f"YAML cannot read {where}; check quotes, brackets and indentation", number + 1)
+    message = "in braces put the whole rule into '…', or write answers.consent.agree"
+    if 'answers["' not in source:
+        where = f'"{printable(source.strip())}", column {mark.column + 1}: {printable(problem)}'
+        message = f"YAML cannot read {where}; check quotes, brackets and indentation"
+    return UnreadableConfig(message, number + 1)
 
 
 def _has_tab(line: str) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hippodrome.control.config import Config, Diagnostic, agent_imports, remarks
 from hippodrome.local.check.agent_file import never_called, read_agent
+from hippodrome.local.check.designs import check_designs
 from hippodrome.local.check.pages import check_pages
 from hippodrome.local.check.sessions import check_sessions
 
@@ -21,6 +22,7 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
         found += agent_imports.requirement_remarks(folder)
     if config:
         found += check_sessions(folder, config)
+        found += check_designs(folder, config)
     if config and plays:
         found += never_called(folder, config)
         found += [*agent_imports.hiding_files(folder), *agent_imports.hidden_files(folder)]

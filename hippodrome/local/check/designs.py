@@ -1,0 +1,55 @@
+"""Checks what a study's design says of its pages: the fields of checks, and those that rules ask about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from hippodrome.bots import forms
+from hippodrome.control.config import Config, Diagnostic
+from hippodrome.control.config.folder import read_source
+from hippodrome.control.model import rules
+from hippodrome.protocol.similar import did_you_mean
+
+OF_EVERY_STEP = frozenset({"outcome", "passed", "tries"})
+"""Fields that answers may have beside those of their pages."""
+
+
+def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
+    """Return a mistake for each field that a check or a rule names and that no element of the page has."""
+    fields = {step.key: _fields(step.files) for step in config.steps if step.files}
+    source = read_source(folder)
+    found = []
+    for path, step, field, why in [*_of_checks(config), *_of_rules(config)]:
+        known = fields.get(step)
+        if known and field not in known | OF_EVERY_STEP:
+            message = f"the page of {step} has no field {field}{did_you_mean(field, known)}{why}"
+            found.append(source.diagnostic(path, message, remark=not why))
+    return found
+
+
+def _of_checks(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str, str]]:
+    for step in config.steps:
+        for field in step.step.right if step.step else ():
+            path = (*config.design.paths.get(step.key, ("project", "steps")), "right", field)
+            yield path, step.key, field, "; nobody who sees it could answer right"
+
+
+def _of_rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str, str]]:
+    for end in config.design.ends:
+        for rule in end.when:
+            for names in rules.mentioned(rule):
+                if names[0] == "answers" and len(names) == 3:
+                    yield ("project", "ends", end.name), names[1], names[2], ""
+
+
+def _fields(files: tuple[Path, ...]) -> set[str]:
+    """The names of all fields in these files. Parts that Jinja fills in may bring others, so then there are none."""
+    names: set[str] = set()
+    for file in files:
+        text = file.read_text(encoding="utf-8", errors="replace")
+        for form in forms.read(f"<form>{text}</form>"):
+            names |= {control.name for control in form.controls if control.name}
+        if "{{" in text and any("{" in name for name in names):
+            return set()
+    return names

@@ -1,0 +1,154 @@
+"""The design in config.yml: what is said of the likeliest mistakes, with their lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hippodrome.control.config import ConfigErrors, read_project
+from hippodrome.local.check.project import check_project
+from testing.designed import write
+
+CONFIG = """project:
+  id: soup
+  conditions: {partner: [helpful, lazy], advice: [on, off]}
+  steps:
+    - consent
+    - quiz: {right: {soups: 3, late: no}, tries: 2}
+    - game
+    - each: {look: [a, b]}
+      steps: [show, rate]
+    - debrief
+  ends:
+    declined: answers.consent.agree == "no"
+    out: not answers.quiz.passed
+trial:
+  game: kitchen
+  players: {human: human, partner: "agent:{partner}"}
+"""
+STEPS = CONFIG[CONFIG.index("    - consent") : CONFIG.index("  ends:")]
+PAGES = {
+    "consent": "<input name='agree'>",
+    "quiz": "<input name='soups'><input name='late'>",
+    **{name: f"<h1>{name}</h1>" for name in ("show", "rate")},
+    "debrief": "<p>{{ completion_code }}</p>",
+}
+
+
+def said(tmp_path: Path, old: str, new: str) -> list[str]:
+    """The mistakes, or without any the remarks, in the study with this change."""
+    assert old in CONFIG
+    folder = write(tmp_path / "soup", CONFIG.replace(old, new, 1), PAGES)
+    try:
+        config = read_project(folder)
+    except ConfigErrors as errors:
+        return str(errors).split("\n")
+    return [str(found) for found in (*config.remarks, *check_project(folder, config)) if "agent" not in str(found)]
+
+
+def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
+    assert said(tmp_path, "soup", "soup") == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "    - quiz: {right: {soups: 3, late: no}, tries: 2}",
+            "    - quiz:\n      right: {soups: 3, late: no}\n      tries: 2",
+            "config.yml:6: project.steps item 2: a step is a name, or one name with its settings in braces or indented "
+            "below it; quiz, right, tries are 3 names. Indent the settings of quiz by two more spaces",
+        ),
+        (
+            "answers.consent.agree",
+            "consent.agree",
+            "config.yml:12: project.ends.declined.when: consent is a step; write answers.consent",
+        ),
+        ('"no"', "no", 'config.yml:12: project.ends.declined.when: no is not a name here; put texts in quotes ("no")'),
+        ("==", "=", "config.yml:12: project.ends.declined.when: one = sets a value; write == to compare"),
+        (
+            "soups: 3",
+            "soup: 3",
+            "config.yml:6: project.steps item 2.quiz.right.soup: the page of quiz has no field soup; did you mean "
+            "soups?; nobody who sees it could answer right",
+        ),
+        (
+            "agent:{partner}",
+            "agent:{partners}",
+            "config.yml:16: trial.players.partner: there is no factor partners; did you mean partner?",
+        ),
+        ("answers.consent", 'answers["1"]', "config.yml:12: project.ends.declined.when: there is no step 1"),
+        (
+            "    - debrief",
+            "    - consent\n    - debrief",
+            "config.yml:10: project.steps item 5: there are two steps called consent; name one of them otherwise: "
+            "- consent2: {page: consent}",
+        ),
+        (
+            STEPS,
+            "    1: consent\n    2: {page: quiz, right: {soups: 3}}\n    3: game\n    finalStep: debrief\n",
+            "config.yml:6: project.steps.2: settings need the list form, in which steps have names: - quiz: {…} instead "
+            "of 2: …",
+        ),
+        (
+            "  conditions: {partner: [helpful, lazy], advice: [on, off]}\n",
+            "",
+            "config.yml:15: trial.players.partner: there is no factor partner; add it to conditions, such as "
+            "conditions: {partner: [a, b]}",
+        ),
+        (
+            "steps: [show, rate]",
+            "steps: [show, {each: {k: [c, d]}, steps: [rate]}]",
+            "config.yml:9: project.steps item 4.steps item 2: is a block in a block; write both factors in one: "
+            "each: {a: […], b: […]}",
+        ),
+        (
+            "not answers.quiz.passed",
+            "answers.rate.q1 < 3",
+            "config.yml:13: project.ends.out.when: answers.rate has an answer for each look; write answers.rate.a.q1, or "
+            "sum(answers.rate.q1)",
+        ),
+        (
+            "    - game\n",
+            "    - intro: {when: answers.rate.a.q1 == 1}\n    - game\n",
+            "config.yml:7: project.steps item 3.intro.when: rate is asked later; a rule may ask about earlier steps only",
+        ),
+        (
+            "    out: not answers.quiz.passed\n",
+            "",
+            "config.yml:6: remark: project.steps item 2.quiz.tries: no end asks for answers.quiz.passed: who fails goes "
+            "on like everybody, and the column quiz.passed tells",
+        ),
+        (
+            "{partner}",
+            "{look}",
+            "config.yml:7: project.steps item 3: the game game takes players.partner from trial, with {look}, and is "
+            "outside of each: look; give it players of its own",
+        ),
+        (
+            'answers.consent.agree == "no"',
+            '{when: answers["consent"].agree == "no"}',
+            "config.yml:12: in braces put the whole rule into '…', or write answers.consent.agree",
+        ),
+        (
+            "[a, b]",
+            "[a-1, b]",
+            "config.yml:8: project.steps item 4.each.look: a level's name has letters, digits, _ and . only; give "
+            '"a-1" a name: {a_1: "a-1"}',
+        ),
+        (
+            "[helpful, lazy]",
+            "[helpful]",
+            "config.yml:3: project.conditions.partner: has one level; a factor needs two or more, or leave it out",
+        ),
+        (
+            "  id: soup\n",
+            "  id: soup\n  players: 2\n",
+            "config.yml:3: project.players: must be 1: a study with conditions, each, or games with settings of their own "
+            "is for one player in each game",
+        ),
+    ],
+)
+def test_a_mistake_gets_its_line_and_what_to_write(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+    assert sentence in said(tmp_path, old, new)
