@@ -33,7 +33,7 @@ SUBPROTOCOL = Subprotocol("hippodrome")
 DECODES = ("deflate", "jpeg", "objects")
 MAX_FRAME_BYTES = 64 * 1024 * 1024
 
-LOBBY, UNMATCHED = "lobby", "unmatched"  # states of the game page (docs/pages.md)
+LOBBY, UNMATCHED, ENDED = "lobby", "unmatched", "ended"  # states of the game page (docs/pages.md)
 POLL_SECONDS = 0.5  # between two polls for the server's state
 LOBBY_SECONDS = 2.0  # between two polls of the lobby
 RETRY_SECONDS = 0.5  # between two tries of a request that failed
@@ -204,6 +204,11 @@ class Bot:
         until = time.monotonic() + self.patience + self.play
         while True:
             state = await self._ready(page, data, play, until)
+            if state["state"] == ENDED:  # matched; whoever plays together has an order of their own
+                page = await self.open()
+                data = page.game or {}
+                play.step = step = data.get("step", step)
+                continue
             if not play.unmatched:
                 await self._connect(state, play)
             page = await self.open()
@@ -217,10 +222,15 @@ class Bot:
             await asyncio.sleep(RETRY_SECONDS)
 
     async def _ready(self, page: VisitedPage, data: dict[str, Any], play: PlayedStep, until: float) -> dict[str, Any]:
-        """Wait for the server as the game page does; return the state in which it is ready, or `unmatched`."""
+        """Wait for the server as the game page does.
+
+        Return the state in which it is ready, `unmatched`, or `ended` if the page is to be loaded again.
+        """
         state, poll = data["state"], urljoin(page.address, data["poll"])
         if state["state"] == LOBBY:
             state = await self._lobby(state, poll, play)
+            if state["state"] == ENDED:
+                return dict(state)
         if state["state"] == UNMATCHED:
             play.unmatched, play.outcome = True, UNMATCHED
             return dict(state)

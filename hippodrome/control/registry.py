@@ -13,7 +13,9 @@ from hippodrome.control.config import ConfigErrors, hippo_registration, parse_re
 from hippodrome.control.limits.slots import Slots
 from hippodrome.control.log import failure, logger
 from hippodrome.control.model import ids
+from hippodrome.control.model.design import Step
 from hippodrome.control.model.project import (
+    GAME_PAGES,
     MASTER_LIST,
     MIN_RUNTIME_MARGIN,
     STEPS_FOLDER,
@@ -149,16 +151,26 @@ def _not_allowed_here(platform: Platform, project: Project) -> Iterable[str]:
 
 def _missing_files(platform: Platform, project: Project) -> Iterable[str]:
     """Yield a sentence for each step file that the project names and the bucket lacks."""
-    pages = [*project.steps, *project.pages_in_game]
+    pages = project.all_pages
     if project.page_folder == STEPS_FOLDER:
         uploaded = {entry.key for entry in platform.documents.list(f"{project.id}/{STEPS_FOLDER}/")}
     else:
         uploaded = uploaded_pages.at_top(platform.documents, project.id, {step.page for step in pages})
-    for step in pages:
-        section = "project.steps" if step in project.steps else "trial"
-        for file in step.files:
-            if project.page_key(file) not in uploaded:
-                yield f"{section}.{step.key}: {file}.html has not been uploaded"
+    missing = {  # a page that is repeated once
+        f"{_place_in_config(project, page)}: {file}.html has not been uploaded": None
+        for page in pages
+        for file in page.files
+        if project.page_key(file) not in uploaded
+    }
+    yield from missing
+
+
+def _place_in_config(project: Project, page: Step) -> str:
+    """Where config.yml names a page."""
+    if page.key in GAME_PAGES:
+        return f"trial.{page.key}"
+    is_end = project.step(page.key) is None and any(end.name == page.key for end in project.ends)
+    return f"project.ends.{page.key}.page" if is_end else f"project.steps.{page.step_name}"
 
 
 def sign_links(platform: Platform, request: object) -> list[str]:

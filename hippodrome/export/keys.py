@@ -108,6 +108,8 @@ def _read_session(project: str, listed: Listed) -> Item:
         why = "it was still being written"
     elif parts[1:] == ["session.json"]:
         return Item(KeyKind.SESSION, listed, session)
+    elif parts[1:] == ["assignment.json"]:  # each member has a copy
+        return Item(KeyKind.ANSWER, listed, session, ASSIGNED)
     elif len(parts) == 4 and parts[1] == "trials" and parts[3].endswith(_END):
         if found := _recording(listed, session, parts[2], parts[3]):
             return found

@@ -278,8 +278,8 @@ def _of_session(key: str) -> str:
     """A key below `sessions/` without ids of participants. The session's id stays, since it does not identify anyone;
     unknown parts are left out."""
     match key.split("/"):
-        case [top, session, "session.json"] if is_session_id(session):
-            return f"{top}/{session}/session.json"
+        case [top, session, "session.json" | "assignment.json" as name] if is_session_id(session):
+            return f"{top}/{session}/{name}"
         case [top, session, "trials", _, name] if is_session_id(session) and _RECORDED.fullmatch(name):
             return f"{top}/{session}/trials/(server)/{name}"
     return "(somewhere in sessions/)"

@@ -18,10 +18,6 @@ SERVER_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}")
 """The form of the names of servers."""
 
 
-ASSIGNMENT = "assignment.json"
-"""The name of the document with a participant's, or a session's, levels and games."""
-
-
 def participant_folder(project_id: str, user_id: str) -> str:
     """Return the folder of all documents of one participant."""
     return f"{project_id}/users/{user_id}/"
@@ -30,11 +26,6 @@ def participant_folder(project_id: str, user_id: str) -> str:
 def answer_key(project_id: str, user_id: str, step: str) -> str:
     """Return the key of the answer to one step."""
     return f"{participant_folder(project_id, user_id)}answers/{step}.json"
-
-
-def assignment_key(project_id: str, user_id: str) -> str:
-    """Return the key of a participant's assignment: their levels, orders and games."""
-    return f"{participant_folder(project_id, user_id)}{ASSIGNMENT}"
 
 
 def recordings_folder(project_id: str, user_id: str) -> str:

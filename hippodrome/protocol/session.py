@@ -24,6 +24,8 @@ from hippodrome.protocol.keys import NAME, participant_folder, session_folder
 SCHEMA = 1
 MAX_PLAYERS = 16
 """The most participants of one session."""
+ASSIGNMENT = "assignment.json"
+"""The name of the document with a participant's, or a session's, levels and games (`protocol/assignment.py`)."""
 SESSION_ID = re.compile(r"s\.[0-9a-f]{20}")
 """The id of a session. No participant's id has a dot (`hippodrome.protocol.keys.NAME`)."""
 
@@ -80,6 +82,11 @@ def owner_folder(project_id: str, owner: str) -> str:
     the participant with this id."""
     folder = session_folder if is_session_id(owner) else participant_folder
     return folder(project_id, owner)
+
+
+def assignment_key(project_id: str, owner: str) -> str:
+    """Return the key of the assignment of a participant, or of a session: levels, orders and games."""
+    return f"{owner_folder(project_id, owner)}{ASSIGNMENT}"
 
 
 def member_token(token: str, user_id: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from collections import Counter
@@ -310,3 +311,95 @@ def _due(person: Browser, page: str) -> str:
     found = re.search(r'data-step="(\w+)"', page)
     assert found
     return found[1]
+
+
+# Several players
+
+PAIRS = """
+project:
+  id: pairs
+  players: 2
+  patience: 60
+  conditions: {pay: [equal, best]}
+  steps:
+    - consent
+    - each: {look: [plain, face, voice]}
+      steps: [game: {options: {look: "{look}", pay: "{pay}"}}, rate]
+    - about: {page: "about-{pay}"}
+    - debrief
+trial:
+  game: kitchen
+  players: {a: human, b: human}
+"""
+ABOUT = {f"about-{pay}": f"<h1>About {pay}</h1><button>Go on</button>" for pay in ("equal", "best")}
+
+
+def pairs(tmp_path: Path, platform: FakePlatform) -> DesignedStudy:
+    return DesignedStudy(write(tmp_path / "pairs", PAIRS, {**PAGES, **ABOUT}), platform)
+
+
+def consented(pair: DesignedStudy, user: str) -> Browser:
+    visitor = pair.visitor(user)
+    visitor.answer(visitor.get(), agree="yes")
+    return visitor
+
+
+def polled(page: str, browser: Browser) -> dict[str, Any]:
+    """What the lobby's page is told when it asks."""
+    address = re.search(r'"poll": ?"[^"?]*\?([^"]+)"', page)
+    assert address, page
+    response = Browser(browser.platform, html.unescape(address[1]).replace("\\u0026", "&")).send()
+    assert response["statusCode"] == 200, response
+    return dict(json.loads(response["body"]))
+
+
+def matched(pair: DesignedStudy, *users: str) -> tuple[str, str]:
+    """Two participants who wait in the lobby at once, and their pages after they were matched."""
+    first, second = (consented(pair, user) for user in users)
+    lobby = first.get()
+    second.get()
+    for _ in range(4):
+        pair.platform.wait(seconds=2)
+        first_told, second_told = polled(lobby, first), second.get()
+    assert first_told["state"] == "ended", "the page that waited is loaded again"
+    return first.get(), second_told
+
+
+def test_participants_who_play_together_are_assigned_together(tmp_path: Path, platform: FakePlatform) -> None:
+    pair = pairs(tmp_path, platform)
+    matched(pair, "ann", "ben")
+    theirs = [pair.stored(user, "assignment") for user in ("ann", "ben")]
+    session = pair.stored("ann", "session")["session"]
+    ours = json.loads(platform.documents.kept[f"pairs/sessions/{session}/assignment.json"][0])
+    assert theirs == [ours, ours], "one path for both"
+    assert list(ours["games"]) == [f"game-{look}" for (look,) in ours["orders"]["look"]]
+    matched(pair, "cid", "dan")
+    conditions = {pair.stored(user, "assignment")["condition"]["pay"] for user in ("ann", "cid")}
+    assert conditions == {"equal", "best"}, "pairs are balanced"
+
+
+def test_a_pair_goes_through_its_games_in_one_order(tmp_path: Path, platform: FakePlatform) -> None:
+    pair = pairs(tmp_path, platform)
+    matched(pair, "ann", "ben")
+    path = list(pair.stored("ann", "assignment")["games"])
+    for user in ("ann", "ben"):
+        visitor = pair.visitor(user)
+        for game in path:
+            assert f'"{game}"' in visitor.get()
+            pair.play(user, game)
+            visitor.answer(visitor.get(), q1=game)
+        assert heading(visitor.get()) == f"About {pair.stored(user, 'assignment')['condition']['pay']}"
+
+
+def test_who_is_matched_with_nobody_has_no_condition_and_no_further_game(
+    tmp_path: Path, platform: FakePlatform
+) -> None:
+    pair = pairs(tmp_path, platform)
+    ann = consented(pair, "ann")
+    ann.get()
+    for _ in range(40):
+        platform.wait(seconds=2)
+        page = ann.get()
+    assert heading(page) == "Thanks"
+    assert "condition" not in pair.stored("ann", "assignment")
+    assert pair.answers("ann")["about"] == {"outcome": "skipped"}

@@ -13,9 +13,11 @@ from hippodrome.control.config.diagnostics import Mistake
 from hippodrome.control.config.each_value import Checked, check_values
 from hippodrome.control.config.project_keys import STEPS
 from hippodrome.control.config.step_order import step_name, step_range
+from hippodrome.control.model import rules
 from hippodrome.control.model.step_order import FINAL, default_start, position, visited
 from hippodrome.control.model.step_types import type_of
 from hippodrome.protocol.environment import PLAIN_ORIGINS
+from hippodrome.protocol.players import HUMAN
 from hippodrome.protocol.values import KeyPath
 
 
@@ -176,11 +178,26 @@ def _game_step(checked: Checked) -> Iterator[Mistake]:
 
 
 def _together(checked: Checked) -> Iterator[Mistake]:
-    """Games of several participants have no factors and no settings of their own yet: a session has one `trial`."""
-    design = checked.design
-    if checked.project.has_sessions and (design.conditions or design.blocks or any(design.own_trial.values())):
-        why = "a study with conditions, each, or games with settings of their own is for one player in each game"
-        yield Mistake(("project", "players"), f"must be 1: {why}")
+    """Participants who play together are assigned when they are matched, at the first game; each game is for all."""
+    design, wanted = checked.design, checked.project.players
+    if not checked.project.has_sessions:
+        return
+    first = next((at for at, step in enumerate(design.steps) if step.type.on_server), len(design.steps))
+    for step in design.steps[:first]:
+        asked = {names[0] for names in rules.mentioned(step.when)} if step.when else set()
+        if step.block is not None or "{" in step.page or asked & {"condition", "order"}:
+            why = "with players: 2 or more, levels are drawn when participants are matched, at the first game"
+            yield Mistake(design.paths[step.key], f"comes too early: {why}; move this step behind it")
+    for step in design.steps:
+        for section in step.sections:
+            players = section.trial.get("players")
+            humans = [*players.values()].count(HUMAN) if isinstance(players, dict) else wanted
+            if humans != wanted:
+                at = ", ".join(f"{name}: {level}" for name, level in section.levels.items())
+                are = f"{humans} of the players are human{f' with {at}' if at else ''}"
+                message = f"{are}, and project.players is {wanted}; all who play together play each game"
+                yield Mistake(design.paths[step.key], message)
+                break
 
 
 _START: KeyPath = ("project", "events", "startServerStep")

@@ -33,7 +33,7 @@ def cells_key(project_id: str) -> str:
 
 
 class Outcome(Enum):
-    """What became of a participant."""
+    """What became of a participant, or of a session: what became of the member who came furthest."""
 
     COMPLETE = "complete"
     ACTIVE = "active"
@@ -143,3 +143,9 @@ def outcome_of(
         return Outcome.COMPLETE, last
     is_active = not has_ended and now - last <= LEFT_AFTER
     return Outcome.ACTIVE if is_active else Outcome.LEFT, last
+
+
+def most_active(outcomes: Sequence[tuple[Outcome, datetime]], now: datetime) -> tuple[Outcome, datetime]:
+    """Return what became of a session, from what became of its members; it has left if there are none any more."""
+    ranks = list(Outcome)
+    return min(outcomes, key=lambda known: ranks.index(known[0]), default=(Outcome.LEFT, now))

@@ -20,7 +20,8 @@ from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import Record
 from hippodrome.control.ports import Entry
 from hippodrome.protocol.answer import FAILED, Answer
-from hippodrome.protocol.keys import ASSIGNMENT, answer_key, participant_folder
+from hippodrome.protocol.keys import answer_key, participant_folder
+from hippodrome.protocol.session import ASSIGNMENT
 
 REPEAT_WINDOW = timedelta(seconds=60)  # a form that names no step is ignored if it repeats an answer younger than this
 MAX_HEADER = 512  # characters of a header's value

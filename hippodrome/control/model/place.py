@@ -76,7 +76,8 @@ class Standing:
             return Place(Next.END, step, end)
         if self.assignment is None and needs_assignment(self.project, step):
             return Place(Next.ASSIGN, step)
-        if step.when and not rules.holds(step.when, self._facts(step.when, step)):
+        has_no_level = self.assignment is not None and "{" in step.page  # who was matched with nobody
+        if has_no_level or (step.when and not rules.holds(step.when, self._facts(step.when, step))):
             return Place(Next.SKIP, step)
         if step.right and step.key in self.progress.tries:
             return Place(Next.JUDGE, step)

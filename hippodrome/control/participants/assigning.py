@@ -1,7 +1,8 @@
 """Assigns participants to the cells and orders of a study, by compare-and-swap on one document per study.
 
 The document (`model/balance.py`) is written first, and remembers the participant, so that a crash before their own
-document is written changes nothing: the repeated request gets the same cell and orders.
+document is written changes nothing: the repeated request gets the same cell and orders. Participants who play together
+are assigned together: their session is drawn, and each gets a copy of its assignment.
 """
 
 from __future__ import annotations
@@ -11,13 +12,23 @@ from datetime import datetime
 from random import SystemRandom
 
 from hippodrome.control.log import logger
-from hippodrome.control.model.balance import Cells, Draw, assignment_of, cells_key, outcome_of
+from hippodrome.control.model.balance import (
+    Cells,
+    Draw,
+    Outcome,
+    assignment_of,
+    cells_key,
+    most_active,
+    outcome_of,
+)
 from hippodrome.control.model.design import LATIN, Assignment
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.ports import Conflict, Document, Platform
+from hippodrome.control.servers.sessions import members_of
 from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.repository import Repository
+from hippodrome.protocol.session import is_session_id
 
 TRIES = 40
 PAUSE = 0.02  # seconds, times a random number; twice as long after each conflict, up to 32 times
@@ -26,33 +37,50 @@ _RANDOM = SystemRandom()
 
 class Assigning:
     """Assigns participants. AWS calls of `assign`: three (a read, a conditional write, a creation), and more if
-    others are assigned at the same moment, or if participants of an hour ago are looked up.
+    others are assigned at the same moment, or if participants of an hour ago are looked up. With sessions two more (the
+    membership, and the copy).
     """
 
     def __init__(self, platform: Platform, repository: Repository) -> None:
         self._platform = platform
         self._repository = repository
 
-    def assign(self, project: Project, user_id: str) -> Assignment:
+    def assign(self, project: Project, user_id: str) -> Assignment | None:
         """Draw the participant's levels and orders, and write their assignment. A second time it is the same.
 
-        `project` is the study, not a path. Raises `RetryLater` if too many are assigned at this moment.
+        The result is None as long as it is not known with whom the participant plays. Who plays with nobody gets no
+        levels and no runs. `project` is the study, not a path. Raises `RetryLater` if too many are assigned at this
+        moment.
         """
+        if not project.has_sessions:
+            return self._assignment(project, user_id)
+        membership = self._repository.membership(project.id, user_id)
+        if membership is None:
+            return None
+        if membership.session is None:
+            alone = Assignment(project.version, orders={block.name: () for block in project.blocks})
+            return self._created(project, user_id, alone)
+        return self._created(project, user_id, self._assignment(project, membership.session))
+
+    def _assignment(self, project: Project, owner: str) -> Assignment:
+        """The assignment of a participant, or of a session, drawn now or before."""
         now = self._platform.now()
         needs_balance = bool(project.conditions) or any(block.order == LATIN for block in project.blocks)
-        draw = self._draw(project, user_id, now) if needs_balance else Draw("", now)
-        assignment = assignment_of(project, user_id, draw)
-        if self._repository.create_assignment(project.id, user_id, assignment):
+        draw = self._draw(project, owner, now) if needs_balance else Draw("", now)
+        return self._created(project, owner, assignment_of(project, owner, draw))
+
+    def _created(self, project: Project, owner: str, assignment: Assignment) -> Assignment:
+        if self._repository.create_assignment(project.id, owner, assignment):
             logger.info("assigned", extra={"project": project.id})
             return assignment
-        return self._repository.assignment(project.id, user_id) or assignment
+        return self._repository.assignment(project.id, owner) or assignment
 
-    def _draw(self, project: Project, user_id: str, now: datetime) -> Draw:
+    def _draw(self, project: Project, owner: str, now: datetime) -> Draw:
         documents, key = self._platform.documents, cells_key(project.id)
         for attempt in range(TRIES):
             found = documents.get(key)
             cells = from_json(found.body, Cells) if found else Cells()
-            cells, draw = self._settled(project, cells, now).draw(project, user_id, now, _RANDOM)
+            cells, draw = self._settled(project, cells, now).draw(project, owner, now, _RANDOM)
             try:
                 self._write(key, found, cells)
                 return draw
@@ -68,9 +96,13 @@ class Assigning:
 
     def _settled(self, project: Project, cells: Cells, now: datetime) -> Cells:
         """The cells after a look at those who have done nothing for long: whether they have finished, or left."""
-        for user_id in cells.unsettled(now):
-            progress = self._repository.progress(project.id, user_id)
-            assignment = self._repository.assignment(project.id, user_id) if progress.is_assigned else None
-            path = [step.key for step in project.own(assignment).steps[:-1]]
-            cells = cells.settled(user_id, *outcome_of(path, progress.answered, progress.has_ended, now))
+        for owner in cells.unsettled(now):
+            users = members_of(self._repository, project.id, owner) if is_session_id(owner) else [owner]
+            outcomes = [self._outcome(project, user_id, now) for user_id in users]
+            cells = cells.settled(owner, *most_active(outcomes, now))
         return cells
+
+    def _outcome(self, project: Project, user_id: str, now: datetime) -> tuple[Outcome, datetime]:
+        progress = self._repository.progress(project.id, user_id)
+        path = [step.key for step in self._repository.own_project(project, user_id, progress).steps[:-1]]
+        return outcome_of(path, progress.answered, progress.has_ended, now)

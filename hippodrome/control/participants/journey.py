@@ -32,8 +32,9 @@ from hippodrome.control.participants.path import Paths, Stop
 from hippodrome.control.participants.previews import PreviewKind
 from hippodrome.control.participants.steps import HANDLERS
 from hippodrome.control.participants.steps.end import EndPage
+from hippodrome.control.participants.steps.game import UNASSIGNED
 from hippodrome.control.participants.steps.services import StepServices
-from hippodrome.control.participants.steps.shared_game import SharedGame, StepAnswered
+from hippodrome.control.participants.steps.shared_game import ENDED, SharedGame, StepAnswered
 from hippodrome.control.participants.steps.sources import NeedsAssignment
 from hippodrome.control.participants.steps.visit import Visit
 from hippodrome.control.participants.waiting import ServerStates
@@ -134,8 +135,7 @@ class Journey:
         try:
             return self._show(request, user_id, stop)
         except NeedsAssignment:
-            standing = self._paths.assigned(project, user_id, stop.standing)
-            return self._show(request, user_id, replace(stop, standing=standing))
+            return self._show(request, user_id, self._paths.assigned(project, user_id, stop.standing))
         except StepAnswered:  # by this very request, since the participant was not matched with others
             progress = self._repository.progress(project.id, user_id)
             return self._show(request, user_id, self._paths.next(project, user_id, progress))
@@ -216,7 +216,12 @@ class Journey:
         """The state of the lobby, or of the session's server. Without a membership, the query must have a ticket."""
         shown = project.step_of_ticket(user_id, step.key if step else None, request.query_value("ticket"))
         if shown is not None and shown.type.on_server:
-            standing = self._shared_game.visit(project, user_id, shown)
+            unassigned = request.has_query(UNASSIGNED)
+            reads = project.assigns and not unassigned
+            assignment = self._repository.assignment(project.id, user_id) if reads else None
+            standing = self._shared_game.visit(project.own(assignment), user_id, shown)
+            if unassigned and standing.is_matched:
+                return self._shared_game.state(project, user_id, step, standing) | {"state": ENDED}  # load it again
         else:
             found = self._shared_game.decided(project, user_id)
             if found is None or not request.has_query("ticket"):  # the page of a game for one participant sends none

@@ -12,7 +12,7 @@ from typing import Any
 
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, participant
-from hippodrome.control.model.design import End, Step
+from hippodrome.control.model.design import Assignment, End, Step
 from hippodrome.control.model.participant import Ended, Progress
 from hippodrome.control.model.place import SKIPPED, TIME_OVER, Next, Place, Standing, wrong_fields
 from hippodrome.control.model.project import Project
@@ -59,7 +59,9 @@ class Paths:
         """Do what is due, and return the step or the end at which the participant is then."""
         if progress.has_ended and (ended := self._repository.ended(project.id, user_id)) is not None:
             return Stop(self._standing(project, user_id, progress), project.final, ended, _end_of(project, ended.end))
-        standing = self._standing(project, user_id, progress)
+        return self._go_on(project, user_id, self._standing(project, user_id, progress))
+
+    def _go_on(self, project: Project, user_id: str, standing: Standing) -> Stop:
         while True:
             place = standing.place(self._platform.now())
             if place.next is Next.ASK:
@@ -67,7 +69,10 @@ class Paths:
             if place.next is Next.END and place.end is not None:
                 return Stop(standing, place.step, self._finish(project, user_id, place.end), place.end)
             if place.next is Next.ASSIGN:
-                standing = self.assigned(project, user_id, standing)
+                assignment = self._assigning.assign(project, user_id)
+                if assignment is None:
+                    return Stop(standing, place.step)  # the game, in whose lobby the participant waits for others
+                standing = _assigned(project, standing, assignment)
                 continue
             answers, wrong = self._answers_at(project, user_id, standing, place)
             if wrong:
@@ -78,11 +83,10 @@ class Paths:
             answered = {**standing.progress.answered, place.step.key: self._platform.now()}
             standing = replace(standing, progress=replace(standing.progress, answered=answered))
 
-    def assigned(self, project: Project, user_id: str, standing: Standing) -> Standing:
-        """Assign the participant to levels and orders, and return their standing on the path that follows."""
+    def assigned(self, project: Project, user_id: str, standing: Standing) -> Stop:
+        """Assign the participant to levels and orders at a page that needs them, and go on from there."""
         assignment = self._assigning.assign(project, user_id)
-        progress = replace(standing.progress, is_assigned=True)
-        return replace(standing, project=project.own(assignment), assignment=assignment, progress=progress)
+        return self._go_on(project, user_id, _assigned(project, standing, assignment) if assignment else standing)
 
     def _standing(self, project: Project, user_id: str, progress: Progress) -> Standing:
         has_one = project.assigns and progress.is_assigned
@@ -125,6 +129,12 @@ class Paths:
             logger.info("ended", extra={"project": project.id, "end": end.name})
             return ended
         return self._repository.ended(project.id, user_id) or ended
+
+
+def _assigned(project: Project, standing: Standing, assignment: Assignment) -> Standing:
+    """The standing on the path that follows from an assignment."""
+    progress = replace(standing.progress, is_assigned=True)
+    return replace(standing, project=project.own(assignment), assignment=assignment, progress=progress)
 
 
 def _end_of(project: Project, name: str) -> End | None:

@@ -41,7 +41,6 @@ from hippodrome.control.storage.secret import SecretCache
 from hippodrome.protocol.keys import (
     QUESTION_ID,
     answer_key,
-    assignment_key,
     groups_folder,
     groups_key,
     handover_key,
@@ -50,7 +49,7 @@ from hippodrome.protocol.keys import (
     session_recordings_folder,
     waiting_key,
 )
-from hippodrome.protocol.session import is_session_id
+from hippodrome.protocol.session import assignment_key, is_session_id
 
 VALID_SECONDS = 60  # a presigned request's life; S3 checks it when the request begins, and servers send it at once
 STORE_AFTER_CLOSE = timedelta(minutes=5)  # a task has two minutes to end after SIGTERM

@@ -16,8 +16,8 @@ from hippodrome.control.model.server import Server
 from hippodrome.control.ports import Conflict, Documents
 from hippodrome.control.storage.errors import RetryLater
 from hippodrome.protocol import session
-from hippodrome.protocol.keys import assignment_key, membership_key, participant_folder, session_key
-from hippodrome.protocol.session import SessionDocument
+from hippodrome.protocol.keys import membership_key, participant_folder, session_key
+from hippodrome.protocol.session import SessionDocument, assignment_key
 
 CACHED_ASSIGNMENTS = 500
 TRIES = 8  # for one change; after that the queue delivers the message again
@@ -61,12 +61,13 @@ class Repository:
         """Write the record of a participant's first visit; return False if there is one already."""
         return self._created(participant.participant_key(record.project_id, record.user_id), to_json(record))
 
-    def assignment(self, project_id: str, user_id: str) -> Assignment | None:
-        """Return the participant's levels and orders; None if none were drawn. They never change, so they are cached.
+    def assignment(self, project_id: str, owner: str) -> Assignment | None:
+        """Return the levels and orders of a participant or a session; None if none were drawn. They never change, so
+        they are cached.
 
         Raises ValueError if the document cannot be read.
         """
-        key = assignment_key(project_id, user_id)
+        key = assignment_key(project_id, owner)
         if key not in self._assignments:
             found = self._documents.get(key)
             if found is None:
@@ -76,9 +77,9 @@ class Repository:
             self._assignments[key] = from_json(found.body, Assignment)
         return self._assignments[key]
 
-    def create_assignment(self, project_id: str, user_id: str, record: Assignment) -> bool:
-        """Write the participant's levels and orders; return False if there are some already."""
-        return self._created(assignment_key(project_id, user_id), to_json(record))
+    def create_assignment(self, project_id: str, owner: str, record: Assignment) -> bool:
+        """Write the levels and orders of a participant or a session; return False if there are some already."""
+        return self._created(assignment_key(project_id, owner), to_json(record))
 
     def ended(self, project_id: str, user_id: str) -> Ended | None:
         """Return the record of the end that the participant has reached; None if there is none."""

@@ -22,7 +22,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from hippodrome.protocol import assignment, exits
-from hippodrome.protocol.keys import assignment_key
+from hippodrome.protocol.session import assignment_key
 from hippodrome.trial.agent import match
 from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.tracebacks import report

@@ -18,12 +18,14 @@ from hippodrome.control.participants import frame, pages
 from hippodrome.control.participants.forms import PostedForm
 from hippodrome.control.participants.steps.services import StepServices
 from hippodrome.control.participants.steps.shared_game import SharedGame, StepAnswered
-from hippodrome.control.participants.steps.sources import rendering, source_of
+from hippodrome.control.participants.steps.sources import NeedsAssignment, rendering, source_of
 from hippodrome.control.participants.steps.visit import Visit
 from hippodrome.control.ports import Topic
 
 ASK_AGAIN = timedelta(seconds=30)  # if there is no server after this time, the next GET sends the start message again
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
+UNASSIGNED = "unassigned"
+"""In the query of a lobby's polls: the page does not know the participant's path yet, and is loaded again then."""
 RESTART, WITHOUT = "restart", "without"
 """The values of `hippodrome-action` in the forms by which a participant asks for another server, and goes on without
 the game."""
@@ -42,13 +44,16 @@ class GameStep:
     def show(self, visit: Visit) -> Response:
         """Return the page on which the participant waits and plays. Sends a lost start message again.
 
-        Raises `StepAnswered` if the participant was not matched with others.
+        Raises `StepAnswered` if the participant was not matched with others, and `NeedsAssignment` if they were
+        matched, and the levels and orders of their session are to be drawn.
         """
         registered, visit = visit.project, self._as_it_plays(visit)
         request, project, step = visit.request, visit.project, visit.step
         ticket = ids.ticket(project.secret, visit.user_id, step.key)
         if project.has_sessions:
+            is_unassigned = project.assigns and visit.standing.assignment is None
             state, proof = self._state_together(visit), {"ticket": ticket}
+            proof |= {UNASSIGNED: "1"} if is_unassigned else {}
         else:
             state, proof = self._state_alone(visit), {}
         played = project.for_session(state.get("players", 0)) or project
@@ -125,6 +130,8 @@ class GameStep:
         standing = self._shared.visit(project, user_id, step)
         if standing.is_unmatched:
             raise StepAnswered
+        if standing.is_matched and visit.standing.assignment is None and project.assigns:
+            raise NeedsAssignment
         if standing.session is not None:
             self._request_if_overdue(visit, standing.session, standing.record, standing.players)
         return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))

@@ -46,6 +46,11 @@ class Standing:
         return self.found.players if isinstance(self.found, Membership | NoServerYet) else 0
 
     @property
+    def is_matched(self) -> bool:
+        """Whether the participant is a member of a session that has its server for good."""
+        return isinstance(self.found, Membership) and self.found.session is not None
+
+    @property
     def is_unmatched(self) -> bool:
         """Whether the participant is unmatched."""
         return isinstance(self.found, Membership) and self.found.unmatched

@@ -61,7 +61,8 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
     """The values that a page may use. Records are read only if the page mentions them."""
     project, user_id, repository, standing = visit.project, visit.user_id, services.repository, visit.standing
     mentioned = records_mentioned(text)
-    if standing.assignment is None and project.assigns and mentioned & {"condition", "order"}:
+    may_draw = project.assigns and not project.has_sessions  # with sessions the matching draws
+    if standing.assignment is None and may_draw and mentioned & {"condition", "order"}:
         raise NeedsAssignment
     values: dict[str, Any] = {
         "project": {"id": project.id, "name": project.name, "researcher": project.researcher},
