@@ -188,6 +188,8 @@ def _together(checked: Checked) -> Iterator[Mistake]:
         if step.block is not None or "{" in step.page or asked & {"condition", "order"}:
             why = "with players: 2 or more, levels are drawn when participants are matched, at the first game"
             yield Mistake(design.paths[step.key], f"comes too early: {why}; move this step behind it")
+    if any(len(humans) != wanted for _, humans in checked.trial.humans()):
+        return  # that is said of trial.players
     for step in design.steps:
         for section in step.sections:
             players = section.trial.get("players")

@@ -142,13 +142,24 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
             "[helpful]",
             "config.yml:3: project.conditions.partner: has one level; a factor needs two or more, or leave it out",
         ),
-        (
-            "  id: soup\n",
-            "  id: soup\n  players: 2\n",
-            "config.yml:3: project.players: must be 1: a study with conditions, each, or games with settings of their own "
-            "is for one player in each game",
-        ),
     ],
 )
 def test_a_mistake_gets_its_line_and_what_to_write(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     assert sentence in said(tmp_path, old, new)
+
+
+def test_with_several_players_levels_are_drawn_at_the_first_game(tmp_path: Path) -> None:
+    old = CONFIG[CONFIG.index("    - consent") :]
+    new = """    - consent
+    - quiz: {when: condition.partner == "lazy"}
+    - game: {players: {a: human, b: "agent:{partner}"}}
+    - debrief
+  players: 2
+trial: {game: kitchen, players: {a: human, b: human}}
+"""
+    assert said(tmp_path, old, new) == [
+        "config.yml:6: project.steps item 2.quiz: comes too early: with players: 2 or more, levels are drawn when "
+        "participants are matched, at the first game; move this step behind it",
+        "config.yml:7: project.steps item 3.game: 1 of the players are human with partner: helpful, and project.players "
+        "is 2; all who play together play each game",
+    ]
