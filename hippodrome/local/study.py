@@ -10,10 +10,11 @@ from rich.text import Text
 
 from hippodrome.control.config import Config
 from hippodrome.control.model import ids
+from hippodrome.control.model.project import Project
 from hippodrome.control.storage.project_cache import ProjectCache
 from hippodrome.control.storage.secret import SecretCache
 from hippodrome.functions import installed, next_step, send_start_server_message, send_stop_server_message
-from hippodrome.local import own_places
+from hippodrome.local import own_cells, own_places
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend.authority import Authority
 from hippodrome.local.backend.platform import LocalPlatform
@@ -74,7 +75,8 @@ class Study:
         )
         installed.use(self._platform)
         self._config = self._platform.publish()
-        app = App(FUNCTIONS, activity_log.warn, origins)
+        next_step_at = own_cells.OwnCells(self._platform, FUNCTIONS["next_step"]).handler
+        app = App({**FUNCTIONS, "next_step": next_step_at}, activity_log.warn, origins)
         site = self._authority.context("localhost", HOST, *sorted(TLS_NAMES)) if self._authority else None
         self.server = WebServer(app, listen(port), self._platform.retry.report, site)
         self._names: Names | None = None
@@ -128,6 +130,7 @@ class Study:
             Text(f"  Logs   {from_here(self._state / 'logs')}"),
             *self._how_to_trust(),
             *self._how_to_play_together(link),
+            *self._how_to_try_cells(link),
             Text(""),
             Text(f"  {_FOR_ONE if project.signed_links else _FOR_ALL} Ctrl-C ends everything."),
         ]
@@ -177,10 +180,35 @@ class Study:
             *(Text(f"    {link}{each}", "green") for each in queries),
         ]
 
+    def _how_to_try_cells(self, link: str) -> list[Text]:
+        """With `conditions`: a link for each of the first cells."""
+        project = self._published_project()
+        names = own_cells.cell_names(project) if project and not project.has_sessions else []
+        if not names or project is None:
+            return []
+        first, more = names[: own_cells.SHOWN], len(names) - own_cells.SHOWN
+        width = max(map(len, first))
+        return [
+            Text(""),
+            Text(f"  {_CELLS.format(factors=', '.join(factor.name for factor in project.conditions))}"),
+            *(
+                Text.assemble(
+                    f"    {name:{width}}  ",
+                    (f"{link}{self._signed(_new_id()) if project.signed_links else ''}&cell={name}", "green"),
+                )
+                for name in first
+            ),
+            *([Text(f"    … and {more} more, such as &cell={names[-1]}")] if more > 0 else []),
+        ]
+
+    def _published_project(self) -> Project | None:
+        cache = ProjectCache(self._platform, SecretCache(self._platform.documents))
+        return cache.project(self._config.project.id)
+
     def _signed(self, user_id: str) -> str:
         """What is appended to the study's link to make this participant's signed link."""
         project_id = self._config.project.id
-        project = ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
+        project = self._published_project()
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 
@@ -195,6 +223,7 @@ _TLS = """\
 _TOGETHER = """\
   To play in {places} places yourself, open these links in windows side by side: a page that is hidden counts as away.
   Come to the game in each within {patience} seconds of the others (`patience`):"""
+_CELLS = "To try a cell yourself ({factors}), open its link; it counts on this machine only, and AWS draws the cells:"
 _FOR_ALL = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _FOR_ONE = "signedLinks is true: this link is for one participant; each start prints another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"

@@ -74,12 +74,17 @@ class Cells(Record, frozen=True):
         rest = msgspec.structs.replace(self, drawn=others)
         return rest if outcome is Outcome.COMPLETE else rest._counting(draw, -1)
 
-    def draw(self, project: Project, user_id: str, now: datetime, random: Random) -> tuple[Cells, Draw]:
-        """Return the cells after this participant was assigned, and what they got. A second time it is the same."""
+    def draw(
+        self, project: Project, user_id: str, now: datetime, random: Random, cell: str | None = None
+    ) -> tuple[Cells, Draw]:
+        """Return the cells after this participant was assigned, and what they got. A second time it is the same.
+
+        With a `cell`, the participant gets this one.
+        """
         if user_id in self.drawn:
             return self, self.drawn[user_id]
         names = [cell_name(levels) for levels in cells(project.conditions)]
-        cell = random.choice(_least({name: self.people.get(name, 0) for name in names}))
+        cell = cell or random.choice(_least({name: self.people.get(name, 0) for name in names}))
         latin = {block.name: len(latin_rows(len(block.runs))) for block in project.blocks if block.order == LATIN}
         uses = {name: dict(enumerate(self._uses(name, cell, number))) for name, number in latin.items()}
         rows = {name: random.choice(_least(of_rows)) for name, of_rows in uses.items()}

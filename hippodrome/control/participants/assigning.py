@@ -45,15 +45,16 @@ class Assigning:
         self._platform = platform
         self._repository = repository
 
-    def assign(self, project: Project, user_id: str) -> Assignment | None:
+    def assign(self, project: Project, user_id: str, cell: str | None = None) -> Assignment | None:
         """Draw the participant's levels and orders, and write their assignment. A second time it is the same.
 
         The result is None as long as it is not known with whom the participant plays. Who plays with nobody gets no
-        levels and no runs. `project` is the study, not a path. Raises `RetryLater` if too many are assigned at this
-        moment.
+        levels and no runs. `project` is the study, not a path. With the name of a `cell` a participant who plays alone
+        gets this one: only a study on one machine gives it (`local/own_cells.py`). Raises `RetryLater` if too many are
+        assigned at this moment.
         """
         if not project.has_sessions:
-            return self._assignment(project, user_id)
+            return self._assignment(project, user_id, cell)
         membership = self._repository.membership(project.id, user_id)
         if membership is None:
             return None
@@ -62,11 +63,11 @@ class Assigning:
             return self._created(project, user_id, alone)
         return self._created(project, user_id, self._assignment(project, membership.session))
 
-    def _assignment(self, project: Project, owner: str) -> Assignment:
+    def _assignment(self, project: Project, owner: str, cell: str | None = None) -> Assignment:
         """The assignment of a participant, or of a session, drawn now or before."""
         now = self._platform.now()
         needs_balance = bool(project.conditions) or any(block.order == LATIN for block in project.blocks)
-        draw = self._draw(project, owner, now) if needs_balance else Draw("", now)
+        draw = self._draw(project, owner, now, cell) if needs_balance else Draw("", now)
         return self._created(project, owner, assignment_of(project, owner, draw))
 
     def _created(self, project: Project, owner: str, assignment: Assignment) -> Assignment:
@@ -75,12 +76,12 @@ class Assigning:
             return assignment
         return self._repository.assignment(project.id, owner) or assignment
 
-    def _draw(self, project: Project, owner: str, now: datetime) -> Draw:
+    def _draw(self, project: Project, owner: str, now: datetime, cell: str | None) -> Draw:
         documents, key = self._platform.documents, cells_key(project.id)
         for attempt in range(TRIES):
             found = documents.get(key)
             cells = from_json(found.body, Cells) if found else Cells()
-            cells, draw = self._settled(project, cells, now).draw(project, owner, now, _RANDOM)
+            cells, draw = self._settled(project, cells, now).draw(project, owner, now, _RANDOM, cell)
             try:
                 self._write(key, found, cells)
                 return draw
