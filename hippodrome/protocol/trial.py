@@ -12,7 +12,7 @@ from hippodrome.protocol import players as player_checks
 from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.trial_sections import SceneSection, Ui
-from hippodrome.protocol.values import KeyPath, number_in
+from hippodrome.protocol.values import KeyPath, number_in, show
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 MAX_EPISODES = 1_000_000
@@ -40,6 +40,15 @@ def _break(value: object) -> float | str:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
 
+def _until(value: object) -> dict[str, int] | None:
+    """Check `until` and return it; None if it is left out."""
+    if value is None:
+        return None
+    if not isinstance(value, dict) or [*value] != ["success"]:
+        raise ValueError(f"must be a number of episodes that succeed, such as {{success: 3}}, not {show(value)}")
+    return {"success": int(str(values.whole(1, MAX_EPISODES)(value["success"])))}
+
+
 def _rate(default: int, meaning: str, **more: Any) -> Any:
     return keyed.whole(1, HIGHEST_RATE, default, meaning, **more)
 
@@ -58,6 +67,20 @@ class TrialSection(Section):
     )
     max_episodes: int = keyed.whole(
         1, MAX_EPISODES, 20, "Episodes until the trial is over and the participant moves on.", example="3"
+    )
+    until: dict[str, int] | None = keyed.key(
+        _until,
+        None,
+        'The trial is over as soon as so many episodes have ended with a true `info["success"]`, in all. '
+        "`maxEpisodes` stays the most that are played; the answer has `reached`, true or false.",
+        {
+            "type": ["object", "null"],
+            "properties": {"success": {"type": "integer", "minimum": 1, "maximum": MAX_EPISODES}},
+            "required": ["success"],
+            "additionalProperties": False,
+        },
+        kind="`{success: n}`",
+        example="{success: 3}",
     )
     between_episodes: float | str = keyed.key(
         _break,

@@ -35,6 +35,13 @@ def _frame_rates(trial: TrialSection) -> Iterator[SectionProblem]:
         yield SectionProblem((key,), sentence, (lower, upper))
 
 
+def _criterion(trial: TrialSection) -> Iterator[SectionProblem]:
+    """`until` can be reached in `maxEpisodes`."""
+    if trial.until is not None and trial.until["success"] > trial.max_episodes:
+        sentence = f"nobody can reach it in {trial.max_episodes} episodes; write a larger maxEpisodes"
+        yield SectionProblem(("until",), sentence, ("until", "maxEpisodes"))
+
+
 def _actions_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
     """`keys` and `labels` name only actions of `actionSpace`, if the file has it."""
     names = [action.lower() for action in trial.action_space]
@@ -93,6 +100,7 @@ def _substitute(trial: TrialSection) -> Iterator[SectionProblem]:
 
 RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _frame_rates,
+    _criterion,
     _different_actions,
     _actions_that_exist,
     _players_that_exist,

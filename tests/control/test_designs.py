@@ -403,3 +403,33 @@ def test_who_is_matched_with_nobody_has_no_condition_and_no_further_game(
     assert heading(page) == "Thanks"
     assert "condition" not in pair.stored("ann", "assignment")
     assert pair.answers("ann")["about"] == {"outcome": "skipped"}
+
+
+# Games that fail, and training
+
+
+FAILING = LOOKS.replace(
+    "trial:", "  ends:\n    failed: {code: CF1}\n    untrained: not answers.level.reached\ntrial:"
+).replace("    - consent\n", "    - consent\n    - level: {until: {success: 1}, maxEpisodes: 3}\n")
+
+
+def test_a_game_that_no_server_could_run_leads_to_the_end_failed(tmp_path: Path, platform: FakePlatform) -> None:
+    looks = study(FAILING, tmp_path, platform)
+    ann = consented(looks, "ann")
+    ann.get()
+    looks.play("ann", "level", reached=True)
+    ann.get()
+    first = next(iter(looks.stored("ann", "assignment")["orders"]["look"]))[0]
+    looks.play("ann", f"game-{first}", outcome="failed")
+    assert "CF1" in ann.get()
+    assert looks.stored("ann", "end")["end"] == "failed"
+
+
+@pytest.mark.parametrize(("reached", "end"), [(False, "untrained"), (True, None)])
+def test_who_is_not_trained_leaves(tmp_path: Path, platform: FakePlatform, reached: bool, end: str | None) -> None:
+    looks = study(FAILING, tmp_path, platform)
+    ann = consented(looks, "ann")
+    ann.get()
+    looks.play("ann", "level", reached=reached)
+    ann.get()
+    assert (looks.stored("ann", "end") or {}).get("end") == end

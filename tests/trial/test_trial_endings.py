@@ -189,3 +189,26 @@ def test_wrong_settings_are_named(tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith("trial: ")
     assert "Traceback" not in done.stderr
+
+
+LEARNER = """
+_reset, _step = Grid.reset, Grid.step
+def _began(self, **options):
+    self.episode = getattr(self, "episode", 0) + 1
+    return _reset(self, **options)
+def _measured(self, action):
+    seen, reward, terminated, truncated, info = _step(self, action)
+    import numpy as np
+    return seen, reward, terminated, truncated, {**info, "success": np.bool_(self.episode != 2)}
+Grid.reset, Grid.step = _began, _measured
+"""
+
+
+async def test_training_ends_once_so_many_episodes_have_succeeded(launch, open_client, grid):
+    trial = {"maxEpisodes": 9, "betweenEpisodes": 0, "until": {"success": 2}}
+    server = launch(agent=grid(3) + LEARNER, trial=trial)
+    async with open_client(server.address) as client:
+        await client.start()
+        await client.until(lambda: client.done)
+    answers = server.answer()["answers"]
+    assert (answers["episodes"], answers["outcome"], answers["reached"]) == (3, "finished", True)

@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from hippodrome.control.model import rules
-from hippodrome.control.model.design import Assignment, End, Step
+from hippodrome.control.model.design import FAILED, Assignment, End, Step
 from hippodrome.control.model.participant import Progress
 from hippodrome.control.model.project import Project
 
@@ -89,7 +89,7 @@ class Standing:
         """The end that is reached between the step answered last and this one; None if there is none.
 
         Who is at a game does not run out of time there: the time of arrival at the game counts. With None for `now`
-        nobody runs out of time.
+        nobody runs out of time. The end `failed` is reached after a game that no server could run.
         """
         progress = self.progress
         if now is not None and last is not None and step.type.on_server:
@@ -99,9 +99,14 @@ class Standing:
             if timed and now - progress.arrived > timedelta(minutes=end.minutes):  # type: ignore[operator,arg-type]
                 return end
             due = (rule for rule in end.when if last is not None and self._is_due(rule, last))
-            if any(rules.holds(rule, self._facts(rule, step)) for rule in due):
+            if any(rules.holds(rule, self._facts(rule, self.project.final)) for rule in due):
+                return end
+            if end.name == FAILED and last is not None and last.type.on_server and self._has_failed(last):
                 return end
         return None
+
+    def _has_failed(self, game: Step) -> bool:
+        return self._read(game.key).get("outcome") == FAILED
 
     def _is_due(self, rule: str, last: Step) -> bool:
         """Whether an end's rule is looked at now: it asks about the last answer, and has all answers that it needs."""

@@ -244,7 +244,8 @@ class AgentCalls(Calls):
             **(self._extra(result.extra) if result.extra else {}),
         )
         view = self._view(result.info) if self._views else None
-        return StepTaken({PLAYER: result.reward}, result.terminated, result.truncated, frame, line, view)
+        success = recording.succeeded(result.info)
+        return StepTaken({PLAYER: result.reward}, result.terminated, result.truncated, frame, line, view, success)
 
 
 def mask_in(info: Mapping[str, Any]) -> Sequence[Any] | None:

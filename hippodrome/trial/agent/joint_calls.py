@@ -130,7 +130,8 @@ class JointCalls(Calls):
             **(self._extra(joint.extra) if joint.extra else {}),
         )
         self._ended = _ended(joint)
-        return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint))
+        success = recording.succeeded(joint.infos.get(first, {}))
+        return StepTaken(joint.rewards, terminated, truncated, pictures, line, self._view(joint), success)
 
     def _step_part(self, player: str, action: Action, joint: Joint) -> dict[str, Any]:
         """Build one player's part of a step's line."""

@@ -170,6 +170,8 @@ class StepTaken(NamedTuple):
     pictures: Pictures
     line: Any
     view: View | None = None
+    success: bool = False
+    """Whether the info of the step, of the first human, has a true `success`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,8 @@ class Episode:
     scores: Mapping[str, float] = field(default_factory=dict)
     limit: str | None = None
     """The key of `trial` whose limit truncated it, maxSteps or episodeSeconds; None if no limit did."""
+    success: bool = False
+    """Whether the info of its last step has a true `success`."""
 
 
 @dataclass(frozen=True, slots=True)

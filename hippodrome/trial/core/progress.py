@@ -62,6 +62,8 @@ class TrialProgress:
         self.total_steps = 0
         self.episodes_played = 0
         """The number of episodes that are over and had at least one step."""
+        self.successes = 0
+        """The number of episodes that ended with `success`."""
         self.scores = dict.fromkeys(self.players, 0.0)
         """By player, the sum of rewards in the trial."""
         self.episode_scores = dict.fromkeys(self.players, 0.0)
@@ -90,18 +92,24 @@ class TrialProgress:
         """The first human's score in this episode."""
         return self.episode_scores[self.first]
 
+    @property
+    def reached(self) -> bool:
+        """Whether as many episodes have succeeded as `until` says; False without `until`."""
+        return self.config.until is not None and self.successes >= self.config.until["success"]
+
     def resume(self, ended: Sequence[Episode]) -> None:
         """Go on after these episodes, which were played on an earlier server. Call it before anything is played."""
         for episode in ended:
             self.episodes_played += episode.steps > 0
             self.total_steps += episode.steps
             self._add(self.scores, episode.scores or {self.first: episode.score})
+            self.successes += episode.success
             self._has_good_episode |= episode.why != "failed"
             self.episode = episode.number + 1
         if ended and ended[-1].why in ("stopped", PARTNER_LEFT):
             self._end(ended[-1].why)
-        elif self.episode > self.config.max_episodes:
-            self.episode = self.config.max_episodes
+        elif self.episode > self.config.max_episodes or self.reached:
+            self.episode = min(self.episode - 1, self.config.max_episodes)
             self._end("finished" if self._has_good_episode else "failed")
 
     def _add(self, scores: dict[str, float], more: Mapping[str, float]) -> None:
@@ -257,9 +265,18 @@ class TrialProgress:
         self._end_episode("truncated", "episodeSeconds")
 
     def stepped(
-        self, rewards: Mapping[str, float], terminated: bool, truncated: bool, limit: str | None = None
+        self,
+        rewards: Mapping[str, float],
+        terminated: bool,
+        truncated: bool,
+        limit: str | None = None,
+        *,
+        success: bool = False,
     ) -> None:
-        """Count a step. `limit`: the key of `trial` whose limit ends the episode with this step; None if none does."""
+        """Count a step. `limit`: the key of `trial` whose limit ends the episode with this step; None if none does.
+
+        `success`: whether the episode has succeeded if it ends with this step.
+        """
         if self.over:
             return
         self.steps += 1
@@ -272,7 +289,7 @@ class TrialProgress:
             self._failures = 0
             self._has_good_episode = True
             own = terminated or truncated
-            self._end_episode("terminated" if terminated else "truncated", None if own else limit)
+            self._end_episode("terminated" if terminated else "truncated", None if own else limit, success=success)
 
     def failed(self, *, fatal: bool = False) -> None:
         """End the episode after an error of the researcher's code. `fatal`: end the trial, since it cannot go on."""
@@ -286,15 +303,16 @@ class TrialProgress:
         else:
             self._end_episode("failed")
 
-    def _close_episode(self, why: str, limit: str | None = None) -> None:
+    def _close_episode(self, why: str, limit: str | None = None, *, success: bool = False) -> None:
         scores = dict(self.episode_scores) if self.several else {}
-        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why, scores, limit))
+        self.ended.append(Episode(self.episode, self.steps, self.episode_score, why, scores, limit, success))
+        self.successes += success
         if self.steps > 0:
             self.episodes_played += 1
 
-    def _end_episode(self, why: str, limit: str | None = None) -> None:
-        self._close_episode(why, limit)
-        if self.episode >= self.config.max_episodes:
+    def _end_episode(self, why: str, limit: str | None = None, *, success: bool = False) -> None:
+        self._close_episode(why, limit, success=success)
+        if self.episode >= self.config.max_episodes or self.reached:
             self._end("finished" if self._has_good_episode else "failed")
             return
         if self.playing and self.config.between_seconds > 0:

@@ -43,6 +43,7 @@ def answers(progress: TrialProgress, seconds: float, trial_id: str) -> dict[str,
         "seconds": round(seconds, 3),
         "trial": trial_id,
         "outcome": progress.outcome,
+        **({"reached": progress.reached} if progress.config.until else {}),
     }
 
 

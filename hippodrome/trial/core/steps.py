@@ -59,7 +59,7 @@ class Stepper:
         self._message_log.recorded(call.messages, len(call.feedback))
         self._timing.stepped(now, progress.frame_rate)
         ended = len(progress.ended)
-        progress.stepped(step.rewards, step.terminated, step.truncated, call.truncated_by)
+        progress.stepped(step.rewards, step.terminated, step.truncated, call.truncated_by, success=step.success)
         if len(progress.ended) == ended and (step.view is not None or progress.turns is not None):
             self._see(step.view, progress, now)
         self._clients.show(step.pictures)

@@ -92,6 +92,11 @@ def plain(value: Any) -> Any:
     return Values().keep(value)
 
 
+def succeeded(info: Mapping[str, Any]) -> bool:
+    """Return whether an info has a true `success`, as environments report it (Gymnasium, Meta-World, ManiSkill)."""
+    return bool(plain(info.get("success")))
+
+
 _JSON = json.JSONEncoder(default=plain, separators=(",", ":"), allow_nan=False)
 
 

@@ -89,7 +89,8 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         current.unheard = []
         recorded.seconds += 1.0 / rate
         if line.get("terminated") or line.get("truncated"):  # over, even if the server was lost before the line `end`
-            _end(recorded, current, "terminated" if line.get("terminated") else "truncated")
+            why = "terminated" if line.get("terminated") else "truncated"
+            _end(recorded, current, why, success=recording.succeeded(line.get("info") or {}))
     elif kind == "end" and line["why"] == "shutdown":
         current.unheard = _feedback(line)
     elif kind == "end":
@@ -108,8 +109,9 @@ def _step(line: Mapping[str, Any], words: tuple[Word, ...]) -> RecordedStep:
     return RecordedStep(line["human"], line["action"], float(line["reward"] or 0.0), words, advice, players)
 
 
-def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str) -> None:
-    recorded.ended.append(Episode(episode.number, len(episode.steps), episode.score, why, episode.scores))
+def _end(recorded: RecordedTrial, episode: UnfinishedEpisode, why: str, *, success: bool = False) -> None:
+    over = Episode(episode.number, len(episode.steps), episode.score, why, episode.scores, success=success)
+    recorded.ended.append(over)
     recorded.unfinished = None
 
 

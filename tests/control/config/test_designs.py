@@ -68,6 +68,12 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
         ('"no"', "no", 'config.yml:12: project.ends.declined.when: no is not a name here; put texts in quotes ("no")'),
         ("==", "=", "config.yml:12: project.ends.declined.when: one = sets a value; write == to compare"),
         (
+            "    - game\n",
+            "    - game: {until: {success: 3}, maxEpisodes: 2}\n",
+            "config.yml:7: project.steps item 3.game.until: nobody can reach it in 2 episodes; write a larger maxEpisodes "
+            "(with partner: helpful)",
+        ),
+        (
             "soups: 3",
             "soup: 3",
             "config.yml:6: project.steps item 2.quiz.right.soup: the page of quiz has no field soup; did you mean "

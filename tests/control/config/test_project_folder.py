@@ -123,6 +123,7 @@ def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
         "trial": {
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,
+            "until": None,
             "betweenEpisodes": 3,
             "instructions": None,
             "resetFreeze": 0,

@@ -428,3 +428,30 @@ def test_missed_frames_are_skipped_and_the_intervals_stay_as_they_were():
     assert pacer.next(0.95, 10) == pytest.approx(1.0)
     assert pacer.next(1.25, 10) == pytest.approx(1.2), "one was missed"
     assert pacer.next(1.25, 20) == pytest.approx(1.25), "a new rate counts from the next frame on"
+
+
+def succeed(game, *, success):
+    game.began()
+    game.stepped({PLAYER: 1.0}, terminated=True, truncated=False, success=success)
+
+
+def test_with_until_the_trial_is_over_once_so_many_episodes_have_succeeded():
+    game = playing(maxEpisodes=9, until={"success": 2})
+    for success in (True, False):
+        succeed(game, success=success)
+    assert (game.over, game.reached) == (False, False)
+    succeed(game, success=True)
+    assert (game.outcome, game.reached, game.episode, game.episodes_played) == ("finished", True, 3, 3)
+
+
+def test_who_does_not_reach_the_criterion_plays_max_episodes():
+    game = playing(maxEpisodes=2, until={"success": 2})
+    for success in (False, True):
+        succeed(game, success=success)
+    assert (game.outcome, game.reached, game.episodes_played) == ("finished", False, 2)
+
+
+def test_successes_on_an_earlier_server_count():
+    game = new_game(maxEpisodes=9, until={"success": 2})
+    game.resume([Episode(1, 1, 1.0, "terminated", success=True), Episode(2, 1, 1.0, "terminated", success=True)])
+    assert (game.outcome, game.reached, game.episode) == ("finished", True, 2)

@@ -572,3 +572,11 @@ def test_a_line_that_was_cut_off_is_not_read():
 def test_what_is_no_gzip_is_no_recording():
     with pytest.raises(zlib.error):
         recording.read(zlib.compress(b'{"n":1}\n'))
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_a_recorded_episode_succeeded_if_its_last_step_says_so(success):
+    past = recorded_trial(
+        reset(), step(info={"success": not success}), step(terminated=True, info={"success": success})
+    )
+    assert [episode.success for episode in past.ended] == [success]
