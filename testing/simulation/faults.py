@@ -38,7 +38,7 @@ class SimulatedJourney:
     comes: float = 0.0  # seconds until they come
     closes: float | None = None  # the second at which the study is closed; None: it stays open
     group: Sequence[Habits] = ()  # instead of `person` and `others`: participants who play together
-    to_the_end: int = 0  # how many of the group come to the last page if no fault is injected
+    to_the_end: int | None = 0  # how many of the group come to the last page without a fault; None: it depends
     play: float = 60.0  # seconds for which the group plays
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
 
@@ -166,6 +166,7 @@ JOURNEYS_OF_GROUPS = (
         project=PAIR,
         minutes=6,
         play=7200.0,
+        to_the_end=None,  # who has joined the last server when its time is over counts as left by the other
     ),
 )
 

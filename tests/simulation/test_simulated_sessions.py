@@ -37,7 +37,8 @@ PAIRS = msgspec.structs.replace(PROJECT, players=2, patience=300.0)
 def test_a_groups_journey_without_faults_ends_as_expected(journey):
     _, outcome = faults.run(journey, SEED)
     assert outcome.well, outcome
-    assert sum(visit.finished is not None for visit in (outcome.visit, *outcome.others)) == journey.to_the_end, outcome
+    finished = sum(visit.finished is not None for visit in (outcome.visit, *outcome.others))
+    assert journey.to_the_end in (None, finished), outcome
 
 
 @pytest.mark.explores
