@@ -24,6 +24,7 @@ from hippodrome.protocol.players import MAX_PLAYERS
 SCHEMA = 1
 RECORDED = 1
 """The version of recordings' lines (`v`) that is converted."""
+MAX_FORM_COLUMNS = 200  # of one player in one episode
 _MAX_VERSIONS = 10  # that are named
 
 
@@ -106,6 +107,7 @@ def convert(
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
         episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}
         episode["players"] = _who_plays(header, scrub)
+        episode["forms"] = {player: scrub.value(fields) for player, fields in episode["forms"].items()}
         if playing is not None:
             episode |= {"session": constants.get("session"), "people": playing}
     return done
@@ -120,6 +122,8 @@ def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
         done.complete = kind == "end"
     number = line.get("episode")
     now = done.episodes[-1] if done.episodes else None
+    if kind == "break" and now is not None:
+        _add_forms(now, line.get("messages"))
     if kind == "reset":
         if now is not None and now["why"] is None and not now["frames"] and now["episode"] == as_whole(number):
             done.episodes.pop()  # that reset failed, so its episode was not played
@@ -133,6 +137,7 @@ def _count(done: Converted, line: Mapping[str, Any], kind: object) -> None:
             done.episodes.append(now)
         now["frames"] += 1
         now["score"] += as_number(line.get("reward")) or 0.0
+        _add_forms(now, line.get("messages"))
         _add_players(now, line.get("players"))
         now["ended"] = as_text(line.get("time"))
     elif kind == "end" and now is not None and now["episode"] == as_whole(number):
@@ -150,10 +155,25 @@ def _episode(line: Mapping[str, Any], number: int | None, seed: int | None) -> d
         "score": 0.0,
         "scores": {},
         "byPolicy": {},
+        "forms": {},
         "why": None,
         "started": started,
         "ended": started,
     }
+
+
+def _add_forms(episode: dict[str, Any], messages: Any) -> None:
+    """Add the fields that participants have filled in on a page of the game: of two forms of a page, the later one."""
+    for message in messages if isinstance(messages, list) else ():
+        form = message.get("form") if isinstance(message, Mapping) else None
+        if not isinstance(form, Mapping):
+            continue
+        fields = form.get("fields")
+        for name, value in fields.items() if isinstance(fields, Mapping) else ():
+            own = episode["forms"].setdefault(str(message.get("player", "")), {})
+            if len(own) < MAX_FORM_COLUMNS:
+                text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+                own[f"{form.get('page')}.{name}"] = text
 
 
 def _add_players(episode: dict[str, Any], players: Any) -> None:

@@ -214,9 +214,8 @@ def _run(
         if options.long:
             written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), style)
         if options.wanted.recordings:
-            players, shared = tables.players(state), tables.in_sessions(state)
-            rows = tables.episodes(state, players, shared)
-            written += table_files.write(folder / "episodes", tables.episode_columns(players, shared), rows, style)
+            shared = tables.in_sessions(state)
+            written += table_files.write(folder / "episodes", *tables.episodes(state, in_sessions=shared), style)
             if any(found.get("callbacks") for _, _, found in state.episodes()):
                 lines = tables.callbacks(state, folder, shared)
                 written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.export import scrub
+from hippodrome.export.recording import MAX_FORM_COLUMNS
 from hippodrome.export.recording_columns import as_number, as_whole, when
 from hippodrome.export.scrub import clean
 from hippodrome.export.state import ExportedParticipant, ExportState
@@ -55,20 +56,36 @@ def players(state: ExportState) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))[:MAX_PLAYERS]
 
 
-def episode_columns(players: Sequence[str], in_sessions: bool) -> list[Column]:
-    """Return the columns of `episodes`."""
-    kinds = (Column(f"player.{clean(name)}") for name in players)
-    scores = (Column(f"score.{clean(name)}", "number") for name in players)
-    return [*EPISODES, *((*_SESSION_COLUMNS, _BY_POLICY) if in_sessions else ()), *kinds, *scores]
+def form_fields(state: ExportState) -> tuple[str, ...]:
+    """Return the fields of all pages in games, such as `betweenEpisodes.trust`, at most MAX_FORM_COLUMNS."""
+    forms = (fields for _, _, found in state.episodes() for fields in found.get("forms", {}).values())
+    return tuple(dict.fromkeys(name for fields in forms for name in fields))[:MAX_FORM_COLUMNS]
 
 
-def episodes(state: ExportState, players: Sequence[str], in_sessions: bool) -> Iterator[list[Any]]:
-    """Yield a row per episode: its outcome, the file with its frames, and who played each player with which score.
+def episodes(state: ExportState, *, in_sessions: bool) -> tuple[list[Column], Iterator[list[Any]]]:
+    """Return the columns of `episodes`, and its rows: one for each episode, or in a session for each human player."""
+    humans, forms = players(state), form_fields(state)
+    columns = [
+        *EPISODES,
+        *((*_SESSION_COLUMNS, _BY_POLICY) if in_sessions else ()),
+        *(Column(f"player.{clean(name)}") for name in humans),
+        *(Column(f"score.{clean(name)}", "number") for name in humans),
+        *(Column(clean(name)) for name in forms),
+    ]
+    return columns, _episode_rows(state, humans, in_sessions, forms)
+
+
+def _episode_rows(
+    state: ExportState, players: Sequence[str], in_sessions: bool, forms: Sequence[str]
+) -> Iterator[list[Any]]:
+    """Yield a row per episode: its outcome, the file with its frames, who played each player with which score, and what
+    was filled in on the pages in the game.
 
     An episode of a session has a row for each human player, with their own score.
     """
     for participant, path, found in state.episodes():
         for number, player, score in _humans(participant, found):
+            filled = found.get("forms", {}).get(player or "", {})
             yield [
                 number,
                 found["step"],
@@ -85,6 +102,7 @@ def episodes(state: ExportState, players: Sequence[str], in_sessions: bool) -> I
                 *(_in_session(found, player) if in_sessions else ()),
                 *(_text(found.get("players", {}).get(name)) for name in players),
                 *(found.get("scores", {}).get(name) for name in players),
+                *(_text(filled.get(name)) for name in forms),
             ]
 
 

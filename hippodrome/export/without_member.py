@@ -17,7 +17,7 @@ from typing import Any
 from hippodrome.export import recording_columns, recording_lines
 from hippodrome.export.scrub import SHORTEST, Scrub
 
-ABOUT_ONE = frozenset({"on_feedback", "on_join", "on_leave", "on_return"})
+ABOUT_ONE = frozenset({"on_feedback", "on_form", "on_join", "on_leave", "on_return"})
 """Callbacks on one participant. A line of theirs without `player` may be about any member."""
 OF_EACH = ("roundTrip", "outcomes")
 """Fields of lines that map each player to a value."""

@@ -97,3 +97,29 @@ def test_without_a_network_the_page_says_what_is_kept_and_what_to_do_and_it_reco
     else:
         lone_tab.wait_for_selector("#wait-status:empty", state="attached")
         assert len(world.polls) > requests
+
+
+def test_what_is_filled_in_between_two_games_is_sent_once_it_is_complete(world: World, tab: Any) -> None:
+    world.trial = {"betweenEpisodes": "beliefs"}
+    world.texts = {
+        "betweenEpisodes": "<label>How sure are you? <input name='sure' type='number' required></label>"
+        "<label><input type='checkbox' name='saw' value='red'> red</label>"
+        "<label><input type='checkbox' name='saw' value='blue'> blue</label>"
+    }
+    play(world, tab)
+    tell(world, state="break")
+    tab.wait_for_selector("input[name=sure]:visible")
+    tab.click("#reading-button")
+    assert tab.is_visible("input[name=sure]"), "a required field is empty"
+    tab.fill("input[name=sure]", "70")
+    tab.check("input[value=red]")
+    tab.check("input[value=blue]")
+    shot(tab, "fields-between-games")
+    tab.press("input[name=sure]", "Enter")
+    world.wait_for({"form": {"page": "betweenEpisodes", "fields": {"sure": "70", "saw": ["red", "blue"]}}})
+    world.wait_for({"command": "start"})
+    tell(world, state="playing", episode=2)
+    tab.wait_for_selector("#screen:visible")
+    tell(world, state="break", episode=2)
+    tab.wait_for_selector("input[name=sure]:visible")
+    assert tab.input_value("input[name=sure]") == ""

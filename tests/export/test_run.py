@@ -473,7 +473,7 @@ def test_tables_are_whole_after_an_interruption(place: Place, monkeypatch: Any, 
     with pytest.MonkeyPatch.context() as patch:
         from hippodrome.export import table_files, tables
 
-        def stop(*args: Any) -> Any:
+        def stop(*args: Any, **named: Any) -> Any:
             raise KeyboardInterrupt
 
         patch.setattr(manifest if what == "write" else tables, what, stop) if what != "answers" else patch.setattr(

@@ -198,7 +198,7 @@ $content
 $texts
 <p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
 </section>""",
-    "text": '<div class="page" id="text-$key" hidden>\n$content\n</div>',
+    "text": '<form class="page" id="text-$key" hidden>\n$content\n</form>',
     "alone": """<h1>TEXT.gettingReady</h1>
 <p>TEXT.startingAlone</p>""",
     "together": """<h1>TEXT.preparedHeading</h1>

@@ -193,7 +193,7 @@ def _dry_run(tally: Tally, target: Path, as_json: bool) -> int:
     return Exit.CHANGES if tally.to_fetch or tally.gone else Exit.DONE
 
 
-def _tell_moved(moved: list[dict[str, Any]]) -> None:
+def _tell_agent(moved: list[dict[str, Any]]) -> None:
     """Warn about steps whose answers come from another page than the present one."""
     for step in moved:
         name, page = step["step"], step["page"]
@@ -224,7 +224,7 @@ def _tell(made: dict[str, Any], target: Path) -> None:
         screen.info(
             "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
         )
-    _tell_moved(made["moved"])
+    _tell_agent(made["moved"])
     if counts["problems"]:
         problems = formatting.count(counts["problems"], "remark")
         screen.warning(f"{problems} on files that are not as they should be: {target / 'problems.csv'}")

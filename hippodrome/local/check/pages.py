@@ -59,10 +59,6 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
     used = _pages(names, config)
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
     found = [_unused(folder, unused)] if unused else []
-    for file in dict.fromkeys(file for page in config.game_pages for file in page.files):
-        if every_branch(source_of(file)).has_fields:
-            message = "its fields are not sent anywhere, since the game page shows it; ask in a step of its own"
-            found.append(Diagnostic(f"{folder.name}/{file.name}", None, "", message, remark=True))
     if config.project.use_aws:
         found += [_too_large(folder, name) for name in sorted(names) if _size(folder / name) > MAX_BYTES]
     if not config.project.keeps_off_aws and not config.project.signed_links:  # strangers may come, from a recruiter

@@ -11,6 +11,7 @@ FEEDBACK = "on_feedback"
 JOIN = "on_join"
 LEAVE = "on_leave"
 RETURN = "on_return"
+FORM = "on_form"
 NAMES = (
     SESSION_START,
     SESSION_END,
@@ -21,4 +22,5 @@ NAMES = (
     JOIN,
     LEAVE,
     RETURN,
+    FORM,
 )

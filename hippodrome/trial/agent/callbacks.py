@@ -193,9 +193,9 @@ class Callbacks:
         """Call `on_session_end`, after the trial."""
         self._call(SESSION_END)
 
-    def player_moved(self, name: str, player: str) -> None:
-        """Call `on_join`, `on_leave` or `on_return` (`name`), after a participant has come, left or returned."""
-        self._call(name, player)
+    def of_player(self, name: str, player: str, fields: Mapping[str, Any] | None = None) -> None:
+        """Call `on_join`, `on_leave`, `on_return`, or `on_form` with the form's `fields`."""
+        self._call(name, player, *(() if fields is None else (dict(fields),)))
 
     # ---- lines
 

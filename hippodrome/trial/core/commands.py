@@ -36,8 +36,8 @@ class Commands:
 
     def receive(
         self, client: Client, message: Message, progress: TrialProgress, participants: Participants, now: float
-    ) -> None:
-        """Record a client's message and carry it out. If it is refused, tell the client why."""
+    ) -> bool:
+        """Record a client's message, carry it out, and return True. If it is refused, tell the client why."""
         try:
             self._check(message, progress, participants)
             self._message_log.add(message, int(now * 1e9), participants.name_of(client.player))
@@ -46,6 +46,8 @@ class Commands:
             self._carry_out(message, client.player, progress, participants, now)
         except CommandRefused as refused:
             self._clients.send(client, messages.error(str(refused)))
+            return False
+        return True
 
     def _check(self, message: Message, progress: TrialProgress, participants: Participants) -> None:
         """Raise CommandRefused if the project does not offer what the message asks for. It is not recorded then."""
@@ -56,7 +58,9 @@ class Commands:
         missing = not_offered(message, self._offered)
         if missing is not None:
             raise CommandRefused(f"{missing} is not offered in this game")
-        if messages.is_feedback(message.command) and progress.over:
+        if message.form is not None and message.form.page not in self._config.pages:
+            raise CommandRefused(f"this game has no page {message.form.page}")
+        if (messages.is_feedback(message.command) or message.form is not None) and progress.over:
             raise CommandRefused("the game is over, and no command has an effect any more")
 
     def _carry_out(

@@ -139,11 +139,12 @@ class StepCall(FeedbackCall):
 
 
 @dataclass(frozen=True, slots=True)
-class TellMoved:
-    """Tell the agent's callbacks that a player's participant has come, left or returned."""
+class TellAgent:
+    """Tell the agent's callbacks that a player's participant has come, left, returned, or filled in a form."""
 
-    callback: Literal["on_join", "on_leave", "on_return"]
+    callback: Literal["on_join", "on_leave", "on_return", "on_form"]
     player: str
+    fields: Mapping[str, Any] | None = None  # of the form
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +285,7 @@ Effect = (
     | SendDone
     | Close
     | Call
-    | TellMoved
+    | TellAgent
     | AskPolicy
     | ResetPolicy
     | OpenRecording

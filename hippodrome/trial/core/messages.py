@@ -21,7 +21,11 @@ DECODABLE = frozenset({"deflate", "jpeg", "objects"})
 """What a client may name in `decodes` of its first message (docs/wire.md)."""
 _DECODED_BY_DEFAULT = frozenset({"deflate"})
 
-_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden"})
+_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden", "form"})
+FORM_PAGES = ("instructions", "betweenEpisodes")
+"""The keys of `trial` that name the pages whose fields a client sends."""
+MAX_FORM, MAX_FORM_FIELDS = 100_000, 200
+"""The most characters of a form's values, and the most fields."""
 
 
 class NotAMessage(ValueError):
@@ -61,6 +65,17 @@ class Hello:
 
 
 @dataclass(frozen=True, slots=True)
+class Form:
+    """What a participant has filled in on a page in the game: by field a text, or a list of texts.
+
+    `page` is the key of `trial` that names the page.
+    """
+
+    page: str
+    fields: Mapping[str, str | list[str]]
+
+
+@dataclass(frozen=True, slots=True)
 class Message:
     """One later message. Fields it left out are None."""
 
@@ -81,6 +96,7 @@ class Message:
     """The name of a key of the keyboard, in a project with `keys`."""
     hidden: bool | None = None
     """Whether the participant looks at another tab or application. Only clients of a session send it."""
+    form: Form | None = None
 
     def record(self) -> dict[str, Any]:
         """Return the fields for the recording: all but `ack`, `asset`, `hidden` and the command `requestUI`."""
@@ -95,6 +111,8 @@ class Message:
             fields["held"] = self.held
         if self.frame_rate is not None:
             fields["changeFrameRate"] = self.frame_rate
+        if self.form is not None:
+            fields["form"] = {"page": self.form.page, "fields": self.form.fields}
         if self.fields:
             fields["fields"] = self.fields
         if self.fields_dropped:
@@ -195,6 +213,7 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
         key=key,
         asset=_asset(value["asset"]) if "asset" in value else None,
         hidden=_hidden(value["hidden"]) if "hidden" in value else None,
+        form=_form(value["form"]) if "form" in value else None,
     )
 
 
@@ -219,6 +238,19 @@ def _asset(value: Any) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 200:
         raise BadMessage("asset must be the name of an image")
     return value
+
+
+def _form(value: Any) -> Form:
+    fields = value.get("fields") if isinstance(value, dict) and value.get("page") in FORM_PAGES else None
+    if not isinstance(fields, dict) or not all(map(_is_answer, fields.values())):
+        raise BadMessage("form must have a page of the game, and fields with texts")
+    if len(fields) > MAX_FORM_FIELDS or len(json.dumps(fields)) > MAX_FORM:
+        raise BadMessage("the form is too long")
+    return Form(value["page"], fields)
+
+
+def _is_answer(value: Any) -> bool:
+    return isinstance(value, str) or (isinstance(value, list) and all(isinstance(part, str) for part in value))
 
 
 def _hidden(value: Any) -> bool:

@@ -59,7 +59,7 @@ from hippodrome.trial.core.effects import (
     Replayed,
     SendDone,
     StepCall,
-    TellMoved,
+    TellAgent,
     WriteLog,
 )
 from hippodrome.trial.core.ending import LAST_CALL_SECONDS, Ending
@@ -244,7 +244,7 @@ class Trial:
             self._send_done(human, client)
             return self._take_effects()
         participants.come(player, now)
-        self._tell_moved("on_return" if player in self._have_come else "on_join", player)
+        self._tell("on_return" if player in self._have_come else "on_join", player)
         self._have_come.add(player)
         self._clients.send_controls(client, self.progress, participants, now)
         client.sent = self._clients.state_of(self.progress, player)
@@ -279,7 +279,9 @@ class Trial:
         client = self._clients.of(connection)
         if client is None or not self._participants.receive(client.player, message, client.window, now):
             return []
-        self._commands.receive(client, message, self.progress, self._participants, now)
+        accepted = self._commands.receive(client, message, self.progress, self._participants, now)
+        if accepted and message.form is not None:
+            self._tell("on_form", client.player, message.form.fields)
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
@@ -500,11 +502,16 @@ class Trial:
     def _left(self, client: Client) -> None:
         self._note("disconnected", client)
         self._participants.go(client.player, self._now, closing=self._ending.closing)
-        self._tell_moved("on_leave", client.player)
+        self._tell("on_leave", client.player)
 
-    def _tell_moved(self, callback: Literal["on_join", "on_leave", "on_return"], player: str) -> None:
+    def _tell(
+        self,
+        callback: Literal["on_join", "on_leave", "on_return", "on_form"],
+        player: str,
+        fields: Mapping[str, Any] | None = None,
+    ) -> None:
         if self.callbacks and self.phase is Phase.PLAYING and not self._agent.hangs:
-            self._emit(TellMoved(callback, player))
+            self._emit(TellAgent(callback, player, fields))
 
     def _note(self, event: str, client: Client) -> None:
         """Record an event of a client among its messages, such as its connection."""

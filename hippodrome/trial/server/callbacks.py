@@ -13,14 +13,14 @@ from typing import Any
 
 from hippodrome.trial.agent.callbacks import Callbacks
 from hippodrome.trial.agent.worker import Worker
-from hippodrome.trial.core.effects import TellMoved
+from hippodrome.trial.core.effects import TellAgent
 from hippodrome.trial.recordings.recording import Line
 
-_MOVES = 4  # if so many moves wait, a return removes the leave that still waits before it
+_EVENTS = 4  # if so many events wait, a return removes the leave that still waits before it
 
 
 class TrialCallbacks:
-    """Tells the agent's callbacks who has come, left or returned (a *move*), and writes the lines that they record."""
+    """Tells the agent's callbacks what participants do (come, go, return, fill in a form), and writes their lines."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class TrialCallbacks:
         self._loop = asyncio.get_running_loop()
         self._callbacks: Callbacks | None = None
         self._recorded = 0  # the number of lines that callbacks had recorded at the end of the last work that is done
-        self._moves: deque[TellMoved] = deque()  # moves that are not told yet; a callback is being told of the first
+        self._events: deque[TellAgent] = deque()  # that are not told yet; a callback is being told of the first
 
     @property
     def busy(self) -> bool:
@@ -88,34 +88,34 @@ class TrialCallbacks:
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._write_late, recorded)
 
-    def tell_moved(self, effect: TellMoved) -> None:
-        """Tell a callback of a move, on the agent's thread, between two calls of the agent.
+    def tell_agent(self, effect: TellAgent) -> None:
+        """Tell a callback of an event, on the agent's thread, between two calls of the agent.
 
-        The moves are told one by one. If `_MOVES` wait, a participant who has left and returned counts as not having
+        The events are told one by one. If `_EVENTS` wait, a participant who has left and returned counts as not having
         moved.
         """
-        moves = self._moves
+        events = self._events
         if not self._callbacks:
             return
-        if effect.callback == "on_return" and len(moves) >= _MOVES:
-            before = max((index for index, move in enumerate(moves) if move.player == effect.player), default=0)
-            if before > 0 and moves[before].callback == "on_leave":
-                del moves[before]
+        if effect.callback == "on_return" and len(events) >= _EVENTS:
+            before = max((index for index, event in enumerate(events) if event.player == effect.player), default=0)
+            if before > 0 and events[before].callback == "on_leave":
+                del events[before]
                 return
-        moves.append(effect)
-        if len(moves) == 1:
-            self._tell_next_move()
+        events.append(effect)
+        if len(events) == 1:
+            self._tell_next()
 
-    def _tell_next_move(self) -> None:
-        callbacks, move = self._callbacks, self._moves[0]
+    def _tell_next(self) -> None:
+        callbacks, event = self._callbacks, self._events[0]
         assert callbacks is not None
-        self.on_agent(lambda: callbacks.player_moved(move.callback, move.player), self._limit, self._told_move)
+        self.on_agent(lambda: callbacks.of_player(event.callback, event.player, event.fields), self._limit, self._told)
 
-    def _told_move(self, _result: object, _error: Exception | None) -> None:
+    def _told(self, _result: object, _error: Exception | None) -> None:
         self.write_lines()
-        self._moves.popleft()
-        if self._moves and not self._is_over():
-            self._tell_next_move()
+        self._events.popleft()
+        if self._events and not self._is_over():
+            self._tell_next()
 
     def _write_late(self, recorded: int) -> None:
         self._recorded = max(self._recorded, recorded)

@@ -36,7 +36,7 @@ from hippodrome.trial.core.effects import (
     SendPicture,
     SendState,
     StepCall,
-    TellMoved,
+    TellAgent,
     WriteLine,
     WriteLog,
 )
@@ -110,7 +110,7 @@ class TrialLoop:
             SendDone: self._send_done,
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
             WriteLine: self._write_line,
-            TellMoved: self._callbacks.tell_moved,
+            TellAgent: self._callbacks.tell_agent,
             RecordLine: self._record_line,
             OpenRecording: self._open_recording,
             CloseRecording: lambda _: self._recorder.close(),

@@ -37,8 +37,11 @@ export function play(server, hear) {
   });
 }
 
+// Returns whether there is a connection that can take the message.
 export function send(message) {
-  if (link?.socket.readyState === WebSocket.OPEN) link.socket.send(JSON.stringify(message));
+  const open = link?.socket.readyState === WebSocket.OPEN;
+  if (open) link.socket.send(JSON.stringify(message));
+  return open;
 }
 
 function receive(own, raw, hear) {

@@ -1,5 +1,6 @@
 // The researcher's pages beside the game: instructions before the game and in a pause, and a page between two games.
 import { start } from "./actions.js";
+import { send } from "./connection.js";
 import { hooks } from "./hooks.js";
 import { overlays } from "./overlay.js";
 import { data, find, make, points, setText, showSection } from "./page.js";
@@ -30,6 +31,7 @@ function openText(name, goOn, score = "") {
 }
 
 function closeText() {
+  if (reading === "between") texts.between.reset();
   reading = "";
   showSection("play");
   find("screen").focus({ preventScroll: true });
@@ -37,6 +39,17 @@ function closeText() {
 
 function openBetween() {
   openText("between", TEXT.nextGame, `${TEXT.gameOver(game.episode, game.maxEpisodes)}. ${TEXT.yourScore(points(game.episodeScore))}`);
+}
+
+// Sends what the participant has filled in; returns whether they may go on.
+function sendFields(form, page) {
+  if (!form.reportValidity()) return false;
+  const fields = {};
+  for (const [name, value] of new FormData(form)) {
+    if (typeof value !== "string") continue; // a file
+    fields[name] = name in fields ? [fields[name], value].flat() : value;
+  }
+  return !Object.keys(fields).length || send({ form: { page, fields } });
 }
 
 const unread = () => Boolean(texts.instructions) && !recall(noted);
@@ -63,8 +76,18 @@ if (texts.between) overlays.break.button = TEXT.goOn;
 find("overlay").append(again);
 find("reading").append(trouble);
 again.addEventListener("click", () => openText("instructions", TEXT.backToGame));
-find("reading-button").addEventListener("click", () => {
-  if (reading === "between" && game.state === "break") return start();
+
+function goOn() {
+  if (reading === "between" && game.state === "break") return sendFields(texts.between, "betweenEpisodes") && start();
+  if (reading === "instructions" && unread() && !sendFields(texts.instructions, "instructions")) return;
   if (reading === "instructions") remember(noted, true);
   closeText();
-});
+}
+
+find("reading-button").addEventListener("click", goOn);
+for (const text of Object.values(texts)) {
+  text?.addEventListener("submit", (event) => {
+    event.preventDefault();
+    goOn();
+  });
+}

@@ -157,13 +157,18 @@ def test_callbacks_of_feedback_joining_and_leaving_are_told_the_player():
 
         on_leave = on_return = on_join
 
+        def on_form(self, session, player, fields):
+            return fields
+
     callbacks, _ = callbacks_of(Agent())
     callbacks.fed_back("player_0", "good")
+    callbacks.of_player("on_form", "player_0", {"belief": "7"})
     for name in ("on_join", "on_leave", "on_return"):
-        callbacks.player_moved(name, "player_0")
+        callbacks.of_player(name, "player_0")
     found = recorded_lines(callbacks)
     assert [(line["name"], line["value"]) for line in found] == [
         ("on_feedback", ["player_0", "good"]),
+        ("on_form", {"belief": "7"}),
         ("on_join", "player_0"),
         ("on_leave", "player_0"),
         ("on_return", "player_0"),

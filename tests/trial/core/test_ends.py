@@ -18,7 +18,7 @@ from hippodrome.trial.core.effects import (
     SendPicture,
     SendState,
     StepTaken,
-    TellMoved,
+    TellAgent,
     WriteLine,
     WriteLog,
 )
@@ -174,14 +174,32 @@ def with_callbacks(**section):
 def test_callbacks_hear_that_a_participant_comes_leaves_and_returns():
     driver = with_callbacks()
     driver.connect()
-    assert driver.of(TellMoved) == [TellMoved("on_join", PLAYER)]
+    assert driver.of(TellAgent) == [TellAgent("on_join", PLAYER)]
     driver.connect("other tab")
-    assert driver.of(TellMoved) == [TellMoved("on_leave", PLAYER), TellMoved("on_return", PLAYER)]
+    assert driver.of(TellAgent) == [TellAgent("on_leave", PLAYER), TellAgent("on_return", PLAYER)]
     driver.event("disconnect", "other tab", driver.now)
-    assert driver.of(TellMoved) == [TellMoved("on_leave", PLAYER)]
+    assert driver.of(TellAgent) == [TellAgent("on_leave", PLAYER)]
     driver.trial.callbacks = False
     driver.connect()
-    assert driver.of(TellMoved) == []
+    assert driver.of(TellAgent) == []
+
+
+def test_a_form_is_recorded_and_told_and_refused_if_the_game_has_no_such_page():
+    driver = with_callbacks(betweenEpisodes="beliefs", maxEpisodes=2)
+    driver.connect()
+    driver.say(command="start")
+    driver.step(terminated=True)
+    driver.returns()
+    driver.say(form={"page": "betweenEpisodes", "fields": {"belief": "7", "why": ["a", "b"]}})
+    assert driver.of(TellAgent) == [TellAgent("on_form", PLAYER, {"belief": "7", "why": ["a", "b"]})]
+    driver.say(form={"page": "instructions", "fields": {"belief": "8"}})
+    assert driver.of(TellAgent) == []
+    driver.say(command="start")
+    driver.returns()
+    lines = [effect.fields for effect in driver.all if isinstance(effect, RecordLine)]
+    assert [message["form"] for line in lines for message in line.get("messages", ()) if "form" in message] == [
+        {"page": "betweenEpisodes", "fields": {"belief": "7", "why": ["a", "b"]}}
+    ]
 
 
 def test_callbacks_hear_of_each_episode_and_break_that_is_over_and_which_is_the_last():
@@ -209,14 +227,14 @@ def test_callbacks_hear_nothing_any_more_of_a_game_that_is_over_or_an_agent_that
     driver.say(command="start")
     driver.fails(AgentTimeout("no answer within 30 s"))
     driver.connect("other tab")
-    assert driver.of(TellMoved) == []
+    assert driver.of(TellAgent) == []
     driver = with_callbacks(maxEpisodes=1)
     driver.connect()
     driver.say(command="start")
     driver.step(terminated=True)
     driver.returns()
     driver.connect("other tab")
-    assert driver.of(TellMoved) == []
+    assert driver.of(TellAgent) == []
 
 
 # ---- what fails
