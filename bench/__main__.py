@@ -40,6 +40,7 @@ MEASURES = (  # each is `module.function`
     "crowds.pairs",
     "crowds.warm",
     "data.download",
+    "designs.balance",
 )
 PATIENCE = 600  # seconds of one measure
 COMPARED = {  # what `--against` measures unless others are named, and how often: timings are noisy, counts are not
