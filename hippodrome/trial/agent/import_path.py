@@ -7,7 +7,9 @@ import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
 
-_OURS = str(Path(__file__).resolve().parents[3])  # has the package hippodrome
+import hippodrome
+
+_OURS = str(Path(hippodrome.__path__[0]).resolve().parent)
 
 
 def add(*folders: Path) -> None:

@@ -691,7 +691,14 @@ def test_the_agents_files_win_over_installed_packages_and_hippodromes_folders(fo
     assert tried(folder) == []
 
 
-@pytest.mark.parametrize(("file", "module"), [("numpy.py", "numpy"), ("PIL/__init__.py", "PIL"), ("yaml.py", "yaml")])
+@pytest.mark.parametrize(
+    ("file", "module"),
+    [
+        ("numpy.py", "numpy"),
+        ("PIL/__init__.py", "PIL"),
+        ("websockets/__init__.py", "websockets"),
+    ],
+)
 def test_a_file_that_hides_a_package_of_the_servers_is_a_mistake(folder: Path, file: str, module: str) -> None:
     (folder / file).parent.mkdir(exist_ok=True)
     (folder / file).write_text("raise SystemExit('hides the package')\n")
@@ -701,6 +708,21 @@ def test_a_file_that_hides_a_package_of_the_servers_is_a_mistake(folder: Path, f
     assert (status, lines) == (1, [mistake, "1 mistake."])
     (on_a_server,) = tried(folder)
     assert on_a_server.endswith(mistake.removeprefix("agent.py:"))
+
+
+def test_a_command_names_the_file_that_hides_a_package_of_the_servers(folder: Path) -> None:
+    for name in ("gymnasium", "hippodrome", "websockets"):
+        (folder / f"{name}.py").write_text("raise SystemExit('hides the package')\n")
+    command = [sys.executable, "-P", "-m", "hippodrome", "check"]
+    done = subprocess.run(
+        command, check=False, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 1, done.stderr
+    assert done.stdout.splitlines() == [
+        "agent.py: gymnasium.py hides the package gymnasium, which servers need; rename it",
+        "agent.py: websockets.py hides the package websockets, which servers need; rename it",
+        "2 mistakes.",
+    ]
 
 
 def test_a_folder_without_code_hides_no_package(folder: Path) -> None:
