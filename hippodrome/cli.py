@@ -85,7 +85,8 @@ def _problem_from(error: Exception, command: str) -> Problem | None:
     if isinstance(error, Problem):
         return error
     if isinstance(error, ModuleNotFoundError):
-        extra = "aws" if command in GROUPS["AWS"] or command == "links" else "data"
+        of_aws = command in GROUPS["AWS"] or command == "links" or error.name in ("boto3", "botocore")
+        extra = "aws" if of_aws else "data"
         target = "plan" if command in ("apply", "links") else command  # these two have no target of their own
         return Problem(
             f"`hippodrome {command}` needs the package {error.name}, which is not installed.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -44,6 +45,12 @@ Path("sweep.zip").write_bytes(sweep.pack())
 image = make_bundle(Path("maze"))
 image.write_folder(Path("image"))
 print(json.dumps({"functions": [function.key for function in functions], "image": image.hash}))
+"""
+WITHOUT_BOTO3 = """
+import sys
+sys.modules |= {"boto3": None, "botocore": None}
+from hippodrome.cli import main
+sys.exit(main())
 """
 _PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
 
@@ -142,9 +149,20 @@ def test_a_study_is_checked_rehearsed_and_read(environment: Path, studies: Path)
     tried = run(environment, studies, "hippodrome", "try", "maze", "--bots", "2", "--play", "2")
     assert re.search(r"errors\s*│ none", tried), tried
     (data,) = (studies / "maze" / "data-try").glob("try-*")
-    run(environment, studies, "hippodrome", "data", "maze", "--from", str(data))
+    without_boto3 = ("python", "-c", WITHOUT_BOTO3)
+    run(environment, studies, *without_boto3, "data", "maze", "--from", str(data))
     (answers,) = (studies / "maze").glob("data-*/**/answers.csv")
-    assert len(answers.read_text().splitlines()) > 2
+    first, second = participants(answers)
+    run(environment, studies, *without_boto3, "erase", first, "maze", "--from", str(data), "--yes")
+    run(environment, studies, *without_boto3, "data", "maze", "--from", str(data))
+    assert participants(answers) == [second]
+    on_aws = run(environment, studies, *without_boto3, "data", "maze", "--aws", fails=True)
+    assert 'pip install "hippodrome[aws]"' in on_aws
+
+
+def participants(answers: Path) -> list[str]:
+    with answers.open(newline="") as file:
+        return [row["participant"] for row in csv.DictReader(file)]
 
 
 def test_the_functions_and_the_image_are_those_of_the_clone(environment: Path, studies: Path) -> None:

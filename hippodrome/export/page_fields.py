@@ -10,8 +10,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from enum import StrEnum
 
-from botocore.exceptions import ClientError
-
 from hippodrome.control.config.step_files import LIMIT_BYTES
 from hippodrome.control.model.project import Project
 from hippodrome.control.participants.page_parser import PageParser, attributes_of
@@ -53,7 +51,7 @@ def fields_of(page: str) -> Mapping[str, FieldKind]:
 def _page(source: Source, key: str) -> str:
     try:
         return source.read(key, LIMIT_BYTES).decode("utf-8", "replace")
-    except (FileGone, TooLarge, ClientError):  # the types of columns then follow from the answers
+    except (FileGone, TooLarge):  # the types of columns then follow from the answers
         return ""
 
 

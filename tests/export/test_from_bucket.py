@@ -15,7 +15,8 @@ import pytest
 
 from hippodrome.console.problem import Exit
 from hippodrome.export import fetch
-from hippodrome.export.source import Bucket, FileGone
+from hippodrome.export.bucket import Bucket
+from hippodrome.export.source import FileGone
 from testing.aws_events import ACCOUNT
 from testing.studies import study
 from tests.deployment.installation import Installed, environment, process
@@ -72,7 +73,7 @@ def test_a_bucket_and_a_folder_give_the_same_tables(world: Installed, tmp_path: 
 def test_a_body_that_breaks_off_is_fetched_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     from botocore.exceptions import IncompleteReadError
 
-    monkeypatch.setattr("hippodrome.export.source.time.sleep", lambda _: None)
+    monkeypatch.setattr("hippodrome.export.bucket.time.sleep", lambda _: None)
     body = os.urandom(300_000)
     world.put("maze/users/a/participant.json", body)
     s3 = world.client("s3")

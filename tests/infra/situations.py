@@ -15,7 +15,7 @@ from testing import template as cfn
 
 ACCOUNT = "123456789012"
 STACK = "Hippodrome-of-thirty-letters-x"
-"""As long as `hippodrome.deployment.aws.account.STACK_NAME` allows, with all the characters that it allows."""
+"""As long as `hippodrome.deployment.aws.resource_names.STACK_NAME` allows, with all the characters that it allows."""
 REGION = max(regions.SUPPORTED, key=len)
 _HEX = "0123456789abcdef0"
 

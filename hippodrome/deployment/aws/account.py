@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import threading
 from collections.abc import Iterator, Mapping
@@ -21,18 +20,7 @@ from hippodrome.control.aws import AwsPlatform, errors
 from hippodrome.control.certificates.rules import Location, location
 from hippodrome.control.ports import Settings
 from hippodrome.deployment.aws import resource_names
-from hippodrome.deployment.aws.resource_names import TAG
-
-STACK = "hippodrome"
-STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
-"""The form of a stack's name. It has at most 30 characters: `<stack>-code-<account>-<region>` is a bucket's name,
-which may have 63."""
-RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
-"""Names that no stack may have: an account has a schedule group and maybe a cluster `default`, and S3 refuses the
-other prefixes.
-
-(EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
-"""
+from hippodrome.deployment.aws.resource_names import STACK, TAG
 
 _OUR_PARAMETERS = {"RootDomain", "HostedZoneId", "SiteHost", "CodeBucket"}  # parameters of infra/template.yml
 

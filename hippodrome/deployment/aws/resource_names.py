@@ -7,6 +7,17 @@ from __future__ import annotations
 
 import re
 
+STACK = "hippodrome"
+STACK_NAME = re.compile(r"[A-Za-z]([A-Za-z0-9-]{0,28}[A-Za-z0-9])?")
+"""The form of a stack's name. It has at most 30 characters: `<stack>-code-<account>-<region>` is a bucket's name,
+which may have 63."""
+RESERVED_STACK_NAME = re.compile(r"default|(xn--|sthree-|amzn-s3-demo-).*", re.IGNORECASE)
+"""Names that no stack may have: an account has a schedule group and maybe a cluster `default`, and S3 refuses the
+other prefixes.
+
+(EventBridge Scheduler's CreateScheduleGroup; ECS's CreateCluster; S3's "Bucket naming rules".)
+"""
+
 TAG = "hippodrome:stack"  # the tag that resources of a stack carry, with its name as the value
 API = "api"  # the source of the site's access log
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from botocore.exceptions import ClientError
 
@@ -18,23 +18,10 @@ from hippodrome.console.formatting import count
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
 from hippodrome.deployment.aws.account import Account
+from hippodrome.deployment.aws.object_version import Version
 
 BATCH = 1_000  # versions deleted by one call
 _PIECE = 256 * 1024  # bytes
-
-
-class Version(NamedTuple):
-    """A version or delete marker of an object, or an unfinished upload (`upload` is its id).
-
-    `latest`: whether it is the version that GetObject returns.
-    """
-
-    key: str
-    id: str
-    size: int = 0
-    marker: bool = False
-    upload: str = ""
-    latest: bool = False
 
 
 class VersionedBucket:

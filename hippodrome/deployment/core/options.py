@@ -9,7 +9,7 @@ import typer
 
 from hippodrome.console.arguments import StudyFolder
 from hippodrome.console.problem import Problem
-from hippodrome.deployment.aws.account import RESERVED_STACK_NAME, STACK_NAME
+from hippodrome.deployment.aws.resource_names import RESERVED_STACK_NAME, STACK_NAME
 
 
 def stack_name(given: str) -> str:

@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -14,9 +14,11 @@ from hippodrome.console.problem import Problem
 from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, layout, read_project
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.model.project import MIN_RUNTIME_MARGIN, Project
-from hippodrome.deployment.aws.account import Installation
 from hippodrome.protocol.section_keys import document
 from hippodrome.protocol.values import KeyPath
+
+if TYPE_CHECKING:
+    from hippodrome.deployment.aws.account import Installation
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model.server import Server
-from hippodrome.deployment.aws.account import STACK, Account, find_installation, open_account
-from hippodrome.deployment.aws.resource_names import TAG
+from hippodrome.deployment.aws.account import Account, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK, TAG
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.server_records import Records
 from hippodrome.deployment.core.study_selection import one_or_all

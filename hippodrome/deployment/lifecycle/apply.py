@@ -13,7 +13,8 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count, duration
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws import errors
-from hippodrome.deployment.aws.account import STACK, Account, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.code import bytecode
 from hippodrome.deployment.core import options
 from hippodrome.deployment.core.finding import Finding

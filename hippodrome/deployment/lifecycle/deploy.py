@@ -13,7 +13,8 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws import errors
 from hippodrome.control.certificates.rules import PRODUCTION, STAGING, Verdict
 from hippodrome.control.config import ConfigErrors, layout, read_project
-from hippodrome.deployment.aws.account import STACK, Account, describe_stack, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, describe_stack, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import explain, options, project_folder
 from hippodrome.deployment.core.explain import DENIED
 from hippodrome.deployment.core.finding import Finding, show

@@ -10,7 +10,8 @@ from rich.text import Text
 
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.deployment.aws.account import STACK, Account, elsewhere, open_account
+from hippodrome.deployment.aws.account import Account, elsewhere, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options
 from hippodrome.deployment.lifecycle.remains import look_again
 from hippodrome.deployment.lifecycle.removal import FoundInstallation, Removal

@@ -11,7 +11,8 @@ from rich.text import Text
 
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.deployment.aws.account import STACK, Account, open_account, site_host
+from hippodrome.deployment.aws.account import Account, open_account, site_host
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.code.template import Template
 from hippodrome.deployment.core import options
 from hippodrome.deployment.core.finding import Finding, look

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hippodrome.control.model.balance import Cells, cells_key
 from hippodrome.control.model.records import from_json, to_json
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.operate.storage import Note, Storage, newest, older
 
 

@@ -12,10 +12,11 @@ import typer
 
 from hippodrome.console import formatting, screen
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.deployment.aws import account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options
 
 if TYPE_CHECKING:
+    from hippodrome.deployment.aws.account import Account
     from hippodrome.export.listing import Tally
     from hippodrome.export.source import Source
 
@@ -73,7 +74,7 @@ def command(
     ] = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
-    stack: options.Stack = account.STACK,
+    stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
 ) -> int:
@@ -110,7 +111,9 @@ def command(
         _refuse_outer(local, study.id)
         source = Folder(local)
     else:
-        source = _bucket(account.open_account(profile, region), stack, bucket, study.id)
+        from hippodrome.deployment.aws.account import open_account
+
+        source = _bucket(open_account(profile, region), stack, bucket, study.id)
     if dry_run:
         return _dry_run(work.look(source, study.id, target, wishes), target, as_json)
     made = work.run(source, study.id, target, wishes)
@@ -143,19 +146,20 @@ def _refuse_outer(folder: Path, project: str) -> None:
         )
 
 
-def _bucket(aws_account: account.Account, stack: str, kept: str | None, project: str) -> Source:
+def _bucket(account: Account, stack: str, kept: str | None, project: str) -> Source:
     """Open the installation's bucket, or the bucket `kept` that `destroy` has kept."""
+    from hippodrome.deployment.aws.account import find_installation
     from hippodrome.deployment.stack.retained_bucket import open_bucket
-    from hippodrome.export.source import Bucket
+    from hippodrome.export.bucket import Bucket
 
     if kept is not None:
-        return open_bucket(aws_account, kept, project)
+        return open_bucket(account, kept, project)
     try:
-        installation = account.find_installation(aws_account, stack)
+        installation = find_installation(account, stack)
     except Problem as problem:
         advice = f"{problem.advice} If it was removed, its data are in the bucket that `destroy` has named: --bucket."
         raise Problem(str(problem), advice) from None
-    return Bucket(aws_account.client("s3"), installation["Bucket"], aws_account.id)
+    return Bucket(account.client("s3"), installation["Bucket"], account.id)
 
 
 def _check(folder: Path, as_json: bool) -> int:

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.operate.storage import Note
 from hippodrome.export.fetch import remove_empty
 from hippodrome.protocol import disk

@@ -31,7 +31,8 @@ from hippodrome.control.servers import resources
 from hippodrome.control.servers.leftovers import Scope, leftovers
 from hippodrome.control.servers.resources import Resources
 from hippodrome.deployment.aws.account import Account, Installation
-from hippodrome.deployment.aws.versions import Version, VersionedBucket
+from hippodrome.deployment.aws.object_version import Version
+from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core.captured_log import functions_log
 from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of

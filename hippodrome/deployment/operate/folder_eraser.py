@@ -24,7 +24,7 @@ from hippodrome.control.model import ids, server
 from hippodrome.control.model.project import MASTER_LIST, read_list
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of
 from hippodrome.deployment.operate.cells_eraser import CellsEraser
 from hippodrome.deployment.operate.data_folder import DataFolder

@@ -6,7 +6,7 @@ from hippodrome.control.lobby import decisions, entries, rules
 from hippodrome.control.lobby.decisions import Decisions
 from hippodrome.control.model import ids
 from hippodrome.control.model.records import from_json, to_json
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.operate.storage import Note, Storage, newest, older, read_all
 from hippodrome.protocol.keys import groups_folder, questions_folder
 

@@ -18,7 +18,8 @@ from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws import errors as aws_errors
 from hippodrome.deployment.aws import resource_names
-from hippodrome.deployment.aws.account import STACK, find_installation, open_account
+from hippodrome.deployment.aws.account import find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.code.template import Template
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.server_records import Records

@@ -15,7 +15,7 @@ from hippodrome.console.problem import Problem
 from hippodrome.control.lobby import decisions, entries
 from hippodrome.control.model import ids
 from hippodrome.deployment.aws.account import Account, Installation
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.protocol.keys import QUESTIONS, groups_folder, participant_folder, sessions_folder
 
 NOT_COVERED = (

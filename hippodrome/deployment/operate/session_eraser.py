@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hippodrome.control.model import memberships
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.operate.storage import Note, Storage, newest, older, read_all
 from hippodrome.export import without_member
 from hippodrome.protocol import session as sessions

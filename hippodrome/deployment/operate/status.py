@@ -21,7 +21,8 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.console.program import as_typed
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
-from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.cost.billed import Billed, billed_or_why

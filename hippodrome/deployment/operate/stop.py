@@ -21,7 +21,8 @@ from hippodrome.control.ports import RunningTask
 from hippodrome.control.servers import resources
 from hippodrome.control.servers.leftovers import Scope, leftovers
 from hippodrome.control.servers.resources import Resources
-from hippodrome.deployment.aws.account import STACK, find_installation, open_account
+from hippodrome.deployment.aws.account import find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.captured_log import functions_log
 from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps

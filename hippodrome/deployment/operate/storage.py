@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
-from hippodrome.deployment.aws.versions import Version
+from hippodrome.deployment.aws.object_version import Version
 
 AT_ONCE = 10  # documents that are read at the same time
 Note = Callable[[Sequence[Version]], None]

@@ -28,8 +28,9 @@ from hippodrome.control.certificates.rules import (
     names_of,
 )
 from hippodrome.deployment.aws import caa
-from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
 from hippodrome.deployment.aws.hosted_zone import delegation, exists, leading_away, read_zone
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options
 from hippodrome.deployment.stack import certificate_transfer
 

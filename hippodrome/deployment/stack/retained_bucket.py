@@ -16,7 +16,7 @@ from hippodrome.deployment.aws.account import Account
 from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.stack import inventory
 from hippodrome.export import keys
-from hippodrome.export.source import Bucket
+from hippodrome.export.bucket import Bucket
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")  # no ARN: that would hide the owner
 _WHICH = "`hippodrome destroy --dry-run` names the buckets that it has kept (with --stack and --region)."

@@ -19,7 +19,8 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import Project
 from hippodrome.control.registry import MAX_SIGNED
-from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options, participants, register_function
 
 _AROUND = " \u00a0\u200b\u2060\ufeff\"'"

@@ -23,7 +23,8 @@ from hippodrome.control.config import agent_imports, parse_registration, remarks
 from hippodrome.control.config.step_order import changed_pages
 from hippodrome.control.model.project import DEFAULT_PORT, Project, UnreadableEntry
 from hippodrome.control.model.records import from_data
-from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options, project_folder, register_function
 from hippodrome.deployment.core.participants import registered_projects
 from hippodrome.deployment.cost.estimate import warm

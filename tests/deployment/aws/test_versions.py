@@ -11,7 +11,8 @@ from moto import mock_aws
 from hippodrome.console.problem import Problem
 from hippodrome.deployment.aws import versions as versioned
 from hippodrome.deployment.aws.account import Account, open_account
-from hippodrome.deployment.aws.versions import Version, VersionedBucket
+from hippodrome.deployment.aws.object_version import Version
+from hippodrome.deployment.aws.versions import VersionedBucket
 
 NAME = "hippodrome-data"
 

@@ -26,7 +26,8 @@ from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.control.storage.repository import Repository
 from hippodrome.deployment.aws import versions as versioned
 from hippodrome.deployment.aws.account import find_installation
-from hippodrome.deployment.aws.versions import Version, VersionedBucket
+from hippodrome.deployment.aws.object_version import Version
+from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core import stages
 from hippodrome.deployment.core.stages import Executor
 from hippodrome.deployment.operate.eraser import SIGNING, Eraser
@@ -376,7 +377,7 @@ def test_each_of_several_erasures_in_one_second_has_its_own_receipt(
         def now(cls, tz: Any = None) -> datetime:
             return datetime(2026, 3, 4, 12, tzinfo=tz)
 
-    monkeypatch.setattr("hippodrome.deployment.operate.erase.datetime", Stopped)
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.datetime", Stopped)
     names = ["erased-20260304T120000Z.json", "erased-20260304T120000Z-2.json", "erased-20260304T120000Z-3.json"]
     for number, name in enumerate(names, 1):
         ran = run(world, capsys)

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from hippodrome.deployment.aws.account import STACK_NAME
+from hippodrome.deployment.aws.resource_names import STACK_NAME
 from tests.infra import schemas
 from tests.infra.rules.book import Rule, Template, each, first, put, values
 from tests.infra.situations import Installation, Resource, references

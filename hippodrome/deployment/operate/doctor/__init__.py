@@ -14,7 +14,8 @@ from rich.text import Text
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model.project import Project
-from hippodrome.deployment.aws.account import STACK, Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, good, look, show
 from hippodrome.deployment.core.study_selection import one_or_all

@@ -22,7 +22,7 @@ from hippodrome.deployment.operate.doctor.check_context import CheckFailed
 from hippodrome.deployment.operate.doctor.play.scene import RehearsalContext
 from hippodrome.deployment.operate.doctor.play.transcript import shown
 from hippodrome.export import run as data
-from hippodrome.export.source import Bucket
+from hippodrome.export.bucket import Bucket
 
 PLAY = 8.0  # seconds that a bot plays
 VICTIM_PLAYS = 25.0  # seconds that the victim, whose task is killed, plays: its game must still run then
