@@ -96,10 +96,19 @@ def test_python_m_deploy_is_the_same_command() -> None:
     assert done.stdout.startswith("Usage: hippodrome stop ")
 
 
-def test_a_mistyped_folder_is_not_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", ["check", "run", "try"])
+def test_a_folder_without_a_study_is_refused_and_a_mistyped_one_not_made(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["run", "my-stduy"]) == 1
-    assert "There is no study in my-stduy: it has no config.yml." in capsys.readouterr().err
+    assert main([command, "my-stduy"]) == 1
+    assert "✗ There is no study in my-stduy: there is no such folder." in capsys.readouterr().err
+    assert main([command]) == 1
+    said = capsys.readouterr()
+    assert (said.out, said.err.splitlines()[0]) == ("", "✗ There is no study in this folder: it has no config.yml.")
     assert not list(tmp_path.iterdir())
+    for folder in ("clone/App", "clone/steps"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "clone" / "config.yml").touch()
+    assert main([command, "clone/App"]) == 1
+    assert f"→ Name the folder {tmp_path / 'clone'}, which has it." in capsys.readouterr().err.splitlines()

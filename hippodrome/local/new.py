@@ -15,6 +15,7 @@ import typer
 
 from hippodrome import places
 from hippodrome.console import screen
+from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.config import ConfigErrors
 from hippodrome.control.config.folder import ConfigSource, read_source
 from hippodrome.control.model import ids
@@ -25,14 +26,12 @@ STUDY_FILES = ("config.yml", "agent.py", "steps", "requirements.txt")
 LEFT_OUT = shutil.ignore_patterns("data", "data-*", "erased-*.json", "__pycache__", "*.pyc", ".*")
 """Names the files of a template that are not copied: data, caches and hidden files."""
 
+_FOLDER = "../my-study" if places.IS_CLONE else "my-study"  # an example: nobody's study should lie in the clone
+_ANOTHER = "Name a folder that does not exist yet."
 _ID = ("project", "id")
 _ID_LINE = re.compile(r"(?P<key>\s*id:\s*)[^#\s]+(?P<comment>.*)", re.DOTALL)
 _LINK = re.compile(r"\]\((\.\./[^)#\s]+)")
 _NOT_IN_AN_ID = re.compile(r"[^A-Za-z0-9_-]+")
-
-
-class NotMade(Exception):
-    """The study cannot be made; str() is a sentence for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,7 @@ def listing(known: Mapping[str, StudyTemplate]) -> str:
 def make_study(template: StudyTemplate, folder: Path) -> str:
     """Copy the template to `folder`, and give the copy a project id made from the folder's name; return this id.
 
-    Raises NotMade if the folder is not empty, if its name makes no id, or if it cannot be written.
+    Raises Problem if the folder is not empty, if its name makes no id, or if it cannot be written.
     """
     project_id = _id_of(folder)
     _check_folder(template, folder)
@@ -76,7 +75,7 @@ def make_study(template: StudyTemplate, folder: Path) -> str:
         _write_id(folder, project_id)
         _adapt_paths(template, folder)
     except OSError as error:
-        raise NotMade(f"{folder} cannot be written: {error.strerror or error}") from None
+        raise Problem(f"{folder} cannot be written: {error.strerror or error}.") from None
     return project_id
 
 
@@ -94,14 +93,14 @@ def what_next(folder: Path) -> str:
 
 
 def _check_folder(template: StudyTemplate, folder: Path) -> None:
-    """Raise NotMade unless the folder is empty or does not exist, and lies outside of the template."""
+    """Raise Problem unless the folder is empty or does not exist, and lies outside of the template."""
     there, inside = folder.resolve(), template.folder.resolve()
     if folder.exists() and not folder.is_dir():
-        raise NotMade(f"{folder} is a file; name a folder that does not exist yet")
+        raise Problem(f"{folder} is a file.", _ANOTHER)
     if folder.is_dir() and any(folder.iterdir()):
-        raise NotMade(f"{folder} is not empty, and nothing in it was changed; name a folder that does not exist yet")
+        raise Problem(f"{folder} is not empty, and nothing in it was changed.", _ANOTHER)
     if not template.at_top and there.is_relative_to(inside):
-        raise NotMade(f"{folder} lies in the template itself; name a folder outside of it")
+        raise Problem(f"{folder} lies in the template itself.", "Name a folder outside of it.")
 
 
 def _copy(template: StudyTemplate, folder: Path) -> None:
@@ -117,14 +116,14 @@ def _copy(template: StudyTemplate, folder: Path) -> None:
 
 
 def _write_id(folder: Path, project_id: str) -> None:
-    """Write the id into config.yml, and leave the rest of the file as it is. Raises NotMade if the id has no line."""
+    """Write the id into config.yml, and leave the rest of the file as it is. Raises Problem if the id has no line."""
     source = read_source(folder)
     file = source.layout.config
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
     number = source.parsed.lines[_ID] - 1
     found = _ID_LINE.fullmatch(lines[number])
     if found is None:
-        raise NotMade(f"{file}: the id is not on a line of its own; write id: {project_id} there yourself")
+        raise Problem(f"{file}: the id is not on a line of its own.", f"Write id: {project_id} there yourself.")
     lines[number] = f"{found['key']}{project_id}{found['comment']}"
     file.write_text("".join(lines), encoding="utf-8")
 
@@ -146,11 +145,11 @@ def _relative(target: Path, folder: Path) -> str:
 
 
 def _id_of(folder: Path) -> str:
-    """The folder's name with dashes in place of characters that no id has. Raises NotMade if that is no id."""
+    """The folder's name with dashes in place of characters that no id has. Raises Problem if that is no id."""
     name = folder.resolve().name
     found = _NOT_IN_AN_ID.sub("-", name).strip("-_")[:64]
     if not ids.is_project_id(found) or found.upper() == "SSL":
-        raise NotMade(f'no project id can be made from the folder\'s name "{name}"; use letters, digits and dashes')
+        raise Problem(f'No project id can be made from the folder\'s name "{name}".', "Use letters, digits and dashes.")
     return found
 
 
@@ -183,19 +182,22 @@ def command(
 ) -> None:
     """Copy the study TEMPLATE to the folder STUDY, give it an id of its own, and say what to do next."""
     known = templates()
-    usage = f"hippodrome new {shlex.quote(folder) if folder else '../my-study'}"
-    if template not in known:
-        problem = (
-            f"There is no template {template}." if template else f"Name a template: {usage} {next(iter(known), '')}"
+    if not template and not folder:
+        screen.result(
+            f"Name a folder and a template: hippodrome new {_FOLDER} {next(iter(known), '')}\n{listing(known)}"
         )
-        screen.result(f"{problem}\n{listing(known)}")
-        raise typer.Exit(1 if template or folder else 0)
+        return
+    if template not in known:
+        raise Problem(
+            f"There is no template {template}." if template else "No template is named.",
+            listing(known),
+            exit_code=Exit.MISUSE,
+        )
     if folder in ("", "."):
-        screen.result(f"Name the folder of the new study: hippodrome new ../my-study {template}")
-        raise typer.Exit(1)
-    try:
-        project_id = make_study(known[template], Path(folder))
-    except NotMade as refusal:
-        screen.result(str(refusal))
-        raise typer.Exit(1) from None
+        raise Problem(
+            "No folder is named for the new study.",
+            f"Name one: hippodrome new {_FOLDER} {template}",
+            exit_code=Exit.MISUSE,
+        )
+    project_id = make_study(known[template], Path(folder))
     screen.result(f"Made {folder} from {template}; its project id is {project_id}.\n{what_next(Path(folder))}")

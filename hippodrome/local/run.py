@@ -18,8 +18,7 @@ import psutil
 import typer
 
 from hippodrome.console.arguments import StudyFolder
-from hippodrome.console.problem import Problem
-from hippodrome.control.config import layout
+from hippodrome.console.problem import Exit, Problem
 from hippodrome.local import requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
@@ -27,6 +26,7 @@ from hippodrome.local.backend import files
 from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.publish import NotPublished
 from hippodrome.local.study import Study, from_here
+from hippodrome.local.study_folder import must_hold_study
 from hippodrome.local.web import server
 from hippodrome.local.web.access import origin_of
 
@@ -71,32 +71,30 @@ def command(
 
     Answers and recordings are kept in its folder data/ from run to run. Ctrl-C ends the study.
     """
-    if not layout.has_config(folder):  # else a mistyped folder would be made, for the data
-        raise Problem(
-            f"There is no study in {folder}: it has no config.yml.",
-            "Name a study's folder, or make one: `hippodrome new` lists the templates.",
-        )
+    must_hold_study(folder)
     requirements.prepare(folder)
     os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
     data = folder / "data" if data is None else data
     activity_log = ActivityLog()
     if host not in ("127.0.0.1", "localhost"):
-        activity_log.show(
+        raise Problem(
             f"A study cannot run at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
-            "so participants could not play on another machine. Leave --host out."
+            "so participants could not play on another machine.",
+            "Leave --host out.",
+            exit_code=Exit.MISUSE,
         )
-        raise typer.Exit(1)
     origins = [origin_of(given) for given in origin or ()]
     if None in origins:
-        activity_log.show(
-            f"--origin {(origin or [])[origins.index(None)]} is no origin. Write it like http://localhost:3000."
+        raise Problem(
+            f"--origin {(origin or [])[origins.index(None)]} is no origin.",
+            "Write it like http://localhost:3000.",
+            exit_code=Exit.MISUSE,
         )
-        raise typer.Exit(1)
     if names is not None and (names not in ("hash", "userId") or not tls):
-        activity_log.show(
-            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses."
+        raise Problem(
+            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses.",
+            exit_code=Exit.MISUSE,
         )
-        raise typer.Exit(1)
     new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
     try:
         _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study, starter=starter)

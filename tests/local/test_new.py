@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from hippodrome.console.problem import Problem
 from hippodrome.control.config import read_project
 from hippodrome.local import new
 
@@ -52,19 +53,21 @@ def test_make_new_makes_a_study_and_says_what_to_do_next(tmp_path: Path) -> None
     assert sorted(path.name for path in folder.iterdir()) == ["agent.py", "config.yml", "steps"]
 
 
-@pytest.mark.parametrize(
-    ("variables", "first"),
-    [
-        ((), f"Name a template: hippodrome new ../my-study {TOP}"),
-        (("PROJECT={folder}",), f"Name a template: hippodrome new {{folder}} {TOP}"),
-        (("PROJECT={folder}", "TEMPLATE=pacman"), "There is no template pacman."),
-    ],
-)
-def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str, tmp_path: Path) -> None:
-    done = make_new(*(variable.format(folder=tmp_path / "x") for variable in variables))
-    assert (done.returncode == 0) == (not variables)  # without variables, that was the question
-    assert done.stdout.splitlines()[0] == first.format(folder=tmp_path / "x")
+def test_without_arguments_it_lists_the_templates() -> None:
+    done = make_new()
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[0] == f"Name a folder and a template: hippodrome new ../my-study {TOP}"
     assert re.search(rf"^  {TOP} +Learning to play Ms\. Pac-Man$", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("variables", "why"), [((), "No template is named."), (("TEMPLATE=pacman",), "There is no template pacman.")]
+)
+def test_without_a_template_that_it_knows_it_lists_them(variables: tuple[str, ...], why: str, tmp_path: Path) -> None:
+    done = make_new(f"PROJECT={tmp_path / 'x'}", *variables)
+    assert done.returncode != 0
+    assert f"✗ {why}" in done.stderr.splitlines()
+    assert re.search(rf"^  {TOP} +Learning to play Ms\. Pac-Man$", done.stderr, re.MULTILINE)
     assert not list(tmp_path.iterdir())
 
 
@@ -72,7 +75,8 @@ def test_without_a_template_it_lists_them(variables: tuple[str, ...], first: str
 def test_without_a_folder_it_asks_for_one(variables: tuple[str, ...]) -> None:
     done = make_new(*variables, f"TEMPLATE={TOP}")
     assert done.returncode != 0
-    assert done.stdout == f"Name the folder of the new study: hippodrome new ../my-study {TOP}\n"
+    assert "✗ No folder is named for the new study." in done.stderr.splitlines()
+    assert f"→ Name one: hippodrome new ../my-study {TOP}" in done.stderr.splitlines()
 
 
 @pytest.mark.parametrize("name", new.templates())
@@ -133,34 +137,34 @@ def test_a_folder_that_holds_something_stays_as_it_is(root: Path, tmp_path: Path
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "thesis.tex").write_text("years of work")
-    with pytest.raises(new.NotMade, match="is not empty, and nothing in it was changed"):
+    with pytest.raises(Problem, match="is not empty, and nothing in it was changed"):
         new.make_study(new.templates(root)["maze"], folder)
     assert [path.name for path in folder.iterdir()] == ["thesis.tex"]
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused(root: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("a file")
-    with pytest.raises(new.NotMade, match="is a file"):
+    with pytest.raises(Problem, match="is a file"):
         new.make_study(new.templates(root)["maze"], tmp_path / "mine")
     assert (tmp_path / "mine").read_text() == "a file"
 
 
 def test_a_study_is_not_made_inside_its_template(root: Path) -> None:
-    with pytest.raises(new.NotMade, match="lies in the template itself"):
+    with pytest.raises(Problem, match="lies in the template itself"):
         new.make_study(new.templates(root)["maze"], root / "examples" / "maze" / "mine")
     assert not (root / "examples" / "maze" / "mine").exists()
 
 
 @pytest.mark.parametrize("name", ["???", "ssl", "_"])
 def test_a_name_that_makes_no_id_is_refused(root: Path, tmp_path: Path, name: str) -> None:
-    with pytest.raises(new.NotMade, match="no project id can be made"):
+    with pytest.raises(Problem, match="No project id can be made"):
         new.make_study(new.templates(root)["maze"], tmp_path / name)
     assert not (tmp_path / name).exists()
 
 
 def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(root: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(new.NotMade, match="cannot be written: Not a directory"):
+    with pytest.raises(Problem, match="cannot be written: Not a directory"):
         new.make_study(new.templates(root)["maze"], tmp_path / "file" / "mine")
 
 

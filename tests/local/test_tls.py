@@ -173,7 +173,7 @@ def test_only_names_of_this_machine_are_answered_and_only_its_own_pages_may_send
 @pytest.mark.parametrize("options", [("--names", "userId"), ("--tls", "--names", "ids")])
 def test_names_without_tls_or_of_another_kind_are_refused_in_a_sentence(local: Make, options: tuple[str, ...]) -> None:
     one = local()
-    assert one.begin(*options).wait(60) == 1
+    assert one.begin(*options).wait(60) == 2
     assert "--names is hash or userId, and needs --tls" in one.text()
 
 

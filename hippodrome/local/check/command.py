@@ -19,6 +19,7 @@ from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_im
 from hippodrome.local import requirements
 from hippodrome.local.check import agent, agent_file
 from hippodrome.local.check.project import check_project
+from hippodrome.local.study_folder import must_hold_study
 
 
 def command(
@@ -30,6 +31,7 @@ def command(
 
     What the study's requirements.txt names is installed first. The exit code is 1 if there is a mistake.
     """
+    must_hold_study(folder)
     requirements.prepare(folder)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a console that lacks a character must not hide the mistake

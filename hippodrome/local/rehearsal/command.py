@@ -31,6 +31,7 @@ from hippodrome.bots.crowd import SIGNALS, interruptible, walk
 from hippodrome.bots.links import with_project
 from hippodrome.bots.report import BotReport
 from hippodrome.console.arguments import StudyFolder
+from hippodrome.console.problem import Problem
 from hippodrome.console.program import as_typed
 from hippodrome.control.config import Config, ConfigErrors, read_project
 from hippodrome.local import requirements
@@ -47,6 +48,7 @@ from hippodrome.local.rehearsal.study_process import (
     sessions_of,
     wait_until_gone,
 )
+from hippodrome.local.study_folder import must_hold_study
 
 
 @dataclass(frozen=True)
@@ -247,6 +249,7 @@ def command(
 
     What the study's requirements.txt names is installed first. The exit code is 1 if something is missing.
     """
+    must_hold_study(folder)
     requirements.prepare(folder)
     os.umask(0o077)  # like `run`: only their owner may read these files
     console = Console(highlight=False)
@@ -275,9 +278,11 @@ def command(
                 console=console,
                 began=began,
             )
-    except (ConfigErrors, AddressRefused, StudyNotStarted) as error:
-        console.print(str(error), markup=False, soft_wrap=True)
-        raise typer.Exit(1) from None
+    except ConfigErrors as errors:
+        mistakes = [str(mistake) for mistake in errors.diagnostics]
+        raise Problem("The study has mistakes:", "Correct them, and try again.", mistakes) from None
+    except (AddressRefused, StudyNotStarted) as error:
+        raise Problem(str(error)) from None
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     raise typer.Exit(0 if fine else 1)

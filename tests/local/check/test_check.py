@@ -79,10 +79,6 @@ def test_a_failing_game_is_a_mistake(folder: Path) -> None:
     ]
 
 
-def test_check_reports_a_missing_folder(tmp_path: Path) -> None:
-    assert run(tmp_path / "nowhere") == (1, [f"{tmp_path / 'nowhere'}: there is no such folder", "1 mistake."])
-
-
 # --- while the study runs -----------------------------------------------------------------------------
 
 
