@@ -14,8 +14,9 @@ import msgspec
 
 from hippodrome.protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
-from testing.simulation import session_checks
+from testing.simulation import design_checks, session_checks
 from testing.simulation.conditions import Conditions
+from testing.simulation.designs import LOOKS, PAGES, PAY, SOUP, WRONG, Designed, DesignedMember, Ways
 from testing.simulation.members import Habits, SimulatedMember
 from testing.simulation.people import SimulatedParticipant, SimulatedVisit
 from testing.simulation.world import PROJECT, SimulatedWorld
@@ -41,9 +42,14 @@ class SimulatedJourney:
     to_the_end: int | None = 0  # how many of the group come to the last page without a fault; None: it depends
     play: float = 60.0  # seconds for which the group plays
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
+    ways: Sequence[Ways] = ()  # instead of `person` and `others`: participants of a study with a design
+    ends: Sequence[str | None] = ()  # of each of them, the end that is reached without a fault; None: the last step
 
     def people(self, world: SimulatedWorld) -> list[SimulatedParticipant]:
         """Make all participants of the journey. They come at the same time, but take different times to read."""
+        if self.ways:
+            kind = DesignedMember if world.project.has_sessions else Designed
+            return [kind(world, number, ways=ways, play=self.play) for number, ways in enumerate(self.ways)]
         if self.group:
             return [
                 SimulatedMember(world, number, habits=habits, play=self.play)
@@ -170,6 +176,86 @@ JOURNEYS_OF_GROUPS = (
     ),
 )
 
+JOURNEYS_OF_DESIGNS = (
+    SimulatedJourney(
+        "somebody is right at the second try", project=SOUP, ways=[Ways({"quiz": ({"soups": "2"}, {"soups": "3"})})]
+    ),
+    SimulatedJourney(
+        "three come at once, send everything twice, go back, or have two tabs",
+        project=SOUP,
+        ways=[Ways(twice=True), Ways(back=True), Ways(tabs=True)],
+    ),
+    SimulatedJourney(
+        "somebody declines, and somebody fails the check",
+        project=SOUP,
+        ways=[Ways({"consent": ({"agree": "no"},)}, back=True), Ways(WRONG, tabs=True, back=True)],
+        ends=["declined", "screenedOut"],
+    ),
+    SimulatedJourney(
+        "time runs out at the check and at a page",
+        project=SOUP,
+        ways=[
+            Ways({"quiz": ({"soups": "2"}, {"soups": "3"})}, pauses={"quiz": 500.0}, reloads=["quiz"]),
+            Ways(pauses={"rate": 150.0}, reloads=["rate"]),
+            Ways(pauses={"survey": 1300.0}, reloads=["survey"]),
+        ],
+        ends=["screenedOut", None, "late"],
+    ),
+    SimulatedJourney("the game is skipped", project=SOUP, ways=[Ways({"consent": ({"plays": "no"},)}, tabs=True)]),
+    SimulatedJourney(
+        "no server can run the game",
+        conditions=lambda: Conditions(stillborn=1.0),
+        project=SOUP,
+        ways=[Ways()],
+        ends=["failed"],
+    ),
+    SimulatedJourney(
+        "games are repeated, in two tabs", project=LOOKS, play=20.0, ways=[Ways(tabs=True), Ways(back=True)]
+    ),
+    SimulatedJourney(
+        "Spot takes the server back between the games",
+        conditions=lambda: Conditions(interrupted=1.0, interrupted_after=(30.0, 90.0)),
+        project=LOOKS,
+        play=20.0,
+        ways=[Ways(twice=True)],
+    ),
+    SimulatedJourney(
+        "somebody is tired of the games",
+        project=LOOKS,
+        play=20.0,
+        ways=[Ways({"about": ({"tired": "yes"},), "rate": ({"answer": "4"},)})],
+        ends=["tired"],
+    ),
+    SimulatedJourney(
+        "a warm server runs the games of whoever comes",
+        project=LOOKS,
+        play=20.0,
+        ways=[Ways()],
+        limits={"warm_servers": 1},
+        comes=150.0,
+        closes=900.0,
+    ),
+    SimulatedJourney(
+        "one leaves, one comes back after an hour, and others have come",
+        project={**SOUP, "ends": ()},
+        ways=[
+            Ways(leaves="rate"),
+            Ways(pauses={"survey": 4500.0}),
+            Ways(comes=4000.0),
+            Ways(comes=4000.0),
+            Ways(comes=4600.0),
+        ],
+        ends=["left by themselves"],
+    ),
+    SimulatedJourney("a pair is assigned together", project=PAY, ways=[Ways(tabs=True), Ways(back=True)]),
+    SimulatedJourney(
+        "of four who come for pairs one declines, and one is unmatched",
+        project=PAY,
+        ways=[Ways({"ready": ({"answer": "no"},)}), Ways(), Ways(twice=True), Ways()],
+        ends=["declined"],
+    ),
+)
+
 
 @dataclass
 class FaultOutcome:
@@ -183,7 +269,7 @@ class FaultOutcome:
     story: str = field(repr=False)
     seed: int = 0
     others: tuple[SimulatedVisit, ...] = ()
-    wrong: tuple[str, ...] = ()  # sessions that are split or merged, and ghosts
+    wrong: tuple[str, ...] = ()  # what `session_checks` and `design_checks` have found
 
     @property
     def well(self) -> bool:
@@ -214,7 +300,7 @@ def run(
 ) -> tuple[SimulatedWorld, FaultOutcome]:
     """Run a journey once; return its world and outcome. `watched` (`SimulatedWorld.watch`) takes four times as long."""
     project = msgspec.structs.replace(PROJECT, max_runtime=journey.minutes, **journey.limits, **journey.project)
-    world = SimulatedWorld(seed, journey.conditions(), project)
+    world = SimulatedWorld(seed, journey.conditions(), project, pages=PAGES)
     world.cloud.fault = fault
     if watched:
         world.watch()
@@ -229,7 +315,8 @@ def run(
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in documents]
     first, *others = [person.visit for person in people]
     members = [person for person in people if isinstance(person, SimulatedMember)]
-    wrong = tuple(session_checks.faults(documents, world.project, members))
+    designed = [person for person in people if isinstance(person, Designed)]
+    wrong = (*session_checks.faults(documents, world.project, members), *design_checks.faults(world, designed))
     outcome = FaultOutcome(
         journey.name, fault, first, dict(world.left()), lost, world.story(), seed, tuple(others), wrong
     )

@@ -10,6 +10,7 @@ from urllib.parse import urlencode
 
 from hippodrome.control.ports import Conflict
 from hippodrome.protocol.keys import answer_key
+from hippodrome.protocol.session import assignment_key
 from testing.port_faults import Crash
 from testing.simulation.trials import LINGER, is_lost
 from testing.simulation.world import SimulatedWorld
@@ -93,14 +94,14 @@ class SimulatedParticipant:
                 page = self._ask("GET")
                 continue
             step = page.get("step")
-            if step is None:
-                self.visit.reason = str(page.get("message"))
+            if not step:
+                self.visit.reason = str(page.get("message") or "the end")
                 return
             if step == self.world.project.final.key:
                 self.visit.finished = self.clock.seconds
                 return
             self.clock.sleep(self.clock.random.uniform(0.5, 1.5) * self._read)
-            form = {"hippodrome-step": step, "hippodrome-ticket": page["ticket"], "answer": "yes"}
+            form = self._filled(page)
             sent = self.clock.seconds
             page = self._ask("POST", urlencode(form))
             if page and page.get("step") not in (step, None):  # None: the study is over, and the answer was refused
@@ -108,6 +109,10 @@ class SimulatedParticipant:
                 if step == self._first_ask:
                     self.visit.asked = sent
         self.visit.reason = self.visit.reason or "no answer from the site"
+
+    def _filled(self, page: Mapping[str, Any]) -> dict[str, str]:
+        """Return the fields of the page's form with their answers."""
+        return {"hippodrome-step": page["step"], "hippodrome-ticket": page["ticket"], "answer": "yes"}
 
     def _step_before_server(self) -> str | None:
         """Return the step whose answer starts the server; None if the first request of the link does."""
@@ -164,6 +169,8 @@ class SimulatedParticipant:
             elif state.get("state") in ("failed", "ended"):
                 if self._is_over():
                     return True
+                if state.get("without") and self._goes_on_without(page):
+                    return True
                 if not state.get("again") or restarts == 2:
                     self.visit.reason = f"{state['state']}: {state.get('reason')}"
                     return False
@@ -182,6 +189,10 @@ class SimulatedParticipant:
                 if fresh and "state" not in fresh:
                     return True
                 state = fresh or state
+
+    def _goes_on_without(self, page: Mapping[str, Any]) -> bool:
+        """Return whether the participant goes on without a game that no server could run."""
+        return False
 
     def _is_over(self) -> bool:
         """Return whether the game is over, after the server has failed or ended.
@@ -218,6 +229,15 @@ class SimulatedParticipant:
         except Conflict:
             pass
         self.answered.append(str(state["step"]))
+        if self._has_another_game():
+            return "done"
         arn = task.arn
         self.clock.after(LINGER, lambda: tasks.end(arn, "EssentialContainerExited", "Essential container exited", 0))
         return "done"
+
+    def _has_another_game(self) -> bool:
+        """Return whether the server has a further game to run for the participant."""
+        documents, project = self.world.platform.documents.kept, self.world.project
+        found = documents.get(assignment_key(project.id, self.visit.user))
+        games = json.loads(found[0])["games"] if found else ()
+        return any(answer_key(project.id, self.visit.user, game) not in documents for game in games)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import msgspec
 
@@ -17,6 +18,7 @@ from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Pr
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
 from hippodrome.control.model.warm_pool import POOLS
+from hippodrome.control.participants import assigning
 from hippodrome.control.ports import Message, Settings, Topic
 from hippodrome.control.servers.causes import Cause
 from hippodrome.control.storage.secret import KEY, Secret
@@ -67,6 +69,12 @@ PROJECT = Project(
 )
 
 
+class Waiting(NamedTuple):
+    """Stands for the module `time` where a function waits: its `sleep` takes virtual seconds."""
+
+    sleep: Callable[[float], None]
+
+
 class SimulatedWorld:
     """The installation and its clock. `run` lets time pass; `left` counts the resources that are left."""
 
@@ -79,7 +87,10 @@ class SimulatedWorld:
         project: Project = PROJECT,
         wires: Mapping[str, Wire] = MappingProxyType(WIRES),
         concurrency: int = CONCURRENCY,
+        pages: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
+        """`pages`: the texts of step files that are not the usual one, by their names without `.html`."""
+        self._pages = pages
         self.conditions = conditions or Conditions()
         self.project = project
         self.clock = GreenletClock(seed)
@@ -150,8 +161,10 @@ class SimulatedWorld:
     def run(self, until: float) -> None:
         """Let time pass until this second since the beginning."""
         before = installed._platform, installed._made
+        waiting = Waiting(self.clock.sleep)
         try:
-            self.clock.run(until)
+            with patch.multiple(assigning, time=waiting, _RANDOM=self.clock.random):
+                self.clock.run(until)
         finally:
             installed._platform, installed._made = before
 
@@ -240,10 +253,10 @@ class SimulatedWorld:
         documents = self.platform.documents
         documents.keep(KEY, to_json(SECRET))
         documents.keep(MASTER_LIST, to_json(MasterList(projects=[self.project])))
-        for step in self.project.steps:
-            if not step.type.on_server:
-                page = f"<h1>{step.page}</h1><input name=answer>"
-                documents.keep(f"{self.project.id}/steps/{step.page}.html", page.encode())
+        files = {file for page in self.project.all_pages for file in page.files}
+        for file in sorted(files):
+            page = self._pages.get(file) or f"<h1>{file}</h1><input name=answer>"
+            documents.keep(f"{self.project.id}/steps/{file}.html", page.encode())
 
     def watch(self) -> None:
         """Update `calls_until_quiet` every `WATCH_EVERY` seconds if anything is left. Slow with many participants."""

@@ -238,6 +238,22 @@ def test_the_other_orders(tmp_path: Path, platform: FakePlatform, order: str) ->
     assert order == "random" or orders == {("plain", "face", "voice")}
 
 
+def test_pages_alone_are_repeated_in_balanced_orders_too(tmp_path: Path, platform: FakePlatform) -> None:
+    steps = "[consent, {each: {look: [plain, face, voice]}, steps: [rate]}, debrief]"
+    looks = study(f"project: {{id: looks, steps: {steps}}}\n", tmp_path, platform)
+    orders = []
+    for number in range(6):
+        person = looks.visitor(f"P{number}")
+        person.answer(person.get(), agree="yes")
+        for _ in range(3):
+            person.answer(person.get(), q1="1")
+        found = re.search(r"[a-z]+,[a-z]+,[a-z]+", person.get().partition("</h1>")[2])
+        assert found
+        orders.append(found[0].split(","))
+    levels = ["plain", "face", "voice"]
+    assert sorted(orders) == sorted([levels[place] for place in row] for row in latin_rows(3))
+
+
 def test_only_some_runs_are_taken(tmp_path: Path, platform: FakePlatform) -> None:
     looks = study(LOOKS.replace("steps: [game:", "take: 2\n      steps: [game:"), tmp_path, platform)
     alice = looks.visitor("alice")
@@ -280,6 +296,17 @@ def test_a_page_has_a_least_and_a_longest_time(tmp_path: Path, platform: FakePla
     platform.wait(seconds=31)
     assert heading(alice.get()) == "Thanks"
     assert times.answers("alice")["rate"] == {"outcome": "timeOver"}
+
+
+def test_time_runs_out_between_the_tries_of_a_check_too(tmp_path: Path, platform: FakePlatform) -> None:
+    config = "project:\n  id: times\n  steps:\n    - quiz: {right: {soups: 3}, maxSeconds: 30}\n    - debrief\n"
+    times = study(config, tmp_path, platform)
+    alice = times.visitor("alice")
+    alice.answer(alice.get(), soups="2")
+    assert "One answer is not right yet." in alice.get()
+    platform.wait(seconds=31)
+    assert heading(alice.get()) == "Thanks"
+    assert times.answers("alice")["quiz"] == {"soups": "2", "passed": False, "tries": 1, "outcome": "timeOver"}
 
 
 # Everybody

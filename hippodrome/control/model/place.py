@@ -34,11 +34,15 @@ class Next(Enum):
 
 
 class Place(NamedTuple):
-    """What is next, and at which step. `end` is the end that is reached."""
+    """What is next, and at which step. `end` is the end that is reached.
+
+    `is_over`: the time of a check is over, so that a wrong answer is the last.
+    """
 
     next: Next
     step: Step
     end: End | None = None
+    is_over: bool = False
 
 
 @dataclass
@@ -79,10 +83,10 @@ class Standing:
         has_no_level = self.assignment is not None and "{" in step.page  # who was matched with nobody
         if has_no_level or (step.when and not rules.holds(step.when, self._facts(step.when, step))):
             return Place(Next.SKIP, step)
-        if step.right and step.key in self.progress.tries:
-            return Place(Next.JUDGE, step)
         reached = self.progress.reached_at(self.project, step) or self.progress.arrived or now
         is_over = step.max_seconds > 0 and now - reached > timedelta(seconds=step.max_seconds)
+        if step.right and step.key in self.progress.tries:
+            return Place(Next.JUDGE, step, is_over=is_over)
         return Place(Next.TIME_OVER if is_over else Next.ASK, step)
 
     def _end(self, step: Step, last: Step | None, now: datetime | None) -> End | None:

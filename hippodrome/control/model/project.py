@@ -117,8 +117,11 @@ class Project(Record, frozen=True):
 
     @property
     def assigns(self) -> bool:
-        """Whether participants get an assignment: the study has factors, or a game with keys of `trial` of its own."""
-        return bool(self.conditions or self.blocks or any(step.sections for step in self.steps))
+        """Whether participants get an assignment: the study has factors, or a game with keys of `trial` of its own.
+
+        A path has no blocks any more, but runs, which have a name.
+        """
+        return bool(self.conditions or self.blocks or any(step.sections or step.name for step in self.steps))
 
     def own(self, assignment: Assignment | None) -> Project:
         """Return the project with the path of a participant who has this assignment, or none yet."""

@@ -117,8 +117,11 @@ class Paths:
         number = standing.progress.tries[step.key]
         sent = self._answers.read(project.id, user_id, f"{step.key}.{number}")
         wrong = wrong_fields(step, sent)
+        judged = {**sent, "passed": not wrong, "tries": number}
         may_try_again = bool(wrong) and (not step.tries or number < step.tries)
-        return {**sent, "passed": not wrong, "tries": number}, wrong if may_try_again else []
+        if may_try_again and place.is_over:
+            return {**judged, "outcome": TIME_OVER}, []
+        return judged, wrong if may_try_again else []
 
     def _finish(self, project: Project, user_id: str, end: End) -> Ended:
         """Write that the participant has reached this end, after the message that stops their server."""
