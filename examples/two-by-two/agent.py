@@ -1,6 +1,6 @@
 """Give and take: in each round both players give or keep, at the same time. What is given counts three for the other.
 
-Which partner plays stands in `options` (config.yml): it is another one in each game of a participant.
+Which partner plays, and what the picture shows, stands in `options` (config.yml): it follows from the participant's cell.
 """
 
 import random
@@ -29,8 +29,6 @@ class Agent:
 
     def partners_move(self):
         """Choose as the partner does, before seeing the participant's choice of this round."""
-        if self.partner == "kind":
-            return GIVE if self.chance.random() < 0.9 else KEEP
         if self.partner == "greedy":
             return KEEP if self.chance.random() < 0.9 else GIVE
         if self.partner == "copycat":

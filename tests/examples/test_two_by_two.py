@@ -1,4 +1,4 @@
-"""examples/partners: the partners behave as the debriefing says, and the design is what the README says."""
+"""examples/two-by-two: the partners behave as the debriefing says, and the design is what the README says."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 
 from hippodrome.control.config import read_project
+from hippodrome.control.model.design import cell_name, cells
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "partners"
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "two-by-two"
 
 
-@pytest.mark.parametrize(("partner", "least", "most"), [("kind", 80, 100), ("greedy", 0, 20), ("copycat", 100, 100)])
+@pytest.mark.parametrize(("partner", "least", "most"), [("greedy", 0, 20), ("copycat", 100, 100)])
 def test_what_each_partner_gives_to_somebody_who_always_gives(load_module, partner: str, least: int, most: int) -> None:
-    agent = load_module("partners", "agent").Agent()
+    agent = load_module("two-by-two", "agent").Agent()
     agent.start("give-and-take")
     agent.reset(seed=1, options={"partner": partner})
     for _ in range(100):
@@ -23,7 +24,7 @@ def test_what_each_partner_gives_to_somebody_who_always_gives(load_module, partn
 
 
 def test_the_picture_hides_what_was_before_in_one_condition(load_module) -> None:
-    agent = load_module("partners", "agent").Agent()
+    agent = load_module("two-by-two", "agent").Agent()
     agent.start("give-and-take")
     for history, shown in (("shown", 3), ("hidden", 1)):
         agent.reset(seed=1, options={"partner": "copycat", "history": history})
@@ -32,9 +33,8 @@ def test_the_picture_hides_what_was_before_in_one_condition(load_module) -> None
         assert len(agent.render()["objects"]) == 2 + 2 * shown
 
 
-def test_the_design_has_two_cells_and_six_orders() -> None:
+def test_the_design_has_four_cells_and_three_ends_before_the_last_page() -> None:
     design = read_project(EXAMPLE).design
-    assert [(factor.name, list(factor.levels)) for factor in design.conditions] == [("history", ["shown", "hidden"])]
-    (block,) = design.blocks
-    assert (block.name, block.runs) == ("partner", [("kind",), ("greedy",), ("copycat",)])
+    names = [cell_name(levels) for levels in cells(design.conditions)]
+    assert names == ["copycat,shown", "copycat,hidden", "greedy,shown", "greedy,hidden"]
     assert [end.name for end in design.ends] == ["declined", "screenedOut", "late"]
