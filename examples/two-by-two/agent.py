@@ -1,6 +1,6 @@
 """Give and take: in each round both players give or keep, at the same time. What is given counts three for the other.
 
-Which partner plays, and what the picture shows, stands in `options` (config.yml): it follows from the participant's cell.
+Which partner plays, and what the picture shows, stands in `options` (config.yml): both follow from the cell.
 """
 
 import random

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -77,7 +78,7 @@ def test_chefs_do_not_walk_through_each_other(modules: Any) -> None:
 def test_everybody_meets_seven_partners_and_each_follows_each_other_equally_often() -> None:
     (block,) = read_project(EXAMPLE).design.blocks
     assert [levels[0] for levels in block.runs] == PARTNERS
-    pairs = [pair for row in latin_rows(len(block.runs)) for pair in zip(row, row[1:], strict=False)]
+    pairs = [pair for row in latin_rows(len(block.runs)) for pair in itertools.pairwise(row)]
     assert {pairs.count(pair) for pair in pairs} == {2}
 
 
@@ -86,3 +87,11 @@ def test_seven_items_follow_each_partner() -> None:
     items = ["adapted", "consistent", "humanlike", "inMyWay", "frustrating", "enjoyed"]
     assert [item for item in items if f'"{item}":' not in page] == []
     assert 'name="coordination"' in page
+
+
+def test_a_bot_plays_the_tutorial_and_seven_rounds(play_example: Any) -> None:
+    played = play_example("cec", options={"seconds": 1}, resetFreeze=0)
+    assert len(played.recordings) == 8
+    assert {len([line for line in lines if line["kind"] == "step"]) for lines in played.recordings} == {6}
+    partners = [lines[0]["players"]["partner"].get("policy") for lines in played.recordings]
+    assert {f"agent:{name.title()}" for name in PARTNERS} < {*partners}

@@ -86,6 +86,7 @@ def _try(report: Path, deadline: Deadline) -> None:
         if given:
             assignment.set_environment(os.environ, _assigned(given))
         progress.callbacks.session_begins()
+        player.set_options(config.options)
         return joint.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))

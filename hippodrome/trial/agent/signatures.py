@@ -58,10 +58,13 @@ class Signature:
     """The kinds of the positional arguments."""
     named: tuple[str, ...] = ()
     """The kinds of the arguments that are given by name. The name is the kind: `seed`, `options`."""
+    optional: tuple[str, ...] = ()
+    """Those of `named` with a default of their own, which stays if there is no value."""
 
     def call(self, function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
         """Call the function with its arguments; `given` has a value for each kind."""
-        return function(*[given[kind] for kind in self.order], **{kind: given[kind] for kind in self.named})
+        by_name = {kind: given[kind] for kind in self.named if kind not in self.optional or given[kind] is not None}
+        return function(*[given[kind] for kind in self.order], **by_name)
 
 
 def usual(method: str) -> Signature:
@@ -78,13 +81,13 @@ def read(method: str, function: Callable[..., Any]) -> Signature:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # a function in C may have no signature
         return usual(method)
-    named, rest = _by_name(method, parameters)
+    named, optional, rest = _by_name(method, parameters)
     needed, possible = _positional(rest)
     order = _order(method, needed, possible)
     if order is None or any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in rest):
         plain = inspect.Signature([p.replace(annotation=p.empty) for p in parameters])
         raise UnfitSignature(f"{method}{plain} cannot be called; write {_SHOWN[method]}")
-    return Signature(order, named)
+    return Signature(order, named, optional)
 
 
 def names(function: Callable[..., Any], parameter: str) -> bool:
@@ -95,21 +98,24 @@ def names(function: Callable[..., Any], parameter: str) -> bool:
         return False
 
 
-def _by_name(method: str, parameters: list[inspect.Parameter]) -> tuple[tuple[str, ...], list[inspect.Parameter]]:
-    """Return the kinds of the arguments that `reset` takes by name, and the other parameters."""
+def _by_name(
+    method: str, parameters: list[inspect.Parameter]
+) -> tuple[tuple[str, ...], tuple[str, ...], list[inspect.Parameter]]:
+    """Return the kinds of the arguments that `reset` takes by name, those with a default, and the other parameters."""
     if method != "reset":
-        return (), parameters
+        return (), (), parameters
     named: set[str] = set()
+    optional: tuple[str, ...] = ()
     rest: list[inspect.Parameter] = []
     for p in parameters:
         if p.kind is p.VAR_KEYWORD or (p.name == SEED and p.kind is not p.POSITIONAL_ONLY):
             named.add(SEED)
         elif p.name == OPTIONS and p.kind is not p.POSITIONAL_ONLY:
-            if p.default is p.empty:
-                named.add(OPTIONS)
+            named.add(OPTIONS)
+            optional = () if p.default is p.empty else (OPTIONS,)
         else:
             rest.append(p)
-    return tuple(sorted(named)), rest
+    return tuple(sorted(named)), optional, rest
 
 
 def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[str]]:

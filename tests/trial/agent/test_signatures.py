@@ -87,6 +87,30 @@ def test_methods_are_called_with_or_without_the_environment(tmp_path: Path, old:
     assert player.env.said == ["reset", ("step", 1), "close"]
 
 
+@pytest.mark.parametrize(
+    ("parameters", "without"),
+    [("seed, options", None), ("seed=None, options=None", None), ("*, seed=None, options='mine'", "mine")],
+)
+def test_reset_gets_the_options_of_the_game(tmp_path: Path, parameters: str, without: object) -> None:
+    """With a default of its own, too: that is how Gymnasium writes `reset`. The default stays if there are no options."""
+    body = f"def reset(self, {parameters}):\n        self.env.said.append(options)\n        return"
+    player = started_agent(
+        tmp_path, "def reset(self):\n        return", body, AGENT.replace('self.env.said.append("reset")', "return")
+    )
+    player.reset(1)
+    player.set_options({"partner": "kind"})
+    player.reset(1)
+    assert player.env.said == [without, {"partner": "kind"}]
+
+
+def test_an_environments_own_reset_gets_the_options_of_the_game(tmp_path: Path) -> None:
+    source = OWN_STEP.replace("SPACE", "spaces.Discrete(2)").replace("self.taken = []", "self.taken = [options]")
+    player = started_agent(tmp_path, source=source)
+    player.set_options({"layout": "ring"})
+    player.reset(1)
+    assert player.env.taken == [{"layout": "ring"}]
+
+
 def test_start_may_take_the_trial_section_in_hippos_form(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Some of HIPPO's agents read keys of their own there; here these keys stand under `options`."""
     options = {"rows": 6, "game": "x", "instructions": ["Mark it"]}
