@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from hippodrome.control.model.design import latin_rows
-from hippodrome.control.ports import Topic
+from hippodrome.control.ports import Conflict, Topic
 from testing.designed import DesignedStudy, write
 from testing.fake_platform import FakePlatform
 from testing.visitors import Browser
@@ -191,6 +191,81 @@ def test_a_repeated_assignment_is_the_same(tmp_path: Path, platform: FakePlatfor
     soup.visitor("alice").get()
     assert soup.stored("alice", "assignment") == first
     assert sum(json.loads(platform.documents.kept["_cells/soup.json"][0])["people"].values()) == 1
+
+
+def test_those_who_left_are_looked_up_once_however_often_others_write_first(
+    tmp_path: Path, platform: FakePlatform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    soup = study(SOUP, tmp_path, platform)
+    for number in range(5):
+        through_soup(soup, f"gone{number}")
+    platform.wait(seconds=2 * 3600)
+    documents, conflicts, looked = platform.documents, iter(range(3)), Counter[str]()
+    replace, listing = documents.replace, documents.list
+
+    def busy(key: str, body: bytes, etag: str) -> str:
+        if key.startswith("_cells/") and next(conflicts, None) is not None:
+            raise Conflict
+        return replace(key, body, etag)
+
+    def counted(prefix: str) -> Any:
+        looked[prefix] += 1
+        return listing(prefix)
+
+    monkeypatch.setattr(documents, "replace", busy)
+    monkeypatch.setattr(documents, "list", counted)
+    through_soup(soup, "alice")
+    assert {looked[f"soup/users/gone{number}/"] for number in range(5)} == {1}
+    assert sum(json.loads(documents.kept["_cells/soup.json"][0])["people"].values()) == 1
+
+
+LAST = """
+project:
+  id: last
+  conditions: {partner: [helpful, lazy]}
+  steps: [consent, rate, {debrief: {page: "debrief-{partner}"}}]
+  ends: {quota: 'answers.consent.agree == "no" and condition.partner != "none"'}
+"""
+LAST_PAGES = {f"debrief-{name}": f"<h1>Thanks, {name}</h1>" for name in ("helpful", "lazy")}
+
+
+def last(tmp_path: Path, platform: FakePlatform) -> DesignedStudy:
+    pages = {**PAGES, **LAST_PAGES, "rate": "<h1>Rate</h1><input name='q1'><button>Go on</button>"}
+    return DesignedStudy(write(tmp_path / "last", LAST, pages), platform)
+
+
+def test_the_last_page_may_be_the_first_that_names_a_factor(tmp_path: Path, platform: FakePlatform) -> None:
+    study = last(tmp_path, platform)
+    alice = study.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.answer(alice.get(), q1="1")
+    assert heading(alice.get()) == f"Thanks, {study.stored('alice', 'assignment')['condition']['partner']}"
+
+
+def test_an_end_that_asks_for_the_condition_draws_it(tmp_path: Path, platform: FakePlatform) -> None:
+    study = last(tmp_path, platform)
+    alice = study.visitor("alice")
+    alice.answer(alice.get(), agree="no")
+    assert heading(alice.get()) == "Thank you"
+    assert study.stored("alice", "end")["end"] == "quota"
+    assert study.stored("alice", "assignment")["condition"]["partner"] in ("helpful", "lazy")
+
+
+def test_who_was_erased_and_comes_again_is_on_the_path_of_the_new_assignment(
+    tmp_path: Path, platform: FakePlatform
+) -> None:
+    study = last(tmp_path, platform)
+    seen = set()
+    for _ in range(12):
+        alice = study.visitor("alice")
+        alice.answer(alice.get(), agree="yes")
+        alice.answer(alice.get(), q1="1")
+        assert heading(alice.get()) == heading(alice.get())
+        seen.add(heading(alice.get()))
+        platform.wait(seconds=60)
+        for key in [key for key in platform.documents.kept if key.startswith(("last/users", "_cells"))]:
+            platform.documents.delete(key)
+    assert seen == {"Thanks, helpful", "Thanks, lazy"}
 
 
 # Blocks

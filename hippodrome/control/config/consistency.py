@@ -188,6 +188,10 @@ def _together(checked: Checked) -> Iterator[Mistake]:
         if step.block is not None or "{" in step.page or asked & {"condition", "order"}:
             why = "with players: 2 or more, levels are drawn when participants are matched, at the first game"
             yield Mistake(design.paths[step.key], f"comes too early: {why}; move this step behind it")
+    if design.steps and "{" in design.steps[-1].page:
+        why = "the last page names a factor, and participants who are matched with nobody have no condition"
+        what = "name one page for all, and ask in it for condition, such as {% if condition.pay %}"
+        yield Mistake(design.paths[design.steps[-1].key], f"{why}; {what}")
     if any(len(humans) != wanted for _, humans in checked.trial.humans()):
         return  # that is said of trial.players
     for step in design.steps:

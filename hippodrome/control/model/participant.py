@@ -57,14 +57,14 @@ class Ended(Record, frozen=True):
 class Progress:
     """A participant's progress: when they arrived, when each step was answered, and which other records exist.
 
-    `tries` has the number of the last try of each check.
+    `tries` has the number of the last try of each check. `assigned` is when their assignment was written.
     """
 
     has_arrived: bool = False
     answered: Mapping[str, datetime] = field(default_factory=dict)
     arrived: datetime | None = None
     tries: Mapping[str, int] = field(default_factory=dict)
-    is_assigned: bool = False
+    assigned: datetime | None = None
     has_ended: bool = False
 
     @classmethod
@@ -72,22 +72,24 @@ class Progress:
         """Read a listing of `folder` in the order of keys. Answers come before participant.json, recordings after."""
         answered: dict[str, datetime] = {}
         tries: dict[str, int] = {}
-        arrived, others = None, set()
+        arrived, assigned, has_ended = None, None, False
         for entry in entries:
             name = entry.key.removeprefix(folder)
             if name > PARTICIPANT:
                 break
             if name == PARTICIPANT:
                 arrived = entry.modified
-            elif name in (ASSIGNMENT, END):
-                others.add(name)
+            elif name == ASSIGNMENT:
+                assigned = entry.modified
+            elif name == END:
+                has_ended = True
             elif name.startswith("answers/") and name.endswith(".json"):
                 step, _, number = name.removeprefix("answers/").removesuffix(".json").partition(".")
                 if not number:
                     answered[step] = entry.modified
                 elif number.isdecimal():
                     tries[step] = max(tries.get(step, 0), int(number))
-        return cls(arrived is not None, answered, arrived, tries, ASSIGNMENT in others, END in others)
+        return cls(arrived is not None, answered, arrived, tries, assigned, has_ended)
 
     def due_step(self, project: Project) -> Step:
         """Return the step that is due: the first without an answer, or the final one."""

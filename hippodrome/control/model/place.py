@@ -71,11 +71,18 @@ class Standing:
                 last = step
                 continue
             return self._place_at(step, last, now)
-        end = self._end(self.project.final, last, None)
-        return Place(Next.ASK if end is None else Next.END, self.project.final, end)
+        final = self.project.final
+        if self._draws_for_end(last):
+            return Place(Next.ASSIGN, final)
+        if (end := self._end(final, last, None)) is not None:
+            return Place(Next.END, final, end)
+        is_unassigned = self.assignment is None and needs_assignment(self.project, final)
+        return Place(Next.ASSIGN if is_unassigned else Next.ASK, final)
 
     def _place_at(self, step: Step, last: Step | None, now: datetime) -> Place:
         """What is next at the first step that is not answered; `last` is the step answered before it."""
+        if self._draws_for_end(last):
+            return Place(Next.ASSIGN, step)
         if (end := self._end(step, last, now)) is not None:
             return Place(Next.END, step, end)
         if self.assignment is None and needs_assignment(self.project, step):
@@ -108,6 +115,15 @@ class Standing:
             if end.name == FAILED and last is not None and last.type.on_server and self._has_failed(last):
                 return end
         return None
+
+    def _draws_for_end(self, last: Step | None) -> bool:
+        """Whether an end's rule that is looked at now asks about levels that are not drawn yet.
+
+        With sessions the matching draws, and rules about levels come after the first game.
+        """
+        if last is None or self.assignment is not None or not self.project.assigns or self.project.has_sessions:
+            return False
+        return any(_asks_levels(rule) and self._is_due(rule, last) for end in self.project.ends for rule in end.when)
 
     def _has_failed(self, game: Step) -> bool:
         return self._read(game.key).get("outcome") == FAILED
@@ -150,8 +166,11 @@ def needs_assignment(project: Project, step: Step) -> bool:
     """Return whether a participant cannot come to this step before their levels and orders are drawn."""
     if not project.assigns:
         return False
-    asks = {names[0] for names in rules.mentioned(step.when)} if step.when else set()
-    return bool(step.name or step.type.on_server or "{" in step.page or asks & {"condition", "order"})
+    return bool(step.name or step.type.on_server or "{" in step.page or (step.when and _asks_levels(step.when)))
+
+
+def _asks_levels(rule: str) -> bool:
+    return any(names[0] in ("condition", "order") for names in rules.mentioned(rule))
 
 
 def values_of(project: Project, assignment: Assignment | None, step: Step) -> dict[str, Any]:

@@ -8,6 +8,7 @@ are assigned together: their session is drawn, and each gets a copy of its assig
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from datetime import datetime
 from random import SystemRandom
 
@@ -33,6 +34,8 @@ from hippodrome.protocol.session import is_session_id
 TRIES = 40
 PAUSE = 0.02  # seconds, times a random number; twice as long after each conflict, up to 32 times
 _RANDOM = SystemRandom()
+Outcomes = Mapping[str, tuple[Outcome, datetime]]
+"""What became of participants or sessions, and the time of their last answers."""
 
 
 class Assigning:
@@ -78,10 +81,13 @@ class Assigning:
 
     def _draw(self, project: Project, owner: str, now: datetime, cell: str | None) -> Draw:
         documents, key = self._platform.documents, cells_key(project.id)
+        outcomes: Outcomes | None = None  # looked up once: others write the document while this one looks
         for attempt in range(TRIES):
             found = documents.get(key)
             cells = from_json(found.body, Cells) if found else Cells()
-            cells, draw = self._settled(project, cells, now).draw(project, owner, now, _RANDOM, cell)
+            if outcomes is None:
+                outcomes = self._outcomes(project, cells, now)
+            cells, draw = _settled(cells, outcomes, now).draw(project, owner, now, _RANDOM, cell)
             try:
                 self._write(key, found, cells)
                 return draw
@@ -95,15 +101,23 @@ class Assigning:
         else:
             self._platform.documents.replace(key, to_json(cells), found.etag)
 
-    def _settled(self, project: Project, cells: Cells, now: datetime) -> Cells:
-        """The cells after a look at those who have done nothing for long: whether they have finished, or left."""
+    def _outcomes(self, project: Project, cells: Cells, now: datetime) -> Outcomes:
+        """What became of those who have done nothing for long: whether they have finished, or left."""
+        outcomes = {}
         for owner in cells.unsettled(now):
             users = members_of(self._repository, project.id, owner) if is_session_id(owner) else [owner]
-            outcomes = [self._outcome(project, user_id, now) for user_id in users]
-            cells = cells.settled(owner, *most_active(outcomes, now))
-        return cells
+            outcomes[owner] = most_active([self._outcome(project, user_id, now) for user_id in users], now)
+        return outcomes
 
     def _outcome(self, project: Project, user_id: str, now: datetime) -> tuple[Outcome, datetime]:
         progress = self._repository.progress(project.id, user_id)
         path = [step.key for step in self._repository.own_project(project, user_id, progress).steps[:-1]]
         return outcome_of(path, progress.answered, progress.has_ended, now)
+
+
+def _settled(cells: Cells, outcomes: Outcomes, now: datetime) -> Cells:
+    """The cells without those who have finished or left, unless they were settled or drawn anew meanwhile."""
+    for owner in cells.unsettled(now):
+        if owner in outcomes:
+            cells = cells.settled(owner, *outcomes[owner])
+    return cells

@@ -72,7 +72,7 @@ class Paths:
                 assignment = self._assigning.assign(project, user_id)
                 if assignment is None:
                     return Stop(standing, place.step)  # the game, in whose lobby the participant waits for others
-                standing = _assigned(project, standing, assignment)
+                standing = self._assigned(project, standing, assignment)
                 continue
             answers, wrong = self._answers_at(project, user_id, standing, place)
             if wrong:
@@ -86,11 +86,10 @@ class Paths:
     def assigned(self, project: Project, user_id: str, standing: Standing) -> Stop:
         """Assign the participant to levels and orders at a page that needs them, and go on from there."""
         assignment = self._assigning.assign(project, user_id)
-        return self._go_on(project, user_id, _assigned(project, standing, assignment) if assignment else standing)
+        return self._go_on(project, user_id, self._assigned(project, standing, assignment) if assignment else standing)
 
     def _standing(self, project: Project, user_id: str, progress: Progress) -> Standing:
-        has_one = project.assigns and progress.is_assigned
-        assignment = self._repository.assignment(project.id, user_id) if has_one else None
+        assignment = self._repository.assignment_of(project, user_id, progress)
         return Standing(
             project.own(assignment),
             progress,
@@ -133,11 +132,10 @@ class Paths:
             return ended
         return self._repository.ended(project.id, user_id) or ended
 
-
-def _assigned(project: Project, standing: Standing, assignment: Assignment) -> Standing:
-    """The standing on the path that follows from an assignment."""
-    progress = replace(standing.progress, is_assigned=True)
-    return replace(standing, project=project.own(assignment), assignment=assignment, progress=progress)
+    def _assigned(self, project: Project, standing: Standing, assignment: Assignment) -> Standing:
+        """The standing on the path that follows from an assignment."""
+        progress = replace(standing.progress, assigned=self._platform.now())
+        return replace(standing, project=project.own(assignment), assignment=assignment, progress=progress)
 
 
 def _end_of(project: Project, name: str) -> End | None:

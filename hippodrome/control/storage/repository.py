@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, memberships, participant, server
@@ -39,7 +40,7 @@ class Repository:
 
     def __init__(self, documents: Documents) -> None:
         self._documents = documents
-        self._assignments: dict[str, Assignment] = {}
+        self._assignments: dict[tuple[str, datetime], Assignment] = {}
 
     # Participants
 
@@ -61,21 +62,24 @@ class Repository:
         """Write the record of a participant's first visit; return False if there is one already."""
         return self._created(participant.participant_key(record.project_id, record.user_id), to_json(record))
 
-    def assignment(self, project_id: str, owner: str) -> Assignment | None:
-        """Return the levels and orders of a participant or a session; None if none were drawn. They never change, so
-        they are cached.
+    def assignment(self, project_id: str, owner: str, written: datetime | None = None) -> Assignment | None:
+        """Return the levels and orders of a participant or a session; None if none were drawn.
 
-        Raises ValueError if the document cannot be read.
+        They never change, so they are cached if the time is given at which a listing says that they were `written`: who
+        was erased and comes again gets others. Raises ValueError if the document cannot be read.
         """
         key = assignment_key(project_id, owner)
-        if key not in self._assignments:
-            found = self._documents.get(key)
-            if found is None:
-                return None
+        if written is not None and (known := self._assignments.get((key, written))):
+            return known
+        found = self._documents.get(key)
+        if found is None:
+            return None
+        assignment = from_json(found.body, Assignment)
+        if written is not None:
             if len(self._assignments) >= CACHED_ASSIGNMENTS:
                 self._assignments.clear()
-            self._assignments[key] = from_json(found.body, Assignment)
-        return self._assignments[key]
+            self._assignments[key, written] = assignment
+        return assignment
 
     def create_assignment(self, project_id: str, owner: str, record: Assignment) -> bool:
         """Write the levels and orders of a participant or a session; return False if there are some already."""
@@ -90,10 +94,17 @@ class Repository:
         """Write the record of the end that a participant has reached; return False if there is one already."""
         return self._created(participant.end_key(project_id, user_id), to_json(record))
 
+    def assignment_of(self, project: Project, user_id: str, progress: Progress) -> Assignment | None:
+        """Return the participant's levels and orders; None if the study has none, or if none were drawn.
+
+        AWS calls: one read, unless they are cached or there are none.
+        """
+        has_one = project.assigns and progress.assigned is not None
+        return self.assignment(project.id, user_id, progress.assigned) if has_one else None
+
     def own_project(self, project: Project, user_id: str, progress: Progress) -> Project:
         """Return the project with the participant's own path. AWS calls: one read, if they have an assignment."""
-        has_one = project.assigns and progress.is_assigned
-        return project.own(self.assignment(project.id, user_id) if has_one else None)
+        return project.own(self.assignment_of(project, user_id, progress))
 
     def _created(self, key: str, body: bytes) -> bool:
         try:

@@ -169,3 +169,14 @@ trial: {game: kitchen, players: {a: human, b: human}}
         "config.yml:7: project.steps item 3.game: 1 of the players are human with partner: helpful, and project.players "
         "is 2; all who play together play each game",
     ]
+
+
+def test_with_several_players_the_last_page_is_there_for_the_unmatched_too(tmp_path: Path) -> None:
+    old = CONFIG[CONFIG.index("    - consent") :]
+    new = """    - consent
+    - game
+    - debrief: {page: "debrief-{partner}"}
+  players: 2
+trial: {game: kitchen, players: {a: human, b: human}}
+"""
+    assert any("the last page names a factor" in sentence for sentence in said(tmp_path, old, new))
