@@ -41,6 +41,8 @@ MEASURES = (  # each is `module.function`
     "crowds.warm",
     "data.download",
     "designs.balance",
+    "designs.calls",
+    "designs.arrivals",
 )
 PATIENCE = 600  # seconds of one measure
 COMPARED = {  # what `--against` measures unless others are named, and how often: timings are noisy, counts are not
