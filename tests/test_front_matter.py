@@ -35,6 +35,19 @@ def test_a_job_runs_commands_that_exist(job: str) -> None:
             assert (ROOT / program).stat().st_mode & 0o111
 
 
+@pytest.mark.parametrize("name", ["bug.yml", "study.yml"])
+def test_the_forms_of_issues_name_commands_that_exist(name: str) -> None:
+    named = re.findall(r"`hippodrome ([\w-]+)", (ROOT / ".github/ISSUE_TEMPLATE" / name).read_text())
+    assert set(named) <= {*COMMANDS, "--version"}
+
+
+def test_each_hook_runs_what_make_lint_installs() -> None:
+    (repository,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    tools = {hook["entry"].split()[0].removeprefix(".venv/bin/") for hook in repository["hooks"]}
+    pinned = {line.partition("==")[0] for line in (ROOT / "requirements/dev.txt").read_text().splitlines()}
+    assert tools <= pinned
+
+
 def test_jobs_run_on_each_python_that_is_promised() -> None:
     (newest,) = set(re.findall(r"Python 3\.11 to 3\.(\d+)", (ROOT / "README.md").read_text()))
     promised = [f"3.{minor}" for minor in range(11, int(newest) + 1)]
