@@ -22,10 +22,11 @@ from websockets.typing import Subprotocol
 from hippodrome.bots import form_filling, forms
 from hippodrome.bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
 from hippodrome.bots.game import GameConnection
-from hippodrome.bots.http import Reply, ask
+from hippodrome.bots.http import BROWSER, Reply, ask
 from hippodrome.bots.links import with_user
 from hippodrome.bots.page import VisitedPage
 from hippodrome.bots.report import BotReport, PlayedStep
+from hippodrome.bots.steering import BROWSERS, Steering
 from hippodrome.control.config.project_keys import MAX_STEPS
 from hippodrome.trial.pictures.frames import FrameError
 
@@ -60,7 +61,8 @@ class Bot:
     After `play` seconds of a game the bot stops the game, if its controls have "stop"; with 0 it plays to the end.
     `patience` is how many seconds the bot waits for one thing: for a response, a server, or the end of a game.
     `allowed` are the addresses that it may send requests to. Raises AddressRefused if the link is none of them.
-    `right` are the right answers of checks, by step and field: of five answers the bot gives four that are right.
+    `right` are the right answers of checks, by step and field: of five answers the bot gives four that are right. With
+    `steering` it gives the answers that lead where that says.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class Bot:
         patience: float = 300.0,
         allowed: AllowedAddresses = THIS_MACHINE,
         right: Mapping[str, Mapping[str, str]] | None = None,
+        steering: Steering | None = None,
     ) -> None:
         self.allowed = allowed
         self.address = allowed.page(with_user(link, user_id))
@@ -81,6 +84,8 @@ class Bot:
         self.patience = patience
         self.report = BotReport(user_id)
         self._right = right or {}
+        self._steering = steering
+        self._browser = BROWSERS.get(steering.participant.get("device", ""), BROWSER) if steering else BROWSER
         self._restarts = 0
 
     async def run(self) -> BotReport:
@@ -143,7 +148,9 @@ class Bot:
             raise Failed(f"step {step} was answered, and its page is shown once more")
         self.report.stage = f"answers step {step}"
         pairs = form_filling.fill(form, self.random)
-        if self.random.random() < KNOWN:
+        if self._steering:
+            pairs = self._steering.fill(step, form, pairs)
+        elif self.random.random() < KNOWN:
             pairs = [(name, right.get(name, value)) for name, value in pairs]
             pairs += [(name, value) for name, value in right.items() if name not in dict(pairs)]
         self.report.answers[step] = form_filling.gathered(pairs)
@@ -170,7 +177,7 @@ class Bot:
         complaints: list[str] = []
         while True:
             try:
-                reply = await ask(address, body, allowed=self.allowed)
+                reply = await ask(address, body, allowed=self.allowed, browser=self._browser)
             except OSError as error:  # a TimeoutError is one
                 complaint = f"no answer from {_without_query(address)}: {_reason(error)}"
                 if time.monotonic() > until:

@@ -12,6 +12,7 @@ import h11
 
 from hippodrome.bots.addresses import PORTS, THIS_MACHINE, AllowedAddresses
 
+BROWSER = "rehearsal"
 ASK_SECONDS = 20.0  # the most seconds from a request to the end of its response
 
 
@@ -28,15 +29,19 @@ class Reply:
         return self.body.decode("utf-8", "replace")
 
 
-async def ask(address: str, body: bytes | None = None, *, allowed: AllowedAddresses = THIS_MACHINE) -> Reply:
+async def ask(
+    address: str, body: bytes | None = None, *, allowed: AllowedAddresses = THIS_MACHINE, browser: str = BROWSER
+) -> Reply:
     """Send one request and return its response. With a `body`, the request is a POST of the form in it.
+
+    `browser` is the name that a browser gives itself.
 
     Raises AddressRefused if `allowed` does not have the address, and OSError if there is no whole response within
     ASK_SECONDS.
     """
     parts = urlsplit(allowed.page(address))
     target = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-    headers = [("Host", parts.netloc), ("Accept", "text/html"), ("Connection", "close"), ("User-Agent", "rehearsal")]
+    headers = [("Host", parts.netloc), ("Accept", "text/html"), ("Connection", "close"), ("User-Agent", browser)]
     if body is not None:
         headers += [("Content-Type", "application/x-www-form-urlencoded"), ("Content-Length", str(len(body)))]
     request = h11.Request(method="GET" if body is None else "POST", target=target, headers=headers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 
@@ -14,6 +15,12 @@ def with_project(link: str, project_id: str) -> str:
     if parts.path not in ("", "/"):
         return link
     return urlunsplit(parts._replace(path="/next", query=urlencode({"projectId": project_id})))
+
+
+def with_fields(link: str, fields: Mapping[str, str]) -> str:
+    """Return the link with more fields."""
+    parts = urlsplit(link)
+    return urlunsplit(parts._replace(query=urlencode([*parse_qsl(parts.query), *fields.items()])))
 
 
 def with_user(link: str, user_id: str) -> str:

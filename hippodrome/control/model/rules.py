@@ -63,6 +63,19 @@ def mentioned(rule: str) -> set[tuple[str, ...]]:
     return found
 
 
+def constants(rule: str) -> list[Any]:
+    """Return the texts and numbers that a rule compares with, in their order. Raises `BadRule`."""
+    found: list[Any] = []
+    nodes: list[ast.AST] = [_tree(rule)]
+    while nodes:
+        node = nodes.pop(0)
+        if isinstance(node, ast.Constant):
+            found.append(node.value)
+        elif _names(node) is None:  # the name of a field in brackets is no constant
+            nodes += ast.iter_child_nodes(node)
+    return found
+
+
 def steps_mentioned(rule: str) -> set[str]:
     """Return the steps whose answers a rule asks about. Raises `BadRule`."""
     return {names[1] for names in mentioned(rule) if names[0] == "answers" and len(names) > 1}

@@ -34,8 +34,11 @@ from hippodrome.console.arguments import StudyFolder
 from hippodrome.console.problem import Problem
 from hippodrome.console.program import as_typed
 from hippodrome.control.config import Config, ConfigErrors, read_project
+from hippodrome.control.config.folder import read_source
 from hippodrome.local import requirements
+from hippodrome.local.rehearsal import ends as reached
 from hippodrome.local.rehearsal.crashes import ServerLogs
+from hippodrome.local.rehearsal.ends import Ends
 from hippodrome.local.rehearsal.logs import FunctionLog, verify
 from hippodrome.local.rehearsal.report import report
 from hippodrome.local.rehearsal.study_process import (
@@ -81,6 +84,20 @@ async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]
     return await walk(bots, at_once=crowd.at_once, ramp=crowd.ramp, watch=watch)
 
 
+async def _to_ends(
+    ends: Ends, link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]
+) -> list[BotReport]:
+    return await ends.rehearse(
+        link,
+        watch,
+        at_once=crowd.at_once,
+        ramp=crowd.ramp,
+        play=crowd.play,
+        patience=crowd.patience,
+        right=crowd.right,
+    )
+
+
 @contextlib.contextmanager
 def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]], None]]:
     """A progress bar that shows how far the bots are."""
@@ -109,7 +126,7 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
                 )
                 if stage in stages
             ]
-            progress.update(bar, completed=over, doing=", ".join(doing))
+            progress.update(bar, completed=over, total=max(bots, len(reports)), doing=", ".join(doing))
 
         yield watch
 
@@ -188,15 +205,17 @@ def _rehearse_and_report(
     study: StudyProcess | None,
     console: Console,
     began: float,
+    ends: Ends | None = None,
 ) -> bool:
     """Send the crowd through the study at `link`, and print the report; return whether all is well.
 
-    `data` is None if the folder of its data is not known.
+    `data` is None if the folder of its data is not known. With `ends`, bots are sent to each of them instead.
     """
     functions = FunctionLog(data) if data else None
     servers = ServerLogs(data) if data else None
-    with _bar(console, crowd.bots) as watch:
-        reports = interruptible(rehearse(link, crowd, watch))
+    with _bar(console, len(ends.goals()) if ends else crowd.bots) as watch:
+        walking = _to_ends(ends, link, crowd, watch) if ends else rehearse(link, crowd, watch)
+        reports = interruptible(walking)
     left = None
     if data:
         ids = {bot.user_id for bot in reports}
@@ -218,12 +237,13 @@ def _rehearse_and_report(
         warnings=functions.warnings() if functions else (),
         crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
     )
+    all_reached = reached.report(console, ends, read_source(folder)) if ends else True
     if not fine and study:
         logs = _keep_logs(study, folder)
         console.print(f"The logs of local mode and of the servers are in {logs}.", soft_wrap=True)
     if study and data:
         console.print(as_typed(_how_to_read(folder, data)), markup=False, soft_wrap=True)
-    return fine
+    return fine and all_reached
 
 
 def command(
@@ -231,6 +251,9 @@ def command(
     *,
     bots: Annotated[int, typer.Option(min=1, max=1000, help="How many simulated participants.")] = 20,
     at_once: Annotated[int, typer.Option(min=1, help="How many of them walk at the same time.")] = 10,
+    ends: Annotated[
+        bool, typer.Option("--ends", help="Send bots to each cell of `conditions` and to each end, instead of --bots.")
+    ] = False,
     play: Annotated[float, typer.Option(min=0, help="Seconds that each plays; 0: to the end of the game.")] = 8.0,
     patience: Annotated[float, typer.Option(min=1, help="Seconds that a bot waits for any one thing.")] = 300.0,
     ramp: Annotated[float, typer.Option(min=0, help="Seconds between the first arrivals.")] = 0.3,
@@ -247,7 +270,8 @@ def command(
 ) -> None:
     """Send simulated participants through the whole study, and check that everything that they do arrives.
 
-    What the study's requirements.txt names is installed first. The exit code is 1 if something is missing.
+    What the study's requirements.txt names is installed first. The exit code is 1 if something is missing, and with
+    --ends if nobody came through a cell, or reached an end.
     """
     must_hold_study(folder)
     requirements.prepare(folder)
@@ -260,6 +284,8 @@ def command(
         config = read_project(folder)
         link = with_project(THIS_MACHINE.page(url), config.project.id) if url else None
         place = data if link else _data_of_bots(folder, config.project.id, data)
+        if ends and not place:
+            raise StudyNotStarted("With --url, --ends also needs --data: it reads there which cell a bot got.")
         with _running(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
             fine = _rehearse_and_report(
                 folder,
@@ -277,6 +303,7 @@ def command(
                 study=study,
                 console=console,
                 began=began,
+                ends=Ends(config, place) if ends and place else None,
             )
     except ConfigErrors as errors:
         mistakes = [str(mistake) for mistake in errors.diagnostics]
