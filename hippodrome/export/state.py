@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from hippodrome.export.keys import ASSIGNED, ENDED
 from hippodrome.protocol.answer import GAME
 
 _TABLES = """
@@ -38,6 +39,8 @@ CREATE VIEW IF NOT EXISTS people AS
 CREATE TABLE IF NOT EXISTS episodes (
   key TEXT NOT NULL, place INTEGER NOT NULL, document TEXT NOT NULL, PRIMARY KEY (key, place)) WITHOUT ROWID;
 """
+_ANSWERS = "SELECT count(*) FROM answers WHERE instr(step, '.') = 0 AND step NOT IN (?, ?)"
+"""Counts the answers: neither tries, whose names have a point, nor assignments and ends (`keys.py`)."""
 _LETTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # characters that are not mistaken for others
 
 
@@ -366,7 +369,7 @@ class ExportState:
         sessions = {"sessions": kinds["session"]} if "session" in kinds else {}
         return sessions | {
             "participants": one("SELECT count(*) FROM participants WHERE seen=?", (self.run,)).fetchone()[0],
-            "answers": one("SELECT count(*) FROM answers").fetchone()[0],
+            "answers": one(_ANSWERS, (ASSIGNED, ENDED)).fetchone()[0],
             "recordings": one("SELECT count(*) FROM files WHERE kind='recording' AND path IS NOT NULL").fetchone()[0],
             "episodes": one("SELECT count(*) FROM episodes").fetchone()[0],
             "frames": one("SELECT coalesce(sum(frames), 0) FROM files").fetchone()[0],

@@ -103,6 +103,11 @@ def test_a_row_per_person_and_run_has_levels_and_answers(tables: Path) -> None:
     assert {row["position"] for row in runs} == {"1", "2", "3"}
 
 
+def test_tries_assignments_and_ends_are_not_counted_as_answers(tables: Path) -> None:
+    counts = json.loads((tables / "manifest.json").read_text())["counts"]
+    assert counts["answers"] == 7 + 6 * (1 + 2 * 3)  # consent; the check, and three runs of game and trust
+
+
 def test_each_try_is_kept(tables: Path) -> None:
     tries = [(row["participant"], row["try"], row["value"]) for row in rows(tables / "tries.csv")]
     assert tries[:2] == [("P0", "1", "4"), ("P0", "2", "3")]
