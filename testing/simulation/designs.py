@@ -14,7 +14,9 @@ from urllib.parse import urlencode
 
 from hippodrome.control.model.design import Block, End, Factor, Section, Step
 from hippodrome.control.model.project import Events
+from hippodrome.control.participants.steps.game import UNASSIGNED
 from hippodrome.protocol.keys import participant_folder
+from hippodrome.protocol.session import assignment_key
 from testing.simulation.members import SimulatedMember
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.world import SimulatedWorld
@@ -76,6 +78,14 @@ PAY: Mapping[str, object] = {
     "patience": 120.0,
 }
 """Participants who play together are assigned together."""
+TOGETHER: Mapping[str, object] = {
+    **LOOKS,
+    "conditions": PAY["conditions"],
+    "ends": (End("late", minutes=30),),
+    "players": 2,
+    "patience": 120.0,
+}
+"""They play several games together, in one order."""
 
 
 @dataclass(frozen=True)
@@ -191,3 +201,25 @@ class Designed(SimulatedParticipant):
 
 class DesignedMember(Designed, SimulatedMember):
     """A participant of such a study who plays together with others."""
+
+    _page_is_unassigned = False
+
+    def _request(self, method: str, query: str, body: str) -> dict[str, Any] | None:
+        had_none = not self._is_assigned()
+        page = super()._request(method, query, body)
+        if page is not None and "poll=" not in query and "state" in page:
+            self._page_is_unassigned = had_none
+        return page
+
+    def _poll(self, step: str) -> dict[str, Any] | None:
+        """Return what a poll says, or the page that is loaded again, as `hippodrome/web/game/main.js` does."""
+        state = super()._poll(step)
+        is_matched = state is not None and state.get("state") == "ended" and self._page_is_unassigned
+        return self._ask("GET") if is_matched else state
+
+    def _poll_query(self, step: str) -> str:
+        return super()._poll_query(step) + (f"&{UNASSIGNED}=1" if self._page_is_unassigned else "")
+
+    def _is_assigned(self) -> bool:
+        key = assignment_key(self.world.project.id, self.visit.user)
+        return key in self.world.platform.documents.kept

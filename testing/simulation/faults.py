@@ -16,7 +16,7 @@ from hippodrome.protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import design_checks, session_checks
 from testing.simulation.conditions import Conditions
-from testing.simulation.designs import LOOKS, PAGES, PAY, SOUP, WRONG, Designed, DesignedMember, Ways
+from testing.simulation.designs import LOOKS, PAGES, PAY, SOUP, TOGETHER, WRONG, Designed, DesignedMember, Ways
 from testing.simulation.members import Habits, SimulatedMember
 from testing.simulation.people import SimulatedParticipant, SimulatedVisit
 from testing.simulation.world import PROJECT, SimulatedWorld
@@ -248,6 +248,12 @@ JOURNEYS_OF_DESIGNS = (
         ends=["left by themselves"],
     ),
     SimulatedJourney("a pair is assigned together", project=PAY, ways=[Ways(tabs=True), Ways(back=True)]),
+    SimulatedJourney(
+        "a pair plays several games in one order, and a third comes late",
+        project=TOGETHER,
+        play=20.0,
+        ways=[Ways(tabs=True), Ways(), Ways(comes=400.0)],
+    ),
     SimulatedJourney(
         "of four who come for pairs one declines, and one is unmatched",
         project=PAY,

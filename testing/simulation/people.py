@@ -183,12 +183,17 @@ class SimulatedParticipant:
             self.clock.sleep(poll_delay(state, polls))
             polls += 1
             state = self._poll(str(page["step"])) or state
+            if "page" in state:  # the page was loaded again
+                page = dict(state)
+            if "state" not in state:
+                return True
             if self.clock.seconds - loaded > RELOADS:
                 loaded, polls = self.clock.seconds, 0
                 fresh = self._ask("GET")
                 if fresh and "state" not in fresh:
                     return True
-                state = fresh or state
+                if fresh:
+                    state = page = fresh
 
     def _goes_on_without(self, page: Mapping[str, Any]) -> bool:
         """Return whether the participant goes on without a game that no server could run."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from hippodrome.control.ports import Conflict
 from hippodrome.protocol import session as sessions
 from hippodrome.protocol.keys import answer_key, session_key
-from hippodrome.protocol.session import SessionDocument, member_token
+from hippodrome.protocol.session import SessionDocument, assignment_key, member_token
 from testing.simulation.ports import SimPlatform
 from testing.simulation.tasks import TimedTask
 from testing.tasks import Life
@@ -90,7 +90,7 @@ class SimTrial:
         members = {member.user_id for member in session.members}
         if members <= here:
             self._all_here()
-            if self._trials.played[self.session_id] >= self._play:
+            if self._trials.played[self.session_id, self._step] >= self._play:
                 self._store(session, dict.fromkeys(members, "finished"))
             return
         self._countdown = COUNTDOWN
@@ -107,7 +107,7 @@ class SimTrial:
             return
         if self.began is None:
             self.began = self._clock.seconds
-        self._trials.played[self.session_id] += TICK  # the recording holds this tick
+        self._trials.played[self.session_id, self._step] += TICK  # the recording holds this tick
 
     def _store(self, session: SessionDocument, outcomes: Mapping[str, str]) -> None:
         """Store an answer for each member, unless an earlier server has stored one."""
@@ -118,7 +118,16 @@ class SimTrial:
             with contextlib.suppress(Conflict):
                 self._documents.keep(key, json.dumps(record).encode())
         self.over = "done"
+        if self._has_another_game(session):
+            return
         self._clock.after(LINGER, lambda: self._end("done"))
+
+    def _has_another_game(self, session: SessionDocument) -> bool:
+        """Whether the server has a further game to run for its members."""
+        found = self._documents.kept.get(assignment_key(self._trials.project_id, session.id))
+        games = json.loads(found[0])["games"] if found else ()
+        keys = (answer_key(self._trials.project_id, session.members[0].user_id, game) for game in games)
+        return any(key not in self._documents.kept for key in keys)
 
     def _end(self, why: str) -> None:
         self.over = self.over or why
@@ -137,17 +146,18 @@ class SimTrials:
     def __init__(self, platform: SimPlatform, project_id: str, idle: float) -> None:
         """`idle`: the seconds after which a trial without members ends."""
         self.platform, self.project_id, self.idle = platform, project_id, idle
-        self.played: defaultdict[str, float] = defaultdict(float)  # by session: seconds of play in its recordings
-        self._trials: dict[str, SimTrial] = {}  # the trials by their tasks
+        self.played: defaultdict[tuple[str, str], float] = defaultdict(float)
+        """Seconds of play in the recordings, by session and game step."""
+        self._trials: dict[tuple[str, str], SimTrial] = {}  # the trials by their tasks and game steps
 
     def at(self, task: TimedTask, step: str, play: float) -> SimTrial | None:
         """Return the trial of a session's task; None if the task has no session, or if the session is not formed yet.
 
-        The first call makes the trial, for this game step and with `play` seconds of play.
+        The first call for a game step makes its trial, with `play` seconds of play.
         """
         session_id = self.platform.tasks.owner(task)
         if not sessions.is_session_id(session_id):
             return None
-        if task.arn not in self._trials:
-            self._trials[task.arn] = SimTrial(self, task, session_id, step, play)
-        return self._trials[task.arn]
+        if (task.arn, step) not in self._trials:
+            self._trials[task.arn, step] = SimTrial(self, task, session_id, step, play)
+        return self._trials[task.arn, step]

@@ -143,6 +143,20 @@ def test_time_runs_out_between_steps_and_not_in_a_game(tmp_path: Path, platform:
     assert heading(bob.get()) == "Thanks", "whoever has come to the last step has finished"
 
 
+def test_time_does_not_run_out_in_a_game_that_is_the_first_step(tmp_path: Path, platform: FakePlatform) -> None:
+    config = SOUP.replace("    - consent\n    - quiz: {right: {soups: 3, late: no}, tries: 2}\n", "").replace(
+        '    declined: answers.consent.agree == "no"\n'
+        '    screenedOut: {when: not answers.quiz.passed, code: CS1, link: "https://example.org/back"}\n',
+        "",
+    )
+    soup = study(config, tmp_path, platform)
+    alice = soup.visitor("alice")
+    alice.get()
+    platform.wait(seconds=61 * 60)
+    alice.get()
+    assert soup.stored("alice", "end") is None
+
+
 # Conditions
 
 
@@ -478,6 +492,20 @@ def test_participants_who_play_together_are_assigned_together(tmp_path: Path, pl
     matched(pair, "cid", "dan")
     conditions = {pair.stored(user, "assignment")["condition"]["pay"] for user in ("ann", "cid")}
     assert conditions == {"equal", "best"}, "pairs are balanced"
+
+
+def test_a_lobbys_page_that_was_made_before_the_study_had_factors_is_loaded_again(
+    tmp_path: Path, platform: FakePlatform
+) -> None:
+    pair = pairs(tmp_path, platform)
+    first, second = consented(pair, "ann"), consented(pair, "ben")
+    lobby = first.get().replace("unassigned=1", "")
+    second.get()
+    for _ in range(4):
+        pair.platform.wait(seconds=2)
+        told = polled(lobby, first)
+        second.get()
+    assert told["state"] == "ended"
 
 
 def test_a_pair_goes_through_its_games_in_one_order(tmp_path: Path, platform: FakePlatform) -> None:

@@ -91,7 +91,7 @@ def test_the_game_waits_for_all_members_and_then_each_has_an_answer():
     played.form(*PAIR)
     played.connect("alice")
     played.run(ABSENT - 5)
-    assert played.world.trials.played[SESSION] == 0
+    assert played.world.trials.played[SESSION, STEP] == 0
     played.connect("bob")
     played.run(COUNTDOWN + PLAY + 2)
     assert played.outcomes() == {"alice": "finished", "bob": "finished"}
@@ -126,7 +126,7 @@ def test_the_next_server_goes_on_where_the_first_was_lost():
     played.world.platform.tasks.end(played.task.arn, "SpotInterruption", "")
     played.run(30)
     assert lost.over == "lost"
-    recorded = played.world.trials.played[SESSION]
+    recorded = played.world.trials.played[SESSION, STEP]
     assert PLAY / 3 < recorded < PLAY
     second = played.serve("a-2")
     for user in PAIR:

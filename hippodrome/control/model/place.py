@@ -103,8 +103,8 @@ class Standing:
         nobody runs out of time. The end `failed` is reached after a game that no server could run.
         """
         progress = self.progress
-        if now is not None and last is not None and step.type.on_server:
-            now = progress.answered[last.key]
+        if now is not None and step.type.on_server:
+            now = progress.answered[last.key] if last is not None else None
         for end in self.project.ends:
             timed = end.minutes is not None and now is not None and progress.arrived is not None
             if timed and now - progress.arrived > timedelta(minutes=end.minutes):  # type: ignore[operator,arg-type]

@@ -216,9 +216,10 @@ class Journey:
         """The state of the lobby, or of the session's server. Without a membership, the query must have a ticket."""
         shown = project.step_of_ticket(user_id, step.key if step else None, request.query_value("ticket"))
         if shown is not None and shown.type.on_server:
-            unassigned = request.has_query(UNASSIGNED)
-            reads = project.assigns and not unassigned
-            assignment = self._repository.assignment(project.id, user_id) if reads else None
+            unassigned, assignment = request.has_query(UNASSIGNED), None
+            if project.assigns and not unassigned:  # a page of an earlier registration may not know that it is
+                assignment = self._repository.assignment(project.id, user_id)
+                unassigned = assignment is None
             standing = self._shared_game.visit(project.own(assignment), user_id, shown)
             if unassigned and standing.is_matched:
                 return self._shared_game.state(project, user_id, step, standing) | {"state": ENDED}  # load it again

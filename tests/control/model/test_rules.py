@@ -115,3 +115,7 @@ def test_a_rule_says_which_steps_it_asks_about() -> None:
         "1",
     }
     assert rules.mentioned("condition.chat == order.look") == {("condition", "chat"), ("order", "look")}
+
+
+def test_a_number_that_is_too_large_is_none() -> None:
+    assert not rules.holds("answers.age.years < 18", {"answers": {"age": {"years": 10**400}}})
