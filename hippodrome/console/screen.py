@@ -75,12 +75,12 @@ class ProgressBars(Progress):
     If stderr is no terminal, a line at the beginning of each task takes their place.
     """
 
-    def __init__(self, *more: ProgressColumn, width: int = 40) -> None:
+    def __init__(self, *more: ProgressColumn, width: int = 40, amount: ProgressColumn | None = None) -> None:
         columns = (
             SpinnerColumn(),
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=width),
-            MofNCompleteColumn(),
+            amount or MofNCompleteColumn(),
             TimeElapsedColumn(),
         )
         super().__init__(*columns, *more, console=err, disable=not err.is_terminal)

@@ -41,22 +41,23 @@ def _is_cpython(place: str, version: str) -> bool:
     return answer.stdout.strip() == f"{version} cpython"
 
 
-_made: dict[tuple[str, str, bytes], dict[str, bytes]] = {}  # by compiler, name and content: functions share most files
+_Key = tuple[str, str, str, bytes]
+_made: dict[_Key, dict[str, bytes]] = {}  # by compiler, place, name and content: functions share most files
 
 
-def compiled(sources: Mapping[str, bytes], python: str) -> dict[str, bytes]:
+def compiled(sources: Mapping[str, bytes], python: str, where: str = WHERE) -> dict[str, bytes]:
     """Compile these modules; return the bytecode files by their names in the zip: `a/__pycache__/b.cpython-313.pyc`.
 
-    `python` is the path of the compiler. Modules that do not compile are left out: some packages hold modules in the
-    syntax of other versions, which they do not import.
+    `python` is the path of the compiler, `where` the folder in which the modules will run. Modules that do not compile
+    are left out: some packages hold modules in the syntax of other versions, which they do not import.
     """
-    if new := {name: body for name, body in sources.items() if (python, name, body) not in _made}:
-        found = _compile(new, python)
-        _made.update({(python, name, body): found.get(name, {}) for name, body in new.items()})
-    return {path: code for name, body in sources.items() for path, code in _made[python, name, body].items()}
+    if new := {name: body for name, body in sources.items() if (python, where, name, body) not in _made}:
+        found = _compile(new, python, where)
+        _made.update({(python, where, name, body): found.get(name, {}) for name, body in new.items()})
+    return {path: code for name, body in sources.items() for path, code in _made[python, where, name, body].items()}
 
 
-def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, bytes]]:
+def _compile(sources: Mapping[str, bytes], python: str, where: str) -> dict[str, dict[str, bytes]]:
     """Compile each module. Return, by the modules' names, the bytecode file of each."""
     with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
         root = Path(folder)
@@ -64,9 +65,14 @@ def _compile(sources: Mapping[str, bytes], python: str) -> dict[str, dict[str, b
             path = root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
-        subprocess.run([python, "-I", "-c", _COMPILE, folder, WHERE], capture_output=True, check=False)  # noqa: S603
+        compile_folder(root, where, python)
         made = {path.relative_to(root): path.read_bytes() for path in root.rglob("*.pyc")}
     return {_source(path): {path.as_posix(): code} for path, code in made.items()}
+
+
+def compile_folder(folder: Path, where: str, python: str) -> None:
+    """Put bytecode beside each module below the folder. `where` is the folder's path where the modules will run."""
+    subprocess.run([python, "-I", "-c", _COMPILE, str(folder), where], capture_output=True, check=False)  # noqa: S603
 
 
 def _source(bytecode: Path) -> str:

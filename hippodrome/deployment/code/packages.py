@@ -373,28 +373,45 @@ def _distribution(path: Path) -> str:
 
 
 ALSO = ("acme", "cryptography", "josepy")  # distributions of deploy.txt that functions import too (renew_certificate)
+SERVER = Target("3.13", "x86_64")
+SERVER_PINS = places.ROOT / "requirements" / "image.txt"
 
 
-def lock() -> str:
-    """Write the text of `packages.txt`: direct requirements as pinned, all others in the versions installed here."""
+def lock_functions() -> str:
+    """Write the text of `packages.txt`."""
     direct = read_pins(places.ROOT / "requirements" / "lambdas.txt")
     deploy = read_pins(places.ROOT / "requirements" / "deploy.txt")
-    pins = direct | {name: deploy[name] for name in ALSO if name in deploy}
-    target, here = Target(), Target.here()
-    done: dict[str, Pin] = {}
+    pins = _closure(direct | {name: deploy[name] for name in ALSO if name in deploy}, Target(), IN_RUNTIME)
+    return _text("Everything that may go into the functions' zips", "for Lambda", "lambdas.txt and deploy.txt", pins)
+
+
+def lock_server() -> str:
+    """Write the text of `image.txt`."""
+    pins = _closure(read_pins(places.ROOT / "requirements" / "trial.txt"), SERVER, set())
+    return _text("The trial's packages in the servers' image", "for Linux on x86-64", "trial.txt", pins)
+
+
+def _closure(direct: Mapping[str, Pin], target: Target, left_out: set[str]) -> list[Pin]:
+    """Pin all that these distributions need, in the versions installed here, with the hashes of the target's wheels."""
+    pins, here, done = dict(direct), Target.here(), dict[str, Pin]()
     with tempfile.TemporaryDirectory() as folder:
         while names := set(pins) - set(done):
             for name, wheel in WheelCache(target, pins, Path(folder)).wheels(names).items():
                 done[name] = Pin(name, pins[name].version, hashlib.sha256(wheel.path.read_bytes()).hexdigest())
-                for need in (wheel.needs(target) | wheel.needs(here)) - IN_RUNTIME - set(pins):
+                for need in (wheel.needs(target) | wheel.needs(here)) - left_out - set(pins):
                     pins[need] = Pin(need, importlib.metadata.version(need))
+    return [pin for _, pin in sorted(done.items())]
+
+
+def _text(what: str, where: str, sources: str, pins: Iterable[Pin]) -> str:
     head = (
-        "# Everything that may go into the functions' zips: exact versions, and the hash of the wheel for Lambda.\n"
-        "# Made from lambdas.txt and deploy.txt by `python -m hippodrome.deployment.code.packages`.\n"
+        f"# {what}: exact versions, and the hash of the wheel {where}.\n"
+        f"# Made from {sources} by `python -m hippodrome.deployment.code.packages`.\n"
     )
-    return head + "".join(f"{pin} --hash=sha256:{pin.sha256}\n" for _, pin in sorted(done.items()))
+    return head + "".join(f"{pin} --hash=sha256:{pin.sha256}\n" for pin in pins)
 
 
 if __name__ == "__main__":
-    PINS.write_text(lock(), encoding="utf-8")
-    screen.success(f"{PINS.name} holds {len(read_pins())} packages.")
+    for file, text in ((PINS, lock_functions()), (SERVER_PINS, lock_server())):
+        file.write_text(text, encoding="utf-8")
+        screen.success(f"{file.name} holds {len(read_pins(file))} packages.")

@@ -1,14 +1,11 @@
-"""The build context of a project's image: its files, their hash, and the context as a folder or a zip."""
+"""The build context of a project's image: its files, their hash, and the context as a folder."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
-import stat
-import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,15 +15,14 @@ from hippodrome.console.problem import Problem
 from hippodrome.control.config import agent_imports, layout
 from hippodrome.control.config.layout import REQUIREMENTS
 from hippodrome.deployment.study.image.files import project_files
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time in a zip, for all files: the same files make the same bytes
-_CHUNK = 1024 * 1024
+from hippodrome.deployment.study.image.layers import hash_of, mode
 
 _ELSEWHERE = re.compile(
     r"-[rcef]\b|--(?:requirement|constraint|editable|find-links)\b|\.{0,2}/|[A-Za-z]:\\|(?:.*@\s*)?file:"
 )
 _PASSWORD = re.compile(r"://[^/\s@]+@")
 _IMAGE = re.compile(r"[a-z0-9][A-Za-z0-9._:@/-]{0,254}")
+_BASE = re.compile(r"(?m)^ARG BASE=(.*)$")
 _COMMENT = re.compile(r"(^|\s+)#.*$")
 
 
@@ -39,13 +35,7 @@ class Bundle:
     @property
     def hash(self) -> str:
         """Twelve hex digits that depend only on the files' names, permissions and bytes."""
-        digest = hashlib.sha256()
-        for name, entry in sorted(self.entries.items()):
-            inner = hashlib.sha256()
-            for chunk in _chunks(entry):
-                inner.update(chunk)
-            digest.update(f"{name}\0{_mode(entry):o}\0{inner.hexdigest()}\n".encode("utf-8", "surrogateescape"))
-        return digest.hexdigest()[:12]
+        return hash_of(self.entries)[:12]
 
     @property
     def size(self) -> int:
@@ -61,17 +51,28 @@ class Bundle:
                 path.write_bytes(entry)
             else:
                 shutil.copyfile(entry, path)
-            path.chmod(_mode(entry))
+            path.chmod(mode(entry))
         (folder / "project").mkdir(exist_ok=True)  # the Dockerfile copies it, even if the project has no files
 
-    def write_zip(self, file: Path) -> None:
-        """Write the context as a zip. The same content makes the same bytes."""
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr(_info("project/", stat.S_IFDIR | 0o755), b"")
-            for name, entry in sorted(self.entries.items()):
-                with archive.open(_info(name, stat.S_IFREG | _mode(entry)), "w", force_zip64=True) as out:
-                    for chunk in _chunks(entry):
-                        out.write(chunk)
+    @property
+    def base(self) -> str:
+        """The name of the base image, as docker pull takes it."""
+        dockerfile = self.entries["Dockerfile"]
+        assert isinstance(dockerfile, bytes)
+        found = _BASE.search(dockerfile.decode())
+        assert found
+        return found[1]
+
+    @property
+    def requirements(self) -> str:
+        """The study's requirements.txt; "" without one."""
+        text = self.entries["requirements/project.txt"]
+        assert isinstance(text, bytes)
+        return text.decode()
+
+    def below(self, folder: str) -> dict[str, Path | bytes]:
+        """Return the files below a folder of the context, by their paths in the context."""
+        return {name: entry for name, entry in self.entries.items() if name.startswith(f"{folder}/")}
 
 
 def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = None) -> Bundle:
@@ -98,7 +99,7 @@ def _dockerfile(base: str) -> bytes:
     text = (places.ROOT / "infra/Dockerfile").read_text(encoding="utf-8")
     if base and not _IMAGE.fullmatch(base):
         raise Problem(f"{base!r} is no name of an image.", "Write it as docker pull takes it: place/name:tag.")
-    return re.sub(r"(?m)^ARG BASE=.*$", f"ARG BASE={base}", text).encode() if base else text.encode()
+    return _BASE.sub(f"ARG BASE={base}", text).encode() if base else text.encode()
 
 
 def _check_json(trial: Mapping[str, Any]) -> bytes:
@@ -137,25 +138,3 @@ def _requirements(folder: Path) -> bytes:
                 f"Write what is needed into {REQUIREMENTS} itself; modules of your own can lie beside agent.py.",
             )
     return text.encode()
-
-
-def _mode(entry: Path | bytes) -> int:
-    """Return a file's mode in the image: readable for all, because the trial's user does not own the files."""
-    return 0o755 if isinstance(entry, Path) and entry.stat().st_mode & stat.S_IXUSR else 0o644
-
-
-def _info(name: str, mode: int) -> zipfile.ZipInfo:
-    info = zipfile.ZipInfo(name, _EPOCH)
-    info.create_system = 3  # Unix, on every system, so that the mode is used
-    info.external_attr = mode << 16
-    info.compress_type = zipfile.ZIP_DEFLATED
-    return info
-
-
-def _chunks(entry: Path | bytes) -> Iterator[bytes]:
-    if isinstance(entry, bytes):
-        yield entry
-        return
-    with entry.open("rb") as stream:
-        while chunk := stream.read(_CHUNK):
-            yield chunk

@@ -46,6 +46,11 @@ class ImageRepository:
         return self.uri.partition("/")[0]
 
     @property
+    def address(self) -> str:
+        """The address of the registry's API."""
+        return f"https://{self.registry}"
+
+    @property
     def name(self) -> str:
         return self.uri.partition("/")[2]
 
