@@ -123,23 +123,29 @@ def _uv(words: list[str], folder: Path) -> None:
 
     command = [uv.find_uv_bin(), "pip", words[0], "--quiet", "--no-progress", "--color", "never"]
     # As pip does: the best version of all indexes, and the certificates that this machine trusts.
-    command += ["--index-strategy", "unsafe-best-match", "--python", sys.executable, *words[1:]]
-    environment = {**os.environ, "UV_SYSTEM_CERTS": "true", "UV_NATIVE_TLS": "true", **_indexes()}
+    command += ["--index-strategy", "unsafe-best-match", "--python", sys.executable, *_indexes(), *words[1:]]
+    environment = {**os.environ, "UV_SYSTEM_CERTS": "true", "UV_NATIVE_TLS": "true"}
     screen.info("Fetching packages …" if words[0] == "install" else "Choosing the versions of packages …")
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise explained(done.stderr)
 
 
-def _indexes() -> dict[str, str]:
-    """Return the indexes of pip's configuration as uv's variables: uv does not read pip's own."""
+def _indexes() -> list[str]:
+    """Return the indexes of pip's configuration as uv's options: uv does not read pip's own."""
     asked = [sys.executable, "-P", "-m", "pip", "config", "list", "--disable-pip-version-check"]
     told = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
-    found = {
-        key.rpartition(".")[2]: value for key, value in re.findall(r"(?m)^([\w:.]+\.[\w-]+)='(.*)'$", told)
-    }  # variables come last, and count more than files
-    names = {"index-url": "UV_DEFAULT_INDEX", "extra-index-url": "UV_INDEX", "find-links": "UV_FIND_LINKS"}
-    return {ours: found[theirs] for theirs, ours in names.items() if theirs in found and ours not in os.environ}
+    settings = re.findall(r"(?m)^[\w:.]+\.([\w-]+)='(.*)'$", told)
+    found = dict(settings)  # variables come last, and count more than files
+    options = {"index-url": "--default-index", "extra-index-url": "--index", "find-links": "--find-links"}
+    words = [
+        word
+        for theirs, ours in options.items()
+        for value in re.split(r"\s+|\\n", found.get(theirs, ""))
+        if value
+        for word in (ours, value)
+    ]
+    return [*words, "--no-index"] if found.get("no-index", "").lower() in {"1", "true", "yes", "on"} else words
 
 
 def explained(said: str) -> Problem:

@@ -125,8 +125,8 @@ class Repository:
             where = self._ask("POST", "blobs/uploads/").headers["Location"]
             with file.open("rb") as body, _Counted(progress) as count:
                 answer = self._ask("PATCH", where, headers=octets, data=_Body(body, blob.size, count))
-            where = answer.headers.get("Location", where)
-            self._ask("PUT", f"{where}{'&' if '?' in where else '?'}digest={blob.digest}", headers=octets)
+                where = answer.headers.get("Location", where)
+                self._ask("PUT", f"{where}{'&' if '?' in where else '?'}digest={blob.digest}", headers=octets)
 
         self._until_done(put)
 
