@@ -1,7 +1,7 @@
 """Keys of the documents that trial servers read and write: answers, recordings, handovers, sessions and questions.
 
 docs/architecture.md lists all documents. Other modules have the keys that servers do not use, such as those below
-`SSL/` (`hippodrome/control/certificates/rules.py`) and `_builds/` (`hippodrome/deployment/study/image/codebuild.py`).
+`SSL/` (`hippodrome/control/certificates/rules.py`).
 """
 
 from __future__ import annotations

@@ -135,7 +135,6 @@ class Installed(MotoWorld):
             "TaskExecutionRole": f"arn:aws:iam::{ACCOUNT}:role/hippodrome-task-execution",
             "TrialLogGroup": f"/hippodrome/{STACK}/trial",
             "RegisterFunction": f"{STACK}-update_project_master_list",
-            "ImageBuilder": f"{STACK}-image",
             "ResearcherPolicy": f"arn:aws:iam::{ACCOUNT}:policy/hippodrome-researcher",
             "Dashboard": "https://console.aws.amazon.com/cloudwatch/home#dashboards:name=hippodrome",
             "Alarms": self.alarm_topic,

@@ -1,8 +1,8 @@
-"""What `register` needs of AWS beyond `Installed`: CodeBuild, pushes to ECR, and the function that registers.
+"""What `register` needs of AWS beyond `Installed`: images in ECR, and the function that registers.
 
-Gaps of moto that are bridged here: its CodeBuild takes no overrides, builds nothing and ends at the first look; its
-Lambda runs functions only with Docker. So a test says here what a build does (queued, running, a log in CloudWatch, then an image in
-moto's ECR, or a failure), and Invoke runs the real handler over the same account.
+moto has no registry behind its ECR, and its Lambda runs functions only with Docker. So images are not assembled here but
+put into ECR (tests/deployment/study/test_image_runs.py assembles them), and Invoke runs the real handler over the same
+account.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import sys
 import textwrap
 import threading
 import time
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,16 +22,17 @@ from typing import Any, Protocol
 import botocore.handlers
 import pytest
 from botocore.awsrequest import AWSResponse
+from botocore.exceptions import ClientError
 from botocore.response import StreamingBody
 
-from hippodrome.console.problem import Exit
+from hippodrome.console.problem import Exit, Problem
+from hippodrome.control.aws import errors
 from hippodrome.control.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.control.model.records import from_json
-from hippodrome.deployment.study.image import codebuild
+from hippodrome.deployment.study.image import assembled
+from hippodrome.deployment.study.image.order import Order
 from hippodrome.functions import installed, update_project_master_list
 from tests.deployment.installation import CommandResult, Installed
-
-LOG_GROUP = "/hippodrome/hippodrome/image"
 
 CONFIG = """\
 project:
@@ -48,28 +48,12 @@ trial:
 
 
 @dataclass
-class Build:
-    """A build at CodeBuild."""
-
-    id: str
-    asked: dict[str, Any]
-    looks: int = 0
-    status: str = "IN_PROGRESS"
-
-    @property
-    def env(self) -> dict[str, str]:
-        return {one["name"]: one["value"] for one in self.asked["environmentVariablesOverride"]}
-
-
-@dataclass
 class RegisterWorld(Installed):
     """`Installed` with what `register` calls."""
 
-    looks: int = 2  # looks at a build until it ends
-    outcome: str = "SUCCEEDED"
-    log: list[str] = field(default_factory=lambda: ["[Container] docker buildx build", "#12 pushing layers done"])
-    push: bool = True  # whether a build that succeeds leaves an image
-    builds: list[Build] = field(default_factory=list)
+    fails: Problem | None = None  # why an image cannot be assembled
+    push: bool = True  # whether an image that is assembled arrives
+    builds: list[Order] = field(default_factory=list)  # the images that were to be assembled
     function_error: bool = False
     interrupt: int | None = None  # the call of a command, counted from 0, at which Ctrl-C is pressed
     made: list[str] = field(default_factory=list)  # the calls of commands, not of functions
@@ -87,7 +71,8 @@ class RegisterWorld(Installed):
         self._stack.callback(botocore.handlers.BUILTIN_HANDLERS.remove, ours)
         installed.use(self.platform)
         self._stack.callback(installed.use, None)
-        self.client("logs").create_log_group(logGroupName=LOG_GROUP)
+        patch = self._stack.enter_context(pytest.MonkeyPatch.context())
+        patch.setattr(assembled, "build", self._assemble)
         return self
 
     @property
@@ -125,12 +110,7 @@ class RegisterWorld(Installed):
                     raise KeyboardInterrupt
         if action == "ecr:DescribeImages":
             self._store_pushed()
-        answer = {
-            "lambda:Invoke": self._invoke,
-            "codebuild:StartBuild": self._start_build,
-            "codebuild:BatchGetBuilds": self._get_builds,
-            "codebuild:ListBuildsForProject": self._list_builds,
-        }.get(action)
+        answer = {"lambda:Invoke": self._invoke}.get(action)
         if answer is None:
             return None
         with self._lock:
@@ -147,62 +127,36 @@ class RegisterWorld(Installed):
             return {"StatusCode": 200, "FunctionError": "Unhandled", "Payload": _stream(b'{"errorType": "KeyError"}')}
         return {"StatusCode": 200, "Payload": _stream(reply)}
 
-    def _start_build(self, body: bytes) -> dict[str, Any]:
-        build = Build(f"hippodrome-image:{uuid.uuid4()}", json.loads(body))
-        bucket, _, key = build.asked["sourceLocationOverride"].partition("/")
-        assert bucket == self.env["BUCKET"]
-        assert key in self.keys("_builds/")
-        self.builds.append(build)
-        return {"build": self._told(build)}
-
-    def _get_builds(self, body: bytes) -> dict[str, Any]:
-        wanted = json.loads(body)["ids"]
-        found = [build for build in self.builds if build.id in wanted]
-        for build in found if len(wanted) == 1 else []:
-            build.looks += 1
-            if build.status == "IN_PROGRESS" and build.looks >= self.looks:
-                self._end(build)
-        return {"builds": [self._told(build) for build in found]}
-
-    def _list_builds(self, body: bytes) -> dict[str, Any]:
-        return {"ids": [build.id for build in reversed(self.builds)]}
-
-    def _end(self, build: Build) -> None:
-        logs, stream, now = self.client("logs"), build.id.replace(":", "-"), int(time.time() * 1000)
-        logs.create_log_stream(logGroupName=LOG_GROUP, logStreamName=stream)
-        events = [{"timestamp": now, "message": line + "\n"} for line in self.log]
-        logs.put_log_events(logGroupName=LOG_GROUP, logStreamName=stream, logEvents=events)
-        build.status = self.outcome
-        if self.outcome == "SUCCEEDED" and self.push:
-            self.put_image(build.env["IMAGE"].rpartition(":")[2])
-
-    def _told(self, build: Build) -> dict[str, Any]:
-        phase = "BUILD" if build.looks else "QUEUED"
-        failed = [
-            {"phaseType": "BUILD", "contexts": [{"message": "exit status 1", "statusCode": "COMMAND_EXECUTION_ERROR"}]}
-        ]
-        return {
-            "id": build.id,
-            "buildStatus": build.status,
-            "currentPhase": phase if build.status == "IN_PROGRESS" else "COMPLETED",
-            "phases": failed if build.status == "FAILED" else [],
-            "environment": {"environmentVariables": build.asked["environmentVariablesOverride"]},
-            "logs": {"groupName": LOG_GROUP, "streamName": build.id.replace(":", "-")} if build.looks else {},
-        }
+    def _assemble(self, order: Order) -> None:
+        order.repository.password()
+        with self._lock:
+            self.builds.append(order)
+        if self.fails:
+            raise self.fails
+        if self.push:
+            try:
+                self.put_image(order.tag)
+            except ClientError as error:
+                assert errors.code(error) == "ImageTagAlreadyExistsException"
+                raise Problem("ECR refused a request for hippodrome (HTTP 400).") from None
 
     def put_image(self, tag: str) -> None:
-        """Store an image, as a finished push does."""
+        """Store an image, as a finished push does, which is no call of a command."""
         digest = f"sha256:{abs(hash((tag, time.time_ns()))):064x}"[:71]
         manifest = {
             "schemaVersion": 2,
             "mediaType": "application/vnd.oci.image.manifest.v1+json",
             "layers": [{"digest": digest}],
         }
-        self.client("ecr").put_image(
-            repositoryName="hippodrome",
-            imageTag=tag,
-            imageManifest=json.dumps(manifest | {"config": {"size": 1, "digest": digest}}),
-        )
+        self._inside.function = True
+        try:
+            self.client("ecr").put_image(
+                repositoryName="hippodrome",
+                imageTag=tag,
+                imageManifest=json.dumps(manifest | {"config": {"size": 1, "digest": digest}}),
+            )
+        finally:
+            self._inside.function = False
 
     def _store_pushed(self) -> None:
         """Store the images that `fake_docker` has pushed since the last call."""
@@ -219,31 +173,39 @@ def _stream(body: bytes) -> StreamingBody:
 
 
 def fake_docker(
-    folder: Path, *, engine: bool = True, buildx: bool = True, build: int = 0, says: str = "#1 DONE"
+    folder: Path,
+    *,
+    engine: bool = True,
+    buildx: bool = True,
+    build: int = 0,
+    says: str = "#1 DONE",
+    program: str = "docker",
 ) -> Path:
-    """Return a `docker` for PATH: it records its calls with the files of the context, and its pushes."""
+    """Return a folder for PATH with this program: it records its calls, with the files of the context, and its pushes."""
     folder.mkdir(parents=True, exist_ok=True)
-    script = folder / "docker"
+    script = folder / program
     script.write_text(
         textwrap.dedent(f"""\
         #!{sys.executable}
         import json, pathlib, sys
         here, words = pathlib.Path({str(folder)!r}), sys.argv[1:]
         call = {{"words": words, "stdin": sys.stdin.read() if words[0] == "login" else ""}}
-        if words[0] == "version":
+        if words[0] in ("version", "info"):
             sys.exit(0 if {engine} else 1)
         if words[:2] == ["buildx", "version"]:
             sys.exit(0 if {buildx} else 1)
-        if words[:2] == ["buildx", "build"]:
+        builds = "build" in words[:2]
+        if builds:
             context = pathlib.Path(words[-1])
             call["files"] = sorted(p.relative_to(context).as_posix() for p in context.rglob("*") if p.is_file())
         with (here / "calls").open("a") as out:
             out.write(json.dumps(call) + "\\n")
-        if words[:2] == ["buildx", "build"]:
+        if {build} == 0 and ("--push" in words or words[0] == "push"):
+            image = words[words.index("--tag") + 1] if builds else words[1]
+            with (here / "pushed").open("a") as out:
+                out.write(image.rpartition(":")[2] + "\\n")
+        if builds:
             print({says!r})
-            if {build} == 0:
-                with (here / "pushed").open("a") as out:
-                    out.write(words[words.index("--tag") + 1].rpartition(":")[2] + "\\n")
             sys.exit({build})
         """)
     )
@@ -274,7 +236,6 @@ def write_study(folder: Path, config: str = CONFIG, **files: str) -> Path:
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """A machine without Docker."""
-    monkeypatch.setattr(codebuild, "POLL", 0.0)
     monkeypatch.setenv("PATH", str(tmp_path_factory.mktemp("bin")))
 
 

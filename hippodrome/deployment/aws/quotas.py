@@ -1,9 +1,8 @@
 """The quotas of an account that decide whether a study can be held, and how to ask AWS for more.
 
 The codes are Service Quotas' own: Fargate's from its user guide's page on quotas; Lambda's L-B99A9384 "Concurrent
-executions"; CodeBuild's L-9D07B6EF "Concurrently running builds for Linux/Small environment" (`BUILD_GENERAL1_SMALL`,
-which the stack's image builder is); the VPCs' L-F678F1CE "VPCs per Region". New accounts may have only 6 vCPUs of
-Fargate, 10 executions of Lambda, and no build at all: "Cannot have more than 0 builds in queue for the account".
+executions"; the VPCs' L-F678F1CE "VPCs per Region". New accounts may have only 6 vCPUs of Fargate, and 10 executions of
+Lambda.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ class Quota(NamedTuple):
 SPOT = Quota("fargate", "L-36FBB829")  # vCPUs
 ON_DEMAND = Quota("fargate", "L-3032A538")  # vCPUs
 EXECUTIONS = Quota("lambda", "L-B99A9384")
-BUILDS = Quota("codebuild", "L-9D07B6EF")
 VPCS = Quota("vpc", "L-F678F1CE")
 
 

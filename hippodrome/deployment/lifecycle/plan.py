@@ -46,7 +46,6 @@ _KINDS = {  # resource type → its name in words; other types are shown as they
     "AWS::CertificateManager::Certificate": "certificate of the site",
     "AWS::CloudWatch::Alarm": "alarm",
     "AWS::CloudWatch::Dashboard": "dashboard",
-    "AWS::CodeBuild::Project": "image builder",
     "AWS::EC2::VPC": "VPC",
     "AWS::ECR::Repository": "image repository",
     "AWS::ECS::Cluster": "ECS cluster",

@@ -145,32 +145,9 @@ def _servers(checked: AccountCheck) -> Iterator[Finding]:
         )
 
 
-def _builds(checked: AccountCheck) -> Iterator[Finding]:
-    """Check whether the image of a study with a game can be built, by Docker here or by CodeBuild."""
-    from hippodrome.deployment.study.image import docker  # noqa: PLC0415 - the checks of config.yml, needed only before a first installation
-
-    account, study = checked
-    if (study and not study.plays) or docker.available():
-        return
-    value = quotas.applied(account, quotas.BUILDS)
-    if value is None or value >= 1:
-        return
-    missing = "This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine"
-    remedy = f"Start Docker here, or ask for a build: {quotas.request(account, quotas.BUILDS, 1)}"
-    if study:
-        yield bad(
-            "CodeBuild",
-            f"{missing}: the image of {study.id} cannot be built.",
-            f"{remedy} (`hippodrome apply` makes the installation alone meanwhile)",
-        )
-    else:
-        yield look("CodeBuild", f"{missing}: images of studies cannot be built.", remedy)
-
-
 _OF_ACCOUNT: Mapping[str, Callable[[AccountCheck], Iterable[Finding]]] = {
     "region": _region,
     "credentials": _root,
-    "CodeBuild": _builds,
     "Lambda": _executions,
     "Fargate": _servers,
 }

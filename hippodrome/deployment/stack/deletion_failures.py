@@ -84,7 +84,7 @@ TABLE: tuple[KnownFailure, ...] = (
         "brentley/appmeshworkshop issue 31; here: an image that is pushed while CloudFormation empties the repository",
     ),
     KnownFailure(
-        r"AWS::(Scheduler::ScheduleGroup|Logs::LogGroup|Lambda::\w+|ApiGatewayV2::\w+|CodeBuild::Project|Events::Rule)",
+        r"AWS::(Scheduler::ScheduleGroup|Logs::LogGroup|Lambda::\w+|ApiGatewayV2::\w+|Events::Rule)",
         r"Conflict|in progress|being (deleted|updated|modified)|OperationAborted|is in use|ResourceInUse|"
         r"targets|Please try again",
         Recovery.PAUSE,

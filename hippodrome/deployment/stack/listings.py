@@ -47,8 +47,6 @@ AWS::CloudWatch::Alarm | alarm | cloudwatch
     describe_alarms | MetricAlarms.AlarmName | delete-alarms --alarm-names
 AWS::CloudWatch::Dashboard | dashboard | cloudwatch
     list_dashboards | DashboardEntries.DashboardName | delete-dashboards --dashboard-names
-AWS::CodeBuild::Project | image builder | codebuild
-    list_projects | projects | delete-project --name
 AWS::EC2::InternetGateway | internet gateway | ec2
     describe_internet_gateways | InternetGateways.InternetGatewayId | delete-internet-gateway --internet-gateway-id
 AWS::EC2::RouteTable | route table | ec2

@@ -29,11 +29,11 @@ _BUSY = re.compile(r"cannot be deleted while in status|is in \w+_IN_PROGRESS sta
 _CONSEQUENCE = re.compile(r"(creation|update|operation|deletion) cancell?ed", re.IGNORECASE)
 _ROLE_IS_NEW = (
     r"Unable to assume the service linked role|cannot be assumed by Lambda|"
-    r"CodeBuild is not authorized to perform: sts:AssumeRole|execution role does not have permissions to call"
+    r"execution role does not have permissions to call"
 )
 """The services' error messages while IAM does not know a new role or its policy everywhere: of CreateCluster
-(1Password/scim-examples, issue 356), CreateFunction (pulumi/pulumi-aws-native 148), CodeBuild's CreateProject
-(terraform-provider-aws 4233), and CreateEventSourceMapping (milliHQ/terraform-aws-next-js 138)."""
+(1Password/scim-examples, issue 356), CreateFunction (pulumi/pulumi-aws-native 148), and CreateEventSourceMapping
+(milliHQ/terraform-aws-next-js 138)."""
 
 
 @dataclass(frozen=True)

@@ -39,9 +39,7 @@ NO_QR = (
 
 Base = Annotated[
     str,
-    typer.Option(
-        "--base", envvar="HIPPODROME_BASE_IMAGE", help="A mirror of the image's base, as docker pull names it."
-    ),
+    typer.Option("--base", envvar="HIPPODROME_BASE_IMAGE", help="Another base of the image, as docker pull names it."),
 ]
 
 
@@ -54,7 +52,7 @@ class RegisterRequest:
 
     live: bool | None = None
     again: bool = False
-    on_aws: bool = False  # build the image by CodeBuild even if Docker is here
+    docker: bool = False  # build the image by its Dockerfile, with Docker, Podman or Buildah
     yes: bool = False
     base: str = ""  # the base image, instead of the Dockerfile's own
     strict: bool = False  # stop if there is a remark
@@ -104,8 +102,8 @@ def command(
     rebuild: Annotated[
         bool, typer.Option("--rebuild", help="Build the image anew, with the updates of what it is based on.")
     ] = False,
-    build_on_aws: Annotated[
-        bool, typer.Option("--build-on-aws", help="Build the image at AWS even if Docker is on this machine.")
+    docker: Annotated[
+        bool, typer.Option("--docker", help="Build the image with this machine's Docker, Podman or Buildah.")
     ] = False,
     base: Base = "",
     strict: Annotated[bool, typer.Option("--strict", help="Do nothing if there is any remark on the project.")] = False,
@@ -128,7 +126,7 @@ def command(
             raise Problem(*NO_QR)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
-    request = RegisterRequest(live, rebuild, build_on_aws, yes, base, strict)
+    request = RegisterRequest(live, rebuild, docker, yes, base, strict)
     if dry_run:
         return _tell_plan(plan(account, installation, folder, request), as_json)
     result = register(account, installation, folder, request)
@@ -176,7 +174,7 @@ def register(account: Account, installation: Installation, folder: Path, request
     _confirm(account, installation, doing, request)
     made, revision = None, None
     if doing.image:
-        made = image.build(installation, doing.image, on_aws=request.on_aws)
+        made = image.build(doing.image, by_dockerfile=request.docker)
         screen.success(f"Image {doing.image.order.content}: {'built' if made.built else 'there already'}")
         wanted = _definition(installation, found, made.uri)
         revision = doing.definition or definition.find(account, wanted)

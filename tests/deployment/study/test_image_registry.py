@@ -49,7 +49,7 @@ class Registry:
                 if self.command != "HEAD":
                     self.wfile.write(told)
 
-            do_GET = do_HEAD = do_POST = do_PATCH = do_PUT = _answer  # noqa: N815
+            do_GET = do_HEAD = do_POST = do_PATCH = do_PUT = _answer
 
             def log_message(self, *_: Any) -> None:
                 pass
@@ -158,8 +158,8 @@ def test_a_damaged_blob_is_fetched_again_and_never_used(there: Registry, tmp_pat
     with pytest.raises(Problem, match="was damaged on its way"):
         Repository(there.address, "study").pull(BLOB, tmp_path / "x")
     assert len(there.asked) == 4
+    there.manifests[BLOB.digest] = b"{}"
     with pytest.raises(Problem, match="was damaged on its way"):
-        there.manifests[BLOB.digest] = b"{}"
         Repository(there.address, "study").manifest(BLOB.digest)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.console.problem import Exit
+from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model import ids
 from hippodrome.functions import next_step, start_server
 from tests.deployment.registering import (
@@ -46,7 +46,7 @@ def test_a_folder_becomes_a_link(register_world: RegisterWorld, register: Regist
     assert [project.task_definition] == register_world.revisions()
     (tag,) = register_world.image_tags()
     assert re.fullmatch("maze-[0-9a-f]{12}", tag)
-    assert register_world.builds[0].env["IMAGE"] == f"{register_world.repository}:{tag}"
+    assert register_world.builds[0].image == f"{register_world.repository}:{tag}"
 
 
 def test_register_answers_in_json(register_world: RegisterWorld, register: Register) -> None:
@@ -161,7 +161,7 @@ def test_register_without_changes_does_nothing(register_world: RegisterWorld, re
     salt = register_world.project().salt
     with register_world.recording() as calls:
         answer = register("--json").json
-    writes = {"s3:DeleteObject", "ecs:RegisterTaskDefinition", "codebuild:StartBuild"}
+    writes = {"s3:DeleteObject", "ecs:RegisterTaskDefinition", "ecr:PutImage"}
     assert not writes & {call.action for call in calls}
     assert not [call for call in calls if call.action == "s3:PutObject" and "/steps/" in call.params["Key"]]
     assert answer["pages"] == {"uploaded": 0, "same": 3, "removed": 0}
@@ -189,7 +189,7 @@ def test_a_live_study_keeps_its_pages_until_its_new_image_exists(
     before = bodies(register_world)
     (folder / "steps/consent.html").write_text("<p>Another consent</p>")
     (folder / "agent.py").write_text("# another agent\n")
-    register_world.outcome = "FAILED"
+    register_world.fails = Problem("The packages could not be downloaded.")
     register(code=Exit.FAILED)
     assert bodies(register_world) == before
 
@@ -280,7 +280,7 @@ def test_register_says_what_warm_servers_of_a_live_study_cost_a_day(
 def test_no_live_closes_the_study_first(register_world: RegisterWorld, folder: Path, register: Register) -> None:
     register()
     (folder / "agent.py").write_text("class Agent:\n    new = True\n")
-    register_world.outcome, register_world.made = "FAILED", []
+    register_world.fails, register_world.made = Problem("The packages could not be downloaded."), []
     ran = register("--no-live")
     assert ran.code == Exit.FAILED  # because the new image could not be built
     assert not register_world.project().live  # but no participant is admitted any more

@@ -10,9 +10,8 @@ from typing import Any
 from hippodrome.console import screen
 from hippodrome.console.problem import Problem
 from hippodrome.deployment.aws.account import Account, Installation
-from hippodrome.deployment.study.image import docker
+from hippodrome.deployment.study.image import builders
 from hippodrome.deployment.study.image.bundle import make_bundle
-from hippodrome.deployment.study.image.codebuild import Builder
 from hippodrome.deployment.study.image.ecr import ImageRepository, content_tag
 from hippodrome.deployment.study.image.order import Order
 
@@ -47,38 +46,37 @@ def plan(
 ) -> ImagePlan:
     """Compare the project's files with the images in the repository. Changes nothing.
 
-    `again`: build an image in any case, without layers of earlier ones. `base` and `trial` are as in `make_bundle`.
+    `again`: make an image in any case, with the newest base and packages. `base` and `trial` are as in `make_bundle`.
     Raises `Problem` as `make_bundle` does, or if the repository is gone.
     """
     bundle = make_bundle(folder, base, trial)
     repository = ImageRepository(account, installation["Repository"])
     content = content_tag(project_id, bundle.hash)
     images = repository.images()
-    cache = "" if again else images.alike(project_id)
-    order = Order(repository, content, images.next_tag(content), bundle, fresh=again, cache_from=cache)
+    order = Order(repository, content, images.next_tag(content), bundle, fresh=again)
     return ImagePlan(None if again else images.of(content), order)
 
 
-def build(installation: Installation, wanted: ImagePlan, *, on_aws: bool = False) -> Image:
-    """Build the image of the plan unless the repository has it, and return it. Raises `Problem` if that fails.
+def build(wanted: ImagePlan, *, by_dockerfile: bool = False) -> Image:
+    """Make the image of the plan unless the repository has it, and return it. Raises `Problem` if that fails.
 
-    This machine's Docker builds it. If no Docker answers, or with `on_aws`, CodeBuild does.
+    It is assembled here, or built by the Dockerfile, with the Docker, Podman or Buildah of this machine.
     """
     if wanted.uri:
         return Image(wanted.uri, built=False)
     order = wanted.order
     try:
-        if not on_aws and docker.available():
-            screen.info("Building the image with the Docker of this machine …")
-            docker.build(order)
+        if by_dockerfile:
+            builders.build(order)
         else:
-            screen.info("Building the image at AWS (CodeBuild); the first time takes some minutes …")
-            Builder(order.repository.account, installation["ImageBuilder"], installation["Bucket"]).build(order)
+            from hippodrome.deployment.study.image import assembled  # noqa: PLC0415 - only a new image needs it
+
+            assembled.build(order)
     except Problem:
         if order.arrived() is None:
             raise
-        screen.warning("Another build has made the same image meanwhile.")  # so the repository refused the tag
+        screen.warning("Another command has made the same image meanwhile.")  # so the repository refused the tag
     uri = order.arrived()
     if uri is None:
-        raise Problem("The image was built, but it is not in the repository.", "Run the same command again.")
+        raise Problem("The image was made, but it is not in the repository.", "Run the same command again.")
     return Image(uri, built=True)

@@ -10,7 +10,6 @@ image. A second image with the same content gets the tag `{project}-{content}.2`
 from __future__ import annotations
 
 import base64
-import re
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -104,12 +103,6 @@ class Images:
         """Return the tag for the next image with this content."""
         most = max((image.number for image in self.found if image.content == content), default=0)
         return f"{content}.{most + 1}" if most else content
-
-    def alike(self, project_id: str) -> str:
-        """Return the image (uri:tag) that probably shares most layers with this project's next one; "" without one."""
-        own = re.compile(re.escape(content_tag(project_id, "")) + r"[0-9a-f]{12}")
-        best = max(self.found, key=lambda image: (own.fullmatch(image.content) is not None, image), default=None)
-        return f"{self.uri}:{best.tag}" if best else ""
 
 
 def content_tag(project_id: str, content: str) -> str:

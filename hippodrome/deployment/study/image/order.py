@@ -1,4 +1,4 @@
-"""The input of a builder."""
+"""What is to be made: an image of a project."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from hippodrome.deployment.study.image.ecr import ImageRepository
 
 @dataclass(frozen=True)
 class Order:
-    """Build this bundle and push it to the repository under this tag."""
+    """Make an image of this bundle and push it to the repository under this tag."""
 
     repository: ImageRepository
     content: str  # the tag without a number: the project's id and the hash of the bundle
     tag: str
     bundle: Bundle
-    fresh: bool = False  # use no layers of earlier images, so that the newest base is pulled
-    cache_from: str = ""  # an earlier image (uri:tag) whose layers may be used
+    fresh: bool = False  # take the newest base and packages, and nothing of earlier images
 
     @property
     def image(self) -> str:

@@ -161,7 +161,9 @@ def explained(said: str) -> Problem:
             f"Choose a version that has one; or let Docker, Podman or Buildah compile it: --docker --base {_COMPILER}.",
             details,
         )
-    if found := re.search(r"(\S+) was not found in the package registry|there is no version of (\S+)", text):
+    if found := re.search(
+        r"(\S+) was not found in the (?:package registry|provided package locations)|there is no version of (\S+)", text
+    ):
         name = found[1] or found[2]
         return Problem(
             "A package cannot be found.",
