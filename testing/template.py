@@ -157,7 +157,6 @@ class ReferenceValues:
 
 _ARNS = {
     "AWS::CloudWatch::Alarm": "arn:aws:cloudwatch:{place}:alarm:{name}",
-    "AWS::CodeBuild::Project": "arn:aws:codebuild:{place}:project/{name}",
     "AWS::ECR::Repository": "arn:aws:ecr:{place}:repository/{name}",
     "AWS::ECS::Cluster": "arn:aws:ecs:{place}:cluster/{name}",
     "AWS::Events::Rule": "arn:aws:events:{place}:rule/{name}",

@@ -8,10 +8,10 @@ authorities. These bridges take the place of the Internet and of parts of AWS th
   challenges are also given to Pebble's own DNS servers.
 - Gap: the site's domain name leads nowhere. Bridge: requests go to the emulator's gateway, with the domain name as Host
   header.
-- Gap: the emulator has no quotas. Bridge: those of a new account: 6 vCPUs of Fargate, 10 executions of Lambda, one
-  build, 5 VPCs.
+- Gap: the emulator has no quotas. Bridge: those of a new account: 6 vCPUs of Fargate, 10 executions of Lambda, 5 VPCs.
 - Gap: the emulator has no scan findings of ECR images. Bridge: a complete scan without findings.
-- Docker counts as missing, so the image is always built by CodeBuild, whatever the tests' machine has.
+- Gap: the emulator's ECR is no registry, and AWS's public mirror is not reachable. Bridge: an image is not assembled, but
+  put into ECR with the caller's rights (tests/deployment/study/test_image_runs.py assembles images).
 """
 
 from __future__ import annotations
@@ -82,16 +82,14 @@ def internet() -> None:
 
 
 def account() -> None:
-    """Give the account the quotas of a new account, and images without findings; let Docker count as missing."""
+    """Give the account the quotas of a new account, and images without findings."""
     import botocore.handlers
     from botocore.awsrequest import AWSResponse
 
     from hippodrome.deployment.aws import quotas
-    from hippodrome.deployment.study.image import docker
 
-    new = {quotas.SPOT: 6.0, quotas.ON_DEMAND: 6.0, quotas.BUILDS: 1.0, quotas.VPCS: 5.0}
+    new = {quotas.SPOT: 6.0, quotas.ON_DEMAND: 6.0, quotas.VPCS: 5.0}
     quotas.applied = lambda account, quota: new[quota]
-    docker.available = lambda: False
 
     def settings(parsed: dict[str, Any], **_: Any) -> None:
         parsed["AccountLimit"] |= {"ConcurrentExecutions": EXECUTIONS, "UnreservedConcurrentExecutions": EXECUTIONS}
@@ -106,12 +104,26 @@ def account() -> None:
     ]
 
 
+def images() -> None:
+    """Put a manifest into ECR in the place of an assembled image."""
+    from hippodrome.deployment.study.image import assembled
+
+    def build(order: Any) -> None:
+        order.repository.password()
+        manifest = json.dumps({"schemaVersion": 2, "config": {}, "layers": [], "annotations": {"tag": order.tag}})
+        ecr = order.repository.account.client("ecr")
+        ecr.put_image(repositoryName=order.repository.name, imageTag=order.tag, imageManifest=manifest)
+
+    assembled.build = build
+
+
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()  # as with `python -m`
     if sys.argv[1:3] == ["-m", "hippodrome"]:
         certificates()
         internet()
         account()
+        images()
     if sys.argv[1] == "-m":
         module = sys.argv[2]
         del sys.argv[:2]

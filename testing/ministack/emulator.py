@@ -13,7 +13,6 @@ the Service Authorization Reference (read November 2026):
   StopTask and DescribeTasks on each task, ListTasks on container instances, CreateCluster on the new cluster; and all
   of them with the key ecs:cluster.
 - ECS RegisterTaskDefinition is judged on "*". AWS: on the task definition, with PassRole for its roles.
-- CodeBuild BatchGetBuilds is judged on "*". AWS: on the builds' projects.
 - CloudWatch DescribeAlarms is judged on "*". AWS: on `alarm:*` where the call lists alarms.
 - Scheduler: every schedule is judged as one of the group `default`.
 - Route 53: GetChange is judged on "*" instead of the change; ChangeResourceRecordSets lacks its three condition keys.
@@ -26,8 +25,6 @@ Gaps elsewhere:
 - ECS emits no events, and PutEvents refuses the source `aws.ecs` to all callers, as on AWS. Here root may use it.
 - RunTask ignores clientToken. AWS: the same token and parameters in a cluster give the same task again, and other
   parameters a ConflictException that names it.
-- CodeBuild's builds succeed at once, make nothing and log nothing, but name a log group. Here a build puts the image
-  that it is to push into the repository, and names no log.
 - CloudFormation passes a number that comes from a parameter on as text, with which Lambda's pollers cannot compute.
 - EC2 does not remember to which interface an address was associated; and DescribeNetworkInterfaces leaves out unknown
   ids, while on AWS the call fails.
@@ -47,7 +44,7 @@ from typing import Any
 
 import defusedxml.ElementTree as xml
 from ministack.core import iam_actions, iam_evaluator
-from ministack.services import codebuild, ec2, ecr, ecs, eventbridge, lambda_svc
+from ministack.services import ec2, ecs, eventbridge, lambda_svc
 
 ECS_TASKS = "ecs-tasks.amazonaws.com"
 
@@ -123,13 +120,6 @@ def asked_of_route53(method: str, path: str, body: bytes) -> Asked | None:
     return None
 
 
-def asked_of_codebuild(operation: str, data: dict[str, Any], place: str) -> Asked | None:
-    if operation != "BatchGetBuilds":
-        return None
-    projects = sorted({build.rpartition("/")[2].partition(":")[0] for build in data.get("ids", [])})
-    return Asked([f"arn:aws:codebuild:{place}:project/{project}" for project in projects])
-
-
 def asked_of_s3(method: str, headers: dict[str, str], theirs: str) -> Asked | None:
     conditions = {f"s3:{name}": headers[name] for name in ("if-match", "if-none-match") if headers.get(name)}
     return Asked([theirs], conditions) if method == "PUT" and conditions else None
@@ -150,12 +140,10 @@ def bridge_authorization() -> None:
     ) -> str:
         theirs = their_resource(service, method, path, headers, body, query, region, account)
         place = f"{region}:{account}"
-        data = json.loads(body) if service in {"codebuild", "ecs", "scheduler"} and body[:1] == b"{" else {}
+        data = json.loads(body) if service in {"ecs", "scheduler"} and body[:1] == b"{" else {}
         operation = headers.get("x-amz-target", "").rpartition(".")[2]
         if service == "ecs":
             found = asked_of_ecs(operation, data, place)
-        elif service == "codebuild":
-            found = asked_of_codebuild(operation, data, place)
         elif service == "scheduler":
             found = asked_of_scheduler(path, data, query, place)
         elif service == "s3":
@@ -245,22 +233,6 @@ def bridge_run_task() -> None:
             table["RunTask"] = run_once
 
 
-def bridge_builds() -> None:
-    start_build = codebuild._start_build
-
-    def start(data: dict[str, Any]) -> Any:
-        answer = start_build(data)
-        variables = {one["name"]: one["value"] for one in data.get("environmentVariablesOverride", [])}
-        repository, _, tag = variables.get("IMAGE", "").partition("/")[2].rpartition(":")
-        if answer[0] == 200 and repository:
-            codebuild._builds[json.loads(answer[2])["build"]["id"]].pop("logs", None)
-            manifest = json.dumps({"schemaVersion": 2, "config": {}, "layers": [], "annotations": {"tag": tag}})
-            ecr._put_image({"repositoryName": repository, "imageTag": tag, "imageManifest": manifest})
-        return answer
-
-    codebuild._start_build = start
-
-
 def bridge_addresses() -> None:
     actions = ec2._ACTION_MAP
     associate, describe, fields = actions["AssociateAddress"], actions["DescribeNetworkInterfaces"], ec2._eni_fields_xml
@@ -317,7 +289,6 @@ if __name__ == "__main__":
     bridge_authorization()
     bridge_events()
     bridge_addresses()
-    bridge_builds()
     bridge_run_task()
     bridge_pollers()
     end_with_parent()

@@ -284,7 +284,6 @@ LISTS: dict[str, tuple[str, str, str, dict[str, Any]]] = {  # service, operation
     "alarms": ("cloudwatch", "describe_alarms", "MetricAlarms.AlarmName", {}),
     "APIs": ("apigatewayv2", "get_apis", "Items.Name", {}),
     "buckets": ("s3", "list_buckets", "Buckets.Name", {}),
-    "builders": ("codebuild", "list_projects", "projects", {}),
     "certificates": ("acm", "list_certificates", "CertificateSummaryList.DomainName", {}),
     "clusters": ("ecs", "list_clusters", "clusterArns", {}),
     "dashboards": ("cloudwatch", "list_dashboards", "DashboardEntries.DashboardName", {}),

@@ -19,7 +19,6 @@ from hippodrome.deployment.code.packages import ZipMember
 from hippodrome.deployment.code.template import Template
 from hippodrome.deployment.lifecycle import preflight
 from hippodrome.deployment.stack import changes, stack
-from hippodrome.deployment.study.image import docker
 from testing.botocore_sessions import botocore_session
 from tests.deployment.fake_cloudformation import FakeCloudFormation, refusal
 
@@ -81,7 +80,7 @@ class Limits:
 
     def __init__(self) -> None:
         self.executions = 1000
-        self.quotas = {quotas.SPOT: 100.0, quotas.ON_DEMAND: 100.0, quotas.BUILDS: 60.0, quotas.VPCS: 5.0}
+        self.quotas = {quotas.SPOT: 100.0, quotas.ON_DEMAND: 100.0, quotas.VPCS: 5.0}
         self.denied: set[str] = set()  # operations that these credentials may not call
 
     def get_account_settings(self) -> Any:
@@ -125,7 +124,6 @@ class World:
         self.cloud = FakeCloudFormation(REGION, ACCOUNT)
         self.limits = Limits()
         self.account = WorldAccount(self.cloud, self.limits)
-        self.docker = True  # whether Docker answers on this machine
         self.delegated = Delegation(())  # the delegation of the zone in public DNS
         self.caa: dict[str, caa.Caa] = {}  # the CAA records that count for a name
         self.functions = [function("next_step"), function("sweep"), function("unused")]
@@ -179,7 +177,6 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         monkeypatch.setattr(build, "functions", lambda target: world.functions)
         monkeypatch.setattr(preflight, "delegation", lambda zone: world.delegated)
         monkeypatch.setattr(preflight.caa, "find", lambda name, *_: world.caa.get(name, caa.Caa()))
-        monkeypatch.setattr(docker, "available", lambda: world.docker)
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
         # Gap: moto ignores the conditions of bucket policies, so the one against plain HTTP would refuse every request.

@@ -22,11 +22,6 @@ from tests.deployment.stack_world import DOMAIN, World
 DELETED: list[Step] = [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]
 
 
-def no_builds(world: World) -> None:
-    world.docker = False
-    world.limits.quotas[quotas.BUILDS] = 0
-
-
 def full_of_networks(world: World) -> None:
     world.limits.quotas[quotas.VPCS] = len(world.account.client("ec2").describe_vpcs()["Vpcs"])
 
@@ -67,8 +62,6 @@ def refused(world: World) -> None:
 
 
 STOPS: dict[str, Callable[[World], None]] = {
-    "CodeBuild: This account may not run a build at CodeBuild (its quota is 0), and no Docker answers on this machine: "
-    "the image of … cannot be built": no_builds,
     "VPCs: There are … VPCs in …, and this account may have no more.": full_of_networks,
     "left over: An earlier installation … has left …": half_destroyed,
     "The stack … is half deleted (DELETE_FAILED).": half_deleted,

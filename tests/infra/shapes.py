@@ -30,7 +30,6 @@ CALLS: Mapping[str, tuple[tuple[str, str, Mapping[str, str]], ...]] = {
     "AWS::CertificateManager::Certificate": (("acm", "RequestCertificate", {}),),
     "AWS::CloudWatch::Alarm": (("cloudwatch", "PutMetricAlarm", {}),),
     "AWS::CloudWatch::Dashboard": (("cloudwatch", "PutDashboard", {}),),
-    "AWS::CodeBuild::Project": (("codebuild", "CreateProject", {}),),
     "AWS::EC2::Route": (("ec2", "CreateRoute", {}),),
     "AWS::EC2::RouteTable": (("ec2", "CreateRouteTable", {}),),
     "AWS::EC2::SecurityGroup": (

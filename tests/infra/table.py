@@ -26,15 +26,12 @@ KNOWN = {
     "Repository.Arn": "images",
     "TaskExecutionRole.Arn": "task execution role",
     "ScheduleRole.Arn": "schedule role",
-    "ImageBuilder.Arn": "image builder",
     "UpdateProjectMasterList.Arn": "update_project_master_list",
     "TrialLogGroup.Arn": "the trials' log",
-    "ImageBuilderLogGroup.Arn": "its log",
 }
 ROLES = {
     "TaskExecutionRole": "Fargate, before the container runs",
     "ScheduleRole": "shutdown timers",
-    "ImageBuilderRole": "image builder",
     "ResearcherPolicy": "researchers (attached by the administrator)",
 }
 

@@ -598,15 +598,8 @@ FARGATES = [
     *((f"logs:{action}", f"{LOGS}/trial:log-stream:p/trial/1", {}) for action in ("CreateLogStream", "PutLogEvents")),
 ]
 """What Fargate does with the execution role (AmazonECSTaskExecutionRolePolicy, AWS's own policy for it)."""
-BUILDERS = [
-    *((f"ecr:{action}", REPOSITORY, {}) for action in PULLING),
-    *(
-        (f"ecr:{action}", REPOSITORY, {})
-        for action in ("InitiateLayerUpload", "UploadLayerPart", "CompleteLayerUpload", "PutImage")
-    ),
-    *((f"logs:{action}", f"{LOGS}/image:log-stream:1", {}) for action in ("CreateLogStream", "PutLogEvents")),
-]
-"""What a build does (ECR User Guide, "IAM permissions for pushing an image"; CodeBuild's service role, logs)."""
+PUSHING = ("InitiateLayerUpload", "UploadLayerPart", "CompleteLayerUpload", "PutImage")
+"""What a push does (ECR User Guide, "IAM permissions for pushing an image")."""
 
 
 @pytest.mark.parametrize(
@@ -642,12 +635,12 @@ BUILDERS = [
                 *(
                     ("s3:PutObject", f"{BUCKET}/{folder}/users/x/{name}", {"s3:if-none-match": "*"})
                     for folder in (
-                        "_slots", "_servers", "_warm", "_builds", "_", "_slots/p/q", "SSL", "SSL/a",
+                        "_slots", "_servers", "_warm", "_", "_slots/p/q", "SSL", "SSL/a",
                         "p/slots", "p/slots/a", "p/handovers", "p/handovers/sabcdefghijklmnopqrst-1.json", "p/steps", "p/steps/a/b",
                     )
                     for name in ("answers/y.json", "trials/y.json")
                 ),
-                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_builds", "_slots", "_warm", "_lobby", "_lobbies")),
+                *(("s3:GetObject", f"{BUCKET}/{folder}/users/x/answers/y.json", {}) for folder in ("_slots", "_warm", "_lobby", "_lobbies")),
                 ("s3:PutObject", f"{BUCKET}/p/sessions/s.1/session.json", {"s3:if-none-match": "*"}),
                 ("s3:PutObject", f"{BUCKET}/_match/p/waiting.json", {"s3:if-none-match": "*"}),
                 *(("s3:PutObject", f"{BUCKET}/{folder}/lobby/groups/y.json", {"s3:if-none-match": "*"}) for folder in ("_lobby", "_servers", "SSL", "p/steps", "p/slots", "p/handovers")),
@@ -660,7 +653,7 @@ BUILDERS = [
             [("s3:GetObject", f"{BUCKET}/p/{page}", {}) for page in ("consent.html", "steps/consent.html", "steps/a.png")],
             [
                 *(("s3:GetObject", f"{BUCKET}/{key}", {}) for key in (
-                    "_builds/a.html", "_servers.html", "p/users/u.html", "p/users/u/a.html", "p/users/u/answers.html", "p/a.json", "a.html",
+                    "_servers.html", "p/users/u.html", "p/users/u/a.html", "p/users/u/answers.html", "p/a.json", "a.html",
                     "p/users/u/trials/a.html", "SSL/privkey.pem",
                 )),
                 ("s3:PutObject", f"{BUCKET}/p/consent.html", {"s3:if-none-match": "*"}),
@@ -678,19 +671,6 @@ BUILDERS = [
             [("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}), ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/hippodrome-Repository", {})],
         ),
         (
-            "ImageBuilderRole",
-            [
-                ("s3:GetObject", f"{BUCKET}/_builds/1.zip", {}),
-                ("ecr:GetAuthorizationToken", "*", {}),
-                *BUILDERS,
-            ],
-            [
-                ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
-                ("s3:PutObject", f"{BUCKET}/_builds/1.zip", {}),
-                ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/another", {}),
-            ],
-        ),
-        (
             "ResearcherPolicy",
             [
                 ("lambda:InvokeFunction", "arn:aws:lambda:us-east-1:123456789012:function:hippodrome-update_project_master_list", {}),
@@ -698,9 +678,12 @@ BUILDERS = [
                 ("s3:PutObject", f"{BUCKET}/p/steps/a.html", {}),
                 ("s3:PutObject", f"{BUCKET}/p/a.html", {}),
                 ("ecs:RegisterTaskDefinition", "arn:aws:ecs:us-east-1:123456789012:task-definition/hippodrome-p", {}),
+                ("ecr:GetAuthorizationToken", "*", {}),
+                *((f"ecr:{action}", REPOSITORY, {}) for action in (*PULLING, *PUSHING)),
             ],
             [
                 ("lambda:InvokeFunction", "arn:aws:lambda:us-east-1:123456789012:function:hippodrome-sweep", {}),
+                ("ecr:PutImage", "arn:aws:ecr:us-east-1:123456789012:repository/another", {}),
                 ("s3:GetObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:PutObject", f"{BUCKET}/SSL/privkey.pem", {}),
                 ("s3:PutObject", f"{BUCKET}/project_master_list.json", {}),

@@ -36,7 +36,7 @@ WITH_CONDITION = {
 # A "*" within a resource: a part of the name that only a run gives.
 PARTIAL = re.compile(
     r"""the-bucket/( \*/(steps|users|slots|handovers|sessions|lobby)/.* | \*/\*\.html
-        | (_servers|_slots|_warm|_lobby|_lobbies|_builds|_cells|SSL)/\* | _match/\*/waiting\.json )
+        | (_servers|_slots|_warm|_lobby|_lobbies|_cells|SSL)/\* | _match/\*/waiting\.json )
       | arn:aws:ecs:[^*]*:task-definition/hippodrome(:|-)\*
       | arn:aws:ecs:[^*]*:(cluster|task)/s\?{20}-\*(/\*)?
       | arn:aws:ecs:[^*]*:task/hippodrome/\*

@@ -28,7 +28,7 @@ def test_a_supported_region_has_every_type_with_the_schema_that_was_linted(regio
 
 
 SERVICES = (  # whose endpoints the template's types and the commands need in the region itself
-    *("acm", "apigatewayv2", "cloudformation", "cloudwatch", "codebuild", "ec2", "ecr", "ecs", "events", "lambda"),
+    *("acm", "apigatewayv2", "cloudformation", "cloudwatch", "ec2", "ecr", "ecs", "events", "lambda"),
     *("logs", "resourcegroupstaggingapi", "s3", "scheduler", "service-quotas", "sns", "sqs", "sts"),
 )
 

@@ -24,15 +24,15 @@ from testing.moto_study import PROJECT, Person, StudyOnMoto
 from testing.moto_world import MotoWorld
 
 POLICY = "ResearcherPolicy"
-LENT = ("TaskExecutionRole", "ImageBuilderRole")
-"""Roles that others use for researchers, who say what is done: a task definition's containers, and a build's commands."""
+LENT = ("TaskExecutionRole",)
+"""Roles that others use for researchers, who say what is done: a task definition's containers."""
 
 SHOWN = {  # every action of the policy: what it shows or does. Who adds one says why it shows no secret
     "cloudformation:DescribeStacks": "parameters and outputs, none of which is a secret",
     "cloudformation:ListStackResources": "names",
     "s3:ListBucket": "keys, which hold ids, but no secrets",
     "s3:GetObject": "documents: see the test below",
-    "s3:PutObject": "pages and what images are built from",
+    "s3:PutObject": "pages",
     "s3:DeleteObject": "pages",
     "lambda:InvokeFunction": "registers projects and signs links; its answers are looked at below",
     "ecr:GetAuthorizationToken": "a password for images alone",
@@ -44,10 +44,6 @@ SHOWN = {  # every action of the policy: what it shows or does. Who adds one say
     "ecr:InitiateLayerUpload": "images",
     "ecr:PutImage": "images",
     "ecr:UploadLayerPart": "images",
-    "codebuild:StartBuild": "a build, with the role of the builds alone",
-    "codebuild:BatchGetBuilds": "builds; their variables are names",
-    "codebuild:ListBuildsForProject": "ids of builds",
-    "codebuild:StopBuild": "a build",
     "ecs:RegisterTaskDefinition": "what servers run; with no other role than the one that pulls images",
     "ecs:TagResource": "tags of those",
     "ecs:DescribeTaskDefinition": "what servers run. What each is told is part of its task, not of the definition",
@@ -238,14 +234,12 @@ def ways() -> Iterator[Ask]:
         for service in (
             "ecs-tasks.amazonaws.com",
             "lambda.amazonaws.com",
-            "codebuild.amazonaws.com",
             "scheduler.amazonaws.com",
         ):
             if (role, service) != ("TaskExecutionRole", "ecs-tasks.amazonaws.com"):
                 yield Ask("iam:PassRole", arn, {"iam:PassedToService": service})
     yield Ask("iam:CreatePolicyVersion", "arn:aws:iam::123456789012:policy/hippodrome-ResearcherPolicy")
     yield Ask("logs:PutSubscriptionFilter", f"arn:aws:logs:{HERE}:log-group:/hippodrome/hippodrome/trial")
-    yield Ask("codebuild:UpdateProject", f"arn:aws:codebuild:{HERE}:project/hippodrome-image")
 
 
 WAYS = [*ways()]
@@ -282,12 +276,12 @@ def test_researchers_may_write_pages_and_nothing_with_a_similar_key(judge: Judge
 
 
 @pytest.mark.parametrize("role", LENT)
-def test_the_roles_of_builds_and_containers_allow_no_way_to_a_secret(judge: Judge, role: str) -> None:
+def test_the_roles_of_containers_allow_no_way_to_a_secret(judge: Judge, role: str) -> None:
     assert [ask for ask in WAYS if judge.may(role, ask)] == []
 
 
 @pytest.mark.parametrize("role", LENT)
-def test_the_roles_of_builds_and_containers_read_no_documents(judge: Judge, role: str) -> None:
+def test_the_roles_of_containers_read_no_documents(judge: Judge, role: str) -> None:
     for key in (
         "project_master_list.json",
         "_servers/s.json",

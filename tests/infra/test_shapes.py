@@ -53,8 +53,6 @@ def test_limits_of_the_calls_are_checked() -> None:
         ("AWS::ApiGatewayV2::Api", "ProtocolType", "HTTP2"),
         ("AWS::CertificateManager::Certificate", "DomainName", "-x.example.org"),
         ("AWS::CloudWatch::Alarm", "Statistic", "Mean"),
-        ("AWS::CodeBuild::Project", "TimeoutInMinutes", 4),
-        ("AWS::CodeBuild::Project", "Environment.EnvironmentVariables.*.Name", ""),
         ("AWS::ECR::Repository", "LifecyclePolicy.LifecyclePolicyText", "{}"),
         ("AWS::Events::Rule", "Targets.*.Id", "x" * 65),
         ("AWS::IAM::ManagedPolicy", "PolicyDocument.Id", "…"),

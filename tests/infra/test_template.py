@@ -34,7 +34,7 @@ OUTPUTS = [
         "SecurityGroup",
     ),
     *("StartServerTopic", "StopServerTopic", "TaskQueue", "ScheduleGroup", "ScheduleRole", "Repository"),
-    *("TaskExecutionRole", "TrialLogGroup", "RegisterFunction", "ImageBuilder", "ResearcherPolicy"),
+    *("TaskExecutionRole", "TrialLogGroup", "RegisterFunction", "ResearcherPolicy"),
     *("Dashboard", "Alarms"),
 ]
 
@@ -269,7 +269,7 @@ def test_data_are_private_encrypted_versioned_and_outlive_the_stack() -> None:
     assert rules["OldVersions"]["NoncurrentVersionExpiration"]
     assert rules["IncompleteUploads"]["AbortIncompleteMultipartUpload"]
     expiring = [rule["Prefix"] for rule in rules.values() if "ExpirationInDays" in rule]
-    assert sorted(expiring) == ["_builds/", "_lobby/", "_match/"], "no data expire"
+    assert sorted(expiring) == ["_lobby/", "_match/"], "no data expire"
     (policy,) = cfn.resources("AWS::S3::BucketPolicy").values()
     (statement,) = policy["PolicyDocument"]["Statement"]
     assert (statement["Effect"], statement["Condition"]) == ("Deny", {"Bool": {"aws:SecureTransport": "false"}})

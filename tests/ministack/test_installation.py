@@ -42,7 +42,6 @@ OUTPUTS = [
     "Cluster",
     "Dashboard",
     "HostedZoneId",
-    "ImageBuilder",
     "MaxRuntime",
     "RegisterFunction",
     "Repository",
@@ -143,7 +142,7 @@ def registered(
 ) -> CommandRun:
     """The tiny study, registered by the researcher."""
     folder = write_project(tmp_path_factory.mktemp("study") / "tiny")
-    return world.deploy("register", str(folder), "--build-on-aws", "--json", keys=researcher)
+    return world.deploy("register", str(folder), "--json", keys=researcher)
 
 
 @pytest.fixture(scope="session")
@@ -156,8 +155,6 @@ def test_a_researcher_registers_a_study(
     world: MinistackWorld, installed: MinistackInstallation, study: dict[str, Any]
 ) -> None:
     assert study["link"] == f"https://study.{DOMAIN}/next?projectId={PROJECT}"
-    bundles = world.client("s3").list_objects_v2(Bucket=installed.bucket, Prefix="_builds/")["Contents"]
-    assert [one["Key"] for one in bundles if one["Key"].endswith(".zip")]
     (project,) = installed.stored("project_master_list.json")["projects"]
     assert project["taskDefinition"] == study["taskDefinition"]
     definition = world.client("ecs").describe_task_definition(taskDefinition=study["taskDefinition"])["taskDefinition"]

@@ -68,17 +68,15 @@ def test_all_problems_are_reported_at_once_with_their_remedies(
 ) -> None:
     world.delegated = NOBODY
     world.caa[f"study.{DOMAIN}"] = caa.Caa(DOMAIN, (("issue", "digicert.com"),))
-    world.docker = False
-    world.limits.quotas[quotas.BUILDS] = 0
     world.limits.executions = 10
     record(world, f"study.{DOMAIN}")
-    with pytest.raises(Problem, match=r"4 things are in the way, marked ✗\. Nothing was made or changed\.") as caught:
+    with pytest.raises(Problem, match=r"3 things are in the way, marked ✗\. Nothing was made or changed\.") as caught:
         apply(world.account, "hippodrome", FIRST, ApplyRequest(game))
     assert caught.value.advice == "Put that right, and run the same command again."
     lines = capsys.readouterr().err.splitlines()
     marks = [line.split(":")[0] for line in lines if line[0] in "✗!"]
-    assert marks == ["! Lambda", "✗ CodeBuild", "✗ domain", "✗ CAA", "✗ site"]
-    assert [line.startswith("    → ") for line in lines] == [False, True] * 5
+    assert marks == ["! Lambda", "✗ domain", "✗ CAA", "✗ site"]
+    assert [line.startswith("    → ") for line in lines] == [False, True] * 4
     assert nothing_was_made(world)
 
 
@@ -209,36 +207,11 @@ def test_few_vcpus_are_a_remark(world: World, game: project_folder.ProjectFolder
     assert "--quota-code L-3032A538 --desired-value 20" in on_demand.advice
 
 
-def test_without_docker_and_without_a_build_nobody_could_build_the_image(
-    world: World, game: project_folder.ProjectFolder
-) -> None:
-    world.docker = False
-    world.limits.quotas[quotas.BUILDS] = 0
-    found = only(findings(world, game=game))
-    assert (found.mark, found.check) == (Mark.BAD, "CodeBuild")
-    assert "the image of maze cannot be built" in found.text
-    assert found.advice.startswith("Start Docker here, or ask for a build: aws service-quotas ")
-    assert "--service-code codebuild --quota-code L-9D07B6EF --desired-value 1" in found.advice
-    assert only(findings(world)).mark is Mark.LOOK  # an installation alone needs no image yet
-
-
-@pytest.mark.parametrize(("docker", "builds"), [(True, 0), (False, 1), (False, None)])
-def test_docker_or_one_build_is_enough(
-    world: World, game: project_folder.ProjectFolder, docker: bool, builds: float | None
-) -> None:
-    world.docker = docker
-    del world.limits.quotas[quotas.BUILDS]
-    if builds is not None:
-        world.limits.quotas[quotas.BUILDS] = builds
-    assert findings(world, game=game) == []
-
-
-def test_a_study_without_a_game_needs_neither_servers_nor_builds(world: World, tmp_path: Path) -> None:
+def test_a_study_without_a_game_needs_no_servers(world: World, tmp_path: Path) -> None:
     folder = write_study(tmp_path / "study")
     config = folder / "config.yml"
     config.write_text(config.read_text().replace("2: game, 3: thanks", "2: thanks").partition("trial:")[0])
-    world.docker = False
-    world.limits.quotas |= {quotas.BUILDS: 0, quotas.SPOT: 0, quotas.ON_DEMAND: 0}
+    world.limits.quotas |= {quotas.SPOT: 0, quotas.ON_DEMAND: 0}
     assert findings(world, game=project_folder.read(folder)) == []
 
 
@@ -471,10 +444,6 @@ UNKNOWN_ROLE = [
 ]
 OF_NEW_ROLES = [
     ("AWS::Lambda::Function", "The role defined for the function cannot be assumed by Lambda."),
-    (
-        "AWS::CodeBuild::Project",
-        "CodeBuild is not authorized to perform: sts:AssumeRole on service role. Please verify",
-    ),
     (
         "AWS::Lambda::EventSourceMapping",
         "Invalid request provided: The function execution role does not have permissions to call ReceiveMessage on SQS",

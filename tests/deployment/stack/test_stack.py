@@ -140,10 +140,6 @@ def test_a_refusal_is_not_taken_for_a_missing_stack(world: World, monkeypatch: p
         ("The domain name you provided already exists.", "--site"),
         ("[Tried to create resource record set [name='study.x.', type='A'] but it already exists]", "--site"),
         ("Unable to assume the service linked role.", "in a minute"),
-        (
-            "CodeBuild is not authorized to perform: sts:AssumeRole on service role. Please verify that: 1) …",
-            "in a minute",
-        ),
         ("Specified ReservedConcurrentExecutions … decreases UnreservedConcurrentExecution below its minimum", "1,000"),
         ("LimitExceededException: too many roles", "Service Quotas"),
         ("Rate exceeded", "again"),

@@ -1,14 +1,13 @@
-"""Rules for what keeps data: the bucket, the images, the cluster, the builder, logs."""
+"""Rules for what keeps data: the bucket, the images, the cluster, logs."""
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from typing import Any
 
 from testing.template import listed
-from tests.infra.rules.book import Rule, Template, each, first, number, one_of, put, setting, text
+from tests.infra.rules.book import Rule, Template, each, first, one_of, put, setting, text
 from tests.infra.situations import Installation, Resource
 
 BUCKET, BUCKET_POLICY, REPOSITORY, CLUSTER = (
@@ -17,7 +16,7 @@ BUCKET, BUCKET_POLICY, REPOSITORY, CLUSTER = (
     "AWS::ECR::Repository",
     "AWS::ECS::Cluster",
 )
-BUILDER, LOGS = "AWS::CodeBuild::Project", "AWS::Logs::LogGroup"
+LOGS = "AWS::Logs::LogGroup"
 RULES_PATH = "LifecycleConfiguration.Rules"
 _ACTIONS = {  # of a lifecycle rule in CloudFormation
     *("AbortIncompleteMultipartUpload", "ExpirationDate", "ExpirationInDays", "NoncurrentVersionExpiration"),
@@ -104,31 +103,6 @@ def _order(one: Resource, there: Installation) -> Iterator[str]:
         yield "a rule for any image is not the last"
 
 
-def _variables(one: Resource, there: Installation) -> Iterator[str]:
-    for variable in one.properties["Environment"].get("EnvironmentVariables", []):
-        if not variable.get("Value") or not re.fullmatch(r"(?!CODEBUILD_)[A-Za-z_]\w*", variable["Name"]):
-            yield f"the variable {variable['Name']} is empty, or CodeBuild's own"
-
-
-def _sources(one: Resource, there: Installation) -> Iterator[str]:
-    source = one.properties["Source"]
-    if source["Type"] == "S3" and not re.fullmatch(r"[^/]+/.*(/|\.zip)", source["Location"]):
-        yield f"{source['Location']} is neither a folder with its slash nor a zip"
-
-
-def _unprivileged(one: Resource, there: Installation) -> Iterator[str]:
-    if not one.properties["Environment"].get("PrivilegedMode"):
-        yield "Docker cannot run in it"
-
-
-def _early_builder(one: Resource, there: Installation) -> Iterator[str]:
-    role = there.everything[one.raw["Properties"]["ServiceRole"]["Fn::GetAtt"][0]]
-    trusted = json.dumps(role.properties["AssumeRolePolicyDocument"])
-    arn = f"arn:aws:codebuild:{there.account.region}:{there.account.id}:project/{one.properties['Name']}"
-    if "aws:SourceArn" in trusted and arn not in trusted:
-        yield f"its role trusts another project than {arn}"
-
-
 def _measured(one: Resource, there: Installation) -> Iterator[str]:
     settings = {setting["Name"]: setting["Value"] for setting in one.properties.get("ClusterSettings", [])}
     if settings.get("containerInsights") != "disabled":
@@ -178,7 +152,6 @@ def _reviving(template: Template) -> None:
 RETENTION = (1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653)
 """Days that CloudWatch Logs keeps logs."""
 LIFECYCLE = "S3 API Reference, PutBucketLifecycleConfiguration"
-PROJECT = "CodeBuild API Reference, CreateProject"
 IMAGES = "ECR User Guide, Lifecycle policy properties"
 
 RULES: tuple[Rule, ...] = (
@@ -269,43 +242,6 @@ RULES: tuple[Rule, ...] = (
         "ECS API Reference, ClusterSetting: overrides the value set with PutAccountSettingDefault",
         _measured,
         lambda t: first(t, CLUSTER).pop("ClusterSettings", None),
-    ),
-    *text(BUILDER, "Name", PROJECT, most=150, pattern=r"[A-Za-z0-9][A-Za-z0-9\-_]{1,149}", spoiled="an image"),
-    *text(BUILDER, "Description", PROJECT, most=255),
-    number(BUILDER, "TimeoutInMinutes", PROJECT, 5, 2160),
-    number(BUILDER, "QueuedTimeoutInMinutes", PROJECT, 5, 480),
-    each(
-        BUILDER,
-        "Environment.EnvironmentVariables",
-        "each with a value, and not called CODEBUILD_…",
-        "CodeBuild User Guide, Environment variables in build environments; cloudposse/terraform-aws-codebuild 10: empty ones "
-        "are refused",
-        _variables,
-        setting(BUILDER, "Environment.EnvironmentVariables.*.Value", ""),
-    ),
-    each(
-        BUILDER,
-        "Source.Location",
-        "of S3: bucket/folder/ with its slash, or bucket/file.zip",
-        "CodeBuild API Reference, ProjectSource",
-        _sources,
-        setting(BUILDER, "Source.Location", {"Fn::Sub": "${Bucket}/_builds"}),
-    ),
-    each(
-        BUILDER,
-        "Environment.PrivilegedMode",
-        "true, for Docker",
-        "CodeBuild API Reference, ProjectEnvironment",
-        _unprivileged,
-        setting(BUILDER, "Environment.PrivilegedMode", False),
-    ),
-    each(
-        BUILDER,
-        "ServiceRole",
-        "a role that trusts this very project",
-        "CodeBuild User Guide, Cross-service confused deputy prevention",
-        _early_builder,
-        setting(BUILDER, "Name", {"Fn::Sub": "${AWS::StackName}-images"}),
     ),
     *text(
         LOGS,

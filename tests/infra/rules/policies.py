@@ -74,13 +74,11 @@ def _comes(service: str, there: Installation) -> str:
     """Return the `aws:SourceArn` with which a service asks for a role; "" where it sends none."""
     place = f"{there.account.region}:{there.account.id}"
     (group,) = there.of("AWS::Scheduler::ScheduleGroup")
-    (builder,) = there.of("AWS::CodeBuild::Project")
     (cluster,) = there.of("AWS::ECS::Cluster")
     return {
         "lambda.amazonaws.com": "",
         "scheduler.amazonaws.com": f"arn:aws:scheduler:{place}:schedule-group/{group.properties['Name']}",
         "ecs-tasks.amazonaws.com": f"arn:aws:ecs:{place}:task/{cluster.properties['ClusterName']}/0123456789abcdef",
-        "codebuild.amazonaws.com": f"arn:aws:codebuild:{place}:project/{builder.properties['Name']}",
     }[service]
 
 
@@ -160,8 +158,7 @@ RULES = (
         "AssumeRolePolicyDocument",
         "conditions that hold for the service that assumes it",
         "EventBridge Scheduler User Guide, Confused deputy prevention: the schedule group, since September 2023; ECS Developer "
-        "Guide, Task execution IAM role: arn:aws:ecs:region:account:*; CodeBuild User Guide, Cross-service confused deputy "
-        "prevention: the project; Lambda sends no such key (prowler 2810)",
+        "Guide, Task execution IAM role: arn:aws:ecs:region:account:*; Lambda sends no such key (prowler 2810)",
         _untrusting,
         lambda t: put(
             t["Resources"]["ScheduleRole"]["Properties"]["AssumeRolePolicyDocument"]["Statement"][0],

@@ -21,7 +21,6 @@ NAMES = {  # where a resource has the name that we give it
     "AWS::Budgets::Budget": "Budget.BudgetName",
     "AWS::CloudWatch::Alarm": "AlarmName",
     "AWS::CloudWatch::Dashboard": "DashboardName",
-    "AWS::CodeBuild::Project": "Name",
     "AWS::ECR::Repository": "RepositoryName",
     "AWS::ECS::Cluster": "ClusterName",
     "AWS::Events::Rule": "Name",
