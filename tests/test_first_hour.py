@@ -54,11 +54,11 @@ ELSEWHERE = {
     "These credentials may not …": "deployment/operate/test_doctor.py",
     "The AWS credentials have expired.": "deployment/operate/test_doctor.py",
     "The profile … is of `aws login`, whose credentials cannot be read here.": "deployment/aws/test_account.py",
-    "This AWS account may not run another build now.": "deployment/study/test_codebuild.py",
     "The installation stands, but has no certificate. …": "deployment/lifecycle/test_deploy.py",
     "… wants no further orders …": "certificate/test_command.py",
     "Nothing is ordered until …": "certificate/test_command.py",
-    "The image could not be built": "deployment/study/test_codebuild.py",
+    "… has no wheel for Python … on Linux and would have to be compiled.": "deployment/study/test_image_packages.py",
+    "The image would lack something: …": "deployment/study/test_image_runs.py",
     "Interrupted. CloudFormation goes on with the stack …": "deployment/stack/test_stack.py",
     "Interrupted. The same command goes on from here.": "deployment/study/test_register_refused.py",
     "Something of that name is in another region: say …": "deployment/lifecycle/test_destroy_waits.py",
@@ -136,7 +136,7 @@ def _put_together(part: str) -> bool:
 @pytest.mark.parametrize("message", first_hour.failures())
 def test_the_words_of_a_failure_are_the_programs(message: str) -> None:
     check, _, rest = message.partition(": ")
-    if check in {"domain", "CAA", "region", "CodeBuild", "site", "VPCs", "left over"}:
+    if check in {"domain", "CAA", "region", "site", "VPCs", "left over"}:
         assert any(f'"{check}"' in text for text in sources()), f"no check is called {check}"
         message = rest
     assert says(message)

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import re
-import subprocess
-import zipfile
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from hippodrome.control.ports import PORTS
 from hippodrome.deployment.study.image.bundle import make_bundle
@@ -34,7 +29,7 @@ def test_the_dockerfile_is_one_that_may_run_a_strangers_code(recipe: Recipe) -> 
     assert not re.search(r"(?i)secret|password|AWS_", (ROOT / "infra/Dockerfile").read_text())
     (base,) = recipe.all("ARG")
     assert re.search(r":3\.13-slim-[a-z]+$", base)
-    # Docker Hub answers 429 to the addresses that CodeBuild's builders share; AWS's mirror of the same images does not.
+    # Docker Hub limits anonymous pulls per address; AWS's mirror of the same images does not.
     assert base.removeprefix("BASE=").startswith("public.ecr.aws/docker/library/python:")
 
 
@@ -88,36 +83,13 @@ def test_the_dockerfile_copies_first_what_changes_least(recipe: Recipe, folder: 
 
 def test_a_project_without_files_of_its_own_can_be_built(folder: Path, tmp_path: Path) -> None:
     (folder / "agent.py").unlink()
-    made = make_bundle(folder)
-    made.write_folder(tmp_path / "context")
-    made.write_zip(tmp_path / "context.zip")
+    make_bundle(folder).write_folder(tmp_path / "context")
     assert (tmp_path / "context/project").is_dir()
-    with zipfile.ZipFile(tmp_path / "context.zip") as archive:
-        assert "project/" in archive.namelist()
 
 
 def test_the_versions_of_the_trial_are_pinned() -> None:
     for line in (ROOT / "requirements/trial.txt").read_text().splitlines():
         assert line.startswith("#") or re.fullmatch(r"[A-Za-z0-9-]+==[0-9.]+", line)
-
-
-def test_the_commands_of_the_buildspec_are_valid() -> None:
-    spec = yaml.safe_load((ROOT / "infra/buildspec.yml").read_text())
-    assert spec["version"] == 0.2
-    commands = [command for phase in spec["phases"].values() for command in phase["commands"]]
-    for command in commands:
-        assert subprocess.run(["bash", "-n", "-c", command], check=False).returncode == 0
-    (build,) = spec["phases"]["build"]["commands"]
-    for cache, extra in (("", []), ("r/x:y", ["--cache-from", "type=registry,ref=r/x:y"])):
-        said = subprocess.run(
-            ["bash", "-c", f'docker() {{ printf "%s\\n" "$@"; }}; {build}'],
-            env={"IMAGE": "r/x:z", "CACHE_FROM": cache, "PATH": os.environ["PATH"]},
-            capture_output=True, text=True, check=True,
-        ).stdout.split("\n")[:-1]  # fmt: skip
-        assert said[:2] == ["buildx", "build"]
-        assert said[-4:] == ["--tag", "r/x:z", "--push", "."]
-        assert said[7 : 7 + len(extra)] == extra
-        assert len(said) == 11 + len(extra)
 
 
 ENV = {

@@ -42,11 +42,11 @@ def test_the_first_of_two_makers_of_the_same_image_counts(register_world: Regist
     """A tag is used once: the second push is refused, and the image of the first is the wanted one."""
     put = register_world.put_image
 
-    def twice(tag: str) -> None:
+    def second(tag: str) -> None:
         put(tag)
-        put(tag)
+        raise Problem("ECR refused a request for hippodrome (HTTP 400).")
 
-    register_world.put_image = twice
+    register_world.put_image = second
     ran = register(code=Exit.DONE)
     assert "meanwhile" in ran.err
     assert register_world.project() is not None

@@ -71,6 +71,7 @@ def build(wanted: ImagePlan, *, by_dockerfile: bool = False) -> Image:
         else:
             from hippodrome.deployment.study.image import assembled  # noqa: PLC0415 - only a new image needs it
 
+            screen.info("Assembling the image …")
             assembled.build(order)
     except Problem:
         if order.arrived() is None:
