@@ -99,11 +99,11 @@ def push_debian(address: str, name: str, folder: Path) -> str:
     return _push(Repository(f"http://{address}", name), body, folder, {"PATH": "/usr/bin:/bin"})
 
 
-def push_official(address: str, name: str, folder: Path) -> str:
+def push_official(address: str, name: str, folder: Path, version: str = "3.13.5") -> str:
     """Push the base as Docker's official image is: Python in /usr/local, an index, media types of Docker."""
     moved = {f"usr/{path}": f"usr/local/{path}" for path in ("lib/python3.13", "bin/python3.13")}
     body = _repacked({"usr/local/bin/python": "python3.13"}, moved)
-    variables = {"PATH": "/usr/local/bin:/usr/local/sbin:/usr/sbin:/usr/bin:/sbin:/bin", "PYTHON_VERSION": "3.13.5"}
+    variables = {"PATH": "/usr/local/bin:/usr/local/sbin:/usr/sbin:/usr/bin:/sbin:/bin", "PYTHON_VERSION": version}
     return _push(Repository(f"http://{address}", name), body, folder, variables, official=True)
 
 

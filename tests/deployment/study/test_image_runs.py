@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -25,9 +26,12 @@ from websockets.exceptions import ConnectionClosed
 from hippodrome.bots.bot import SUBPROTOCOL
 from hippodrome.bots.game import GameConnection
 from hippodrome.bots.report import BotReport, PlayedStep
-from hippodrome.deployment.study.image import assembled
+from hippodrome.console.problem import Problem
+from hippodrome.deployment.code import bytecode
+from hippodrome.deployment.study.image import assembled, packages
 from hippodrome.deployment.study.image.bundle import make_bundle
 from hippodrome.deployment.study.image.order import Order
+from hippodrome.deployment.study.image.registry import Repository
 from testing import ports
 from tests.deployment import sandbox
 
@@ -136,6 +140,62 @@ def played(root: Path, config: Mapping[str, Any], folder: Path) -> PlayedStep:
         process.kill()
         process.wait()
     return play
+
+
+def test_a_changed_agent_is_all_that_is_sent(images: Images, study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assembled.build(images.order(study, "Debian's layout", "first"))
+    (study / "agent.py").write_text((study / "agent.py").read_text() + "\n# changed\n")
+    capsys.readouterr()
+    assembled.build(images.order(study, "Debian's layout", "second"))
+    told = capsys.readouterr().err
+    sent = [line.split()[0:2] for line in told.splitlines() if line.endswith("  sent")]
+    assert sent == [["the", "study"]]
+    assert told.count("  there already") == 3, "the base, the packages and Hippodrome"
+
+
+def test_the_same_study_makes_the_same_image_on_another_machine(images: Images, study: Path, tmp_path: Path) -> None:
+    assembled.build(images.order(study, "the official layout", "here"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assembled, "cache_folder", lambda: tmp_path)
+        assembled.build(images.order(study, "the official layout", "there"))
+    here, there = (Repository(f"http://{images.address}", STUDY).manifest(tag)[0] for tag in ("here", "there"))
+    assert here == there
+
+
+def test_our_layers_are_small(images: Images, study: Path, cache: Path) -> None:
+    """Each server pulls them before its participant can play."""
+    assembled.build(images.order(study, "Debian's layout", "small"))
+    _, manifest = Repository(f"http://{images.address}", STUDY).manifest("small")
+    assert sum(layer["size"] for layer in manifest["layers"][1:]) <= 31_000_000
+
+
+def test_an_agent_that_lacks_a_package_is_not_sent(images: Images, study: Path) -> None:
+    """The machine's own Python has it; the image has not."""
+    if bytecode.compiler(packages.PYTHON) is None:
+        pytest.skip("The agent is tried only where Python 3.13 is installed")
+    (study / "agent.py").write_text("import psutil\n\n\nclass Agent:\n    pass\n")
+    with pytest.raises(Problem, match=r"The image would lack something: agent\.py:1: ModuleNotFoundError"):
+        assembled.build(images.order(study, "Debian's layout", "lacking"))
+    with pytest.raises(Problem, match="refused a request"):
+        Repository(f"http://{images.address}", STUDY).manifest("lacking")
+
+
+def test_another_kind_of_machine_says_that_it_could_not_try(
+    images: Images, study: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "arm64")
+    assembled.build(images.order(study, "Debian's layout", "untried"))
+    assert "! The agent was not tried with the image's packages: that needs Python 3.13" in capsys.readouterr().err
+
+
+def test_a_base_with_another_python_is_refused(images: Images, study: Path) -> None:
+    folder = images.folder / "old"
+    folder.mkdir()
+    old = sandbox.push_official(images.address, "old/python", folder, version="3.12.1")
+    bundle = make_bundle(study, old)
+    order = images.order(study, "Debian's layout", "old")
+    with pytest.raises(Problem, match=r"has Python 3\.12\.1, and the trial needs Python 3\.13"):
+        assembled.build(dataclasses.replace(order, bundle=bundle))
 
 
 async def _play(port: int, play: PlayedStep) -> None:
