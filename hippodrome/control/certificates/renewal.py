@@ -7,16 +7,15 @@ All other documents are derived from `privkey.pem`; if a run is interrupted, the
 
 from __future__ import annotations
 
-import json
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from hippodrome.control.certificates import rules
+from hippodrome.control.certificates.accounts import account_key
 from hippodrome.control.certificates.rules import (
-    ACCOUNT,
     CertificateRecord,
     Decision,
     FailureReason,
@@ -227,29 +226,12 @@ class Renewal:
         request = order.OrderRequest(
             directory=wanted.directory,
             domain=wanted.domain,
-            account=self._account(wanted.directory),
+            account=account_key(self._documents, wanted.directory),
             email=wanted.email,
             trusted=wanted.trusted,
             seconds=wanted.seconds,
         )
         return order.order(request, publish, self._tell)
-
-    def _account(self, directory: str) -> dict[str, Any]:
-        """The key of our account at this directory. A new key is stored before it is used."""
-        from hippodrome.control.certificates.order import new_account_key  # noqa: PLC0415 - its import is slow
-
-        for _ in range(MAX_TRIES):
-            known = self._documents.get(ACCOUNT)
-            keys = _read_keys(known.body) if known else {}
-            if directory in keys:
-                return keys[directory]
-            keys[directory] = new_account_key()
-            try:
-                self._write(ACCOUNT, json.dumps(keys, indent=1).encode(), known)
-            except Conflict:
-                continue
-            return keys[directory]
-        raise Conflict(ACCOUNT)
 
     def _remove_challenges(self, domain: str, values: Sequence[str]) -> None:
         """Remove published values from DNS. If that fails, the next run does it."""
@@ -327,10 +309,3 @@ def renew(renewal: Renewal, domain: str, seconds: float) -> RenewalOutcome | Non
         return None
     trusted = renewal.last_roots(directory)
     return renewal.obtain(RenewalRequest(domain, directory, trusted=trusted, seconds=seconds))
-
-
-def _read_keys(body: bytes) -> dict[str, dict[str, Any]]:
-    found = json.loads(body)
-    if not isinstance(found, dict):
-        raise ValueError(f"{ACCOUNT} is not a JSON object")
-    return found
