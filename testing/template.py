@@ -11,6 +11,9 @@ from typing import Any
 
 import yaml
 
+NO_VALUE = object()
+"""What `AWS::NoValue` is resolved to: the entry is left out."""
+DOMAIN = {"RootDomain": "the-RootDomain", "HostedZoneId": "the-HostedZoneId"}
 PATH = Path(__file__).resolve().parents[1] / "infra" / "template.yml"
 
 
@@ -62,13 +65,13 @@ def functions(of: Mapping[str, Any] | None = None) -> dict[str, str]:
 class ReferenceValues:
     """The values of the template's references in one account (`id` is the account's).
 
-    `known` has the values of resources that exist already, by `Ref` ("Bucket") or attribute ("Bucket.Arn").
+    Without `parameters` it has a domain. `known` has the values of resources that exist already, by `Ref` ("Bucket") or attribute ("Bucket.Arn").
     """
 
     stack: str = "hippodrome"
     id: str = "123456789012"
     region: str = "us-east-1"
-    parameters: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, str] = field(default_factory=lambda: DOMAIN)
     known: Mapping[str, str] = field(default_factory=dict)
     of: Mapping[str, Any] = field(default_factory=template)
 
@@ -78,7 +81,7 @@ class ReferenceValues:
         Raises KeyError for a reference to nothing, and for an intrinsic function that is not implemented here.
         """
         if isinstance(value, list):
-            return [self.resolve(item) for item in value]
+            return [resolved for item in value if (resolved := self.resolve(item)) is not NO_VALUE]
         if not isinstance(value, dict):
             return value
         if len(value) == 1:
@@ -97,7 +100,7 @@ class ReferenceValues:
                 return [f"{self.region}{letter}" for letter in "abc"]
             if name.startswith("Fn::"):
                 raise KeyError(name)
-        return {key: self.resolve(item) for key, item in value.items()}
+        return {key: resolved for key, item in value.items() if (resolved := self.resolve(item)) is not NO_VALUE}
 
     def holds(self, condition: str | dict[str, Any]) -> bool:
         """Return whether a condition is true: its name, or an expression of Fn::Equals and Fn::Not."""
@@ -144,9 +147,10 @@ class ReferenceValues:
                 return str(self.resolve(properties[key]))
         return f"{self.stack}-{name}"
 
-    def _pseudo(self, name: str) -> str:
+    def _pseudo(self, name: str) -> Any:
         return {
             "AWS::AccountId": self.id,
+            "AWS::NoValue": NO_VALUE,
             "AWS::Partition": "aws",
             "AWS::Region": self.region,
             "AWS::StackId": f"arn:aws:cloudformation:{self.region}:{self.id}:stack/{self.stack}/1",
@@ -177,7 +181,7 @@ def statements(of: Mapping[str, Any] | None = None) -> Iterator[tuple[str, dict[
     for name, one in (of or template())["Resources"].items():
         for document in _documents(one.get("Properties", {})):
             for statement in document["Statement"]:
-                yield name, statement
+                yield name, statement["Fn::If"][1] if "Fn::If" in statement else statement
 
 
 def role_documents(role: str, of: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:

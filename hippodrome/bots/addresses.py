@@ -10,6 +10,7 @@ from __future__ import annotations
 import ssl
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from ipaddress import IPv4Address
 from typing import Protocol
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
@@ -79,7 +80,8 @@ class OneSite:
 
     `site` is an https address. `servers` are the sources for trial servers in the pages' Content-Security-Policy, such
     as `wss://*.example.org:443`. An allowed address has the name of a server (`ids.parse_server_name`) in the place of
-    the asterisk. `connect` is the function behind `dial`.
+    the asterisk. Without sources servers have no names, and any public IPv4 address is allowed: its certificate proves
+    it. `connect` is the function behind `dial`.
     """
 
     site: str
@@ -100,12 +102,17 @@ class OneSite:
 
     def server(self, address: str) -> str:
         parts = _split(address)
-        if parts is None or parts.scheme != "wss" or not any(_matches(parts, source) for source in self.servers):
+        if parts is None or parts.scheme != "wss" or not self._is_server(parts):
             raise AddressRefused(f"bots only go to servers of {self.site}, not to {_without_path(parts)}")
         return address
 
     def dial(self, host: str, port: int) -> tuple[str, int]:
         return self.connect(host, port)
+
+    def _is_server(self, parts: SplitResult) -> bool:
+        if self.servers:
+            return any(_matches(parts, source) for source in self.servers)
+        return _is_public(parts.hostname or "")
 
 
 def _matches(parts: SplitResult, source: str) -> bool:
@@ -115,6 +122,13 @@ def _matches(parts: SplitResult, source: str) -> bool:
     if allowed is None or not source.startswith("wss://*.") or ids.parse_server_name(first) is None:
         return False
     return rest == (allowed.hostname or "").removeprefix("any.") and _origin(parts)[2] == _origin(allowed)[2]
+
+
+def _is_public(host: str) -> bool:
+    try:
+        return IPv4Address(host).is_global
+    except ValueError:
+        return False
 
 
 def _split(address: str) -> SplitResult | None:

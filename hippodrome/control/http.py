@@ -43,6 +43,7 @@ class Request:
     query: tuple[tuple[str, str], ...] | None  # None: the query is malformed
     headers: Mapping[str, str] = field(repr=False)
     body: bytes | None = field(default=b"", repr=False)
+    source: str = field(default="", repr=False)  # the address that the request comes from
 
     @classmethod
     def from_event(cls, event: Mapping[str, Any]) -> Request:
@@ -54,6 +55,7 @@ class Request:
             query=_query(event),
             headers=_headers(event),
             body=_body(event),
+            source=str(http.get("sourceIp") or ""),
         )
 
     def query_value(self, name: str) -> str | None:

@@ -239,12 +239,13 @@ class Settings:
     task_definition: str = "hippodrome"
     game_sources: str = ""  # the sources in the pages' Content-Security-Policy to which the game may connect
     user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
+    certificate_url: str = ""  # where servers without a name get their certificate (`certify_server`)
     plain_clients: bool = False  # whether projects' front ends may open servers without a token (`plainClients`)
 
     @property
     def servers_domain(self) -> str:
-        """The domain directly above the servers' names."""
-        return f"{self.servers_host}.{self.root_domain}" if self.servers_host else self.root_domain
+        """The domain directly above the servers' names; "" if servers have no names."""
+        return f"{self.servers_host}.{self.root_domain}" if self.servers_host and self.root_domain else self.root_domain
 
     @property
     def game_scheme(self) -> str:
@@ -256,8 +257,8 @@ class Settings:
         """Read the settings from a function's environment variables.
 
         They are `BUCKET`, `ROOT_DOMAIN`, `MAX_RUNTIME`, `CLUSTER`, `TASK_DEFINITION`, `SERVER_NAMES`, `SERVERS_HOST`,
-        `PLAIN_CLIENTS`, and Lambda's `AWS_REGION`. A missing variable gives the default; without `SERVER_NAMES` no
-        server is named after a participant's id.
+        `PLAIN_CLIENTS`, `CERTIFICATE_URL`, and Lambda's `AWS_REGION`. A missing variable gives the default; without
+        `SERVER_NAMES` no server is named after a participant's id.
         """
         domain, host = (env.get(key, "").strip(".").lower() for key in ("ROOT_DOMAIN", "SERVERS_HOST"))
         return cls(
@@ -271,6 +272,7 @@ class Settings:
             user_id_names=env.get("SERVER_NAMES") == "userId",
             plain_clients=env.get("PLAIN_CLIENTS") == "allowed",
             servers_host=host,
+            certificate_url=env.get("CERTIFICATE_URL", ""),
         )
 
 

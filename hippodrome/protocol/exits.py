@@ -8,3 +8,5 @@ LATE_AGENT = 4
 """The agent was not started within START_SECONDS."""
 NO_PORT = 5
 """The system does not let the server listen on its port."""
+NO_CERTIFICATE = 6
+"""The server got no certificate for its address."""

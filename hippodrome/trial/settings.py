@@ -132,7 +132,7 @@ class TrialSettings:
         if not steps or not all(NAME.fullmatch(step) for step in steps):
             raise SettingsError("GAME_STEPS must be step keys separated by commas, such as 3 or 2,4")
         tls, warm_server = _switch(env, variables.TLS, True), _switch(env, variables.WARM_SERVER, False)
-        if tls:
+        if tls and not env.get(variables.CERTIFICATE):
             _required(env, variables.SSL_FULLCHAIN)
             _required(env, variables.SSL_PRIVKEY)
         port = _number(env, variables.PORT, 5000)

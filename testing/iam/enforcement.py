@@ -56,10 +56,11 @@ class ApiCall:
 NEXT, START, TASK, STOP = "next_step", "start_server", "task_changed", "stop_server"
 SEND_START, SEND_STOP = "send_start_server_message", "send_stop_server_message"
 REGISTER, SWEEP, RENEW, SIGN = "update_project_master_list", "sweep", "renew_certificate", "sign_requests"
+CERTIFY = "certify_server"
 
 WHO_MAY: dict[str, set[str]] = {
     # Without s3:ListBucket, S3 gives the same answer for a missing document as for a forbidden one.
-    "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN},
+    "s3:ListBucket": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP, RENEW, SIGN, CERTIFY},
     # Most functions look up whether a project is live, and its game steps. stop_server stops a participant's servers of
     # all projects if the message names no project.
     "s3:GetObject project_master_list.json": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, REGISTER, SWEEP},
@@ -81,7 +82,7 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject answers": {NEXT, SIGN},
     "s3:GetObject trials": {SIGN},
     "s3:PutObject trials": {SIGN},
-    "s3:GetObject SSL": {SIGN, RENEW},
+    "s3:GetObject SSL": {SIGN, RENEW, CERTIFY, START},
     "s3:GetObject handovers": {SIGN},
     # Sessions: a lobby's entries and its decisions, and the documents of sessions and of their members, which are written
     # once. start_server and stop_server note whether a participant is under way; the sweep finishes decisions that were
@@ -107,10 +108,10 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:DeleteObject lobby/groups": {SWEEP},
     # Tickets, tokens and credentials are derived from the secret. It is made with the first project, or with the first
     # server after an upgrade.
-    "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN},
+    "s3:GetObject _secret.json": {NEXT, START, SEND_START, SEND_STOP, REGISTER, SIGN, CERTIFY},
     "s3:PutObject _secret.json": {START, REGISTER},
     # Functions that show, name, stop or remove servers read the record first; the relays compare the server's token.
-    "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN},
+    "s3:GetObject _servers": {NEXT, START, TASK, STOP, SEND_START, SEND_STOP, SWEEP, SIGN, CERTIFY},
     "s3:PutObject _servers": {START, TASK, STOP, SWEEP},
     # Slots of projects with limits. next_step takes a slot for a new participant, and registering counts the
     # participants who came before the limit; a function that starts a server takes a slot, and one that ends a server
@@ -130,7 +131,7 @@ WHO_MAY: dict[str, set[str]] = {
     # servers by messages, and sends the messages of servers that make no progress again.
     "sns:Publish start": {NEXT, START, TASK, STOP, SEND_START, SWEEP, REGISTER},
     "sns:Publish stop": {NEXT, START, SEND_STOP, SWEEP},
-    "sqs:SendMessage tasks": {TASK, SWEEP},
+    "sqs:SendMessage tasks": {TASK, SWEEP, CERTIFY},
     # The shutdown timer, and the stop relay's delay.
     "scheduler:CreateSchedule": {START, SEND_STOP},
     "scheduler:UpdateSchedule": {START, SEND_STOP},
@@ -212,7 +213,7 @@ class IamEnforcement:
         """Run handlers with the roles of their functions within the block."""
         with contextlib.ExitStack() as stack:
             for name in self._judge.functions:
-                if name != RENEW:  # needs a certificate authority; its calls are judged in test_enforcement.py
+                if name not in (RENEW, CERTIFY):  # need an authority; their calls are judged in test_enforcement.py
                     module = importlib.import_module(f"hippodrome.functions.{name}")
                     stack.enter_context(mock.patch.object(module, "handler", self._as_function(name, module.handler)))
             yield

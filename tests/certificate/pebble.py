@@ -43,6 +43,7 @@ class Pebble:
     dns: str
     dns_port: int
     dns_management: str
+    http_port: int
     log: Path
 
     def root(self) -> str:
@@ -141,13 +142,13 @@ class DidNotStart(Exception):
 @contextlib.contextmanager
 def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
     trusted, certificate, key = make_ca(folder)
-    dns, dns_management, acme, management, unused = _ports(5)
+    dns, dns_management, acme, management, http_port, unused = _ports(6)
     config = {
         "listenAddress": f"127.0.0.1:{acme}",
         "managementListenAddress": f"127.0.0.1:{management}",
         "certificate": str(certificate),
         "privateKey": str(key),
-        "httpPort": unused,
+        "httpPort": http_port,
         "tlsPort": unused,
         "ocspResponderURL": "",
         "externalAccountBindingRequired": False,
@@ -178,6 +179,7 @@ def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
             dns="127.0.0.1",
             dns_port=dns,
             dns_management=f"http://127.0.0.1:{dns_management}",
+            http_port=http_port,
             log=log,
         )
         for port in (dns, dns_management, acme, management):  # its name server also listens on TCP

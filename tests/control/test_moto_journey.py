@@ -60,7 +60,7 @@ def test_a_participant_plays_from_the_link_to_the_end_and_nothing_is_left(study:
     assert (ready["state"], ready["url"]) == ("ready", f"wss://{name}.servers.example.org:5000/")
     environment = {e["name"]: e["value"] for e in world.task(task).overrides["containerOverrides"][0]["environment"]}
     assert ready["token"] == environment["TOKEN"]
-    assert environment["STORE"] == "https://study.example.org/sign"
+    assert environment["STORE"] == "https://hippodrome-Api.execute-api.us-east-1.amazonaws.com/sign"
 
     alice.play(score=420)
     assert alice.at == AFTER

@@ -153,7 +153,7 @@ def _extremes(template: Mapping[str, Any], limit: str) -> dict[str, str]:
 
 
 def installations(of: Mapping[str, Any] | None = None) -> Iterator[Installation]:
-    """Every choice of the conditions, with the longest names and the largest numbers; then other names, at last all small."""
+    """Every choice of the conditions, with the longest names and the largest numbers; then other names, all small, and no domain."""
     template = of or cfn.template()
     plain = {
         "HostedZoneId": f"Z{'0' * 31}",
@@ -172,3 +172,4 @@ def installations(of: Mapping[str, Any] | None = None) -> Iterator[Installation]
     for names in others:
         yield Installation(template, account(STACK, plain | names, template))
     yield Installation(template, account("s", least | others[-1], template))
+    yield Installation(template, account(STACK, plain | {"RootDomain": "", "HostedZoneId": ""}, template))

@@ -35,7 +35,7 @@ from hippodrome.protocol.keys import groups_key, waiting_key
 from testing import aws_events
 from testing import template as cfn
 from testing.iam.actions import Ask, asks, normalized
-from testing.iam.enforcement import RENEW, SIGN, WHO_MAY, ApiCall, IamEnforcement
+from testing.iam.enforcement import CERTIFY, RENEW, SIGN, WHO_MAY, ApiCall, IamEnforcement
 from testing.iam.judge import MISSING, Judge, evaluator
 from testing.moto_study import GAME, PAIRS, PROJECT, MotoMember, Person, StudyOnMoto, come, meet
 from testing.moto_world import MotoWorld
@@ -510,8 +510,8 @@ def test_the_certificates_challenge_is_one_functions_and_all_that_it_may(judge: 
     own = [f"servers.example.org/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")]
     for file in (*own, "fullchain.pem", "privkey.pem", "account.json", "certificate.json"):
         for action in ("s3:GetObject", "s3:PutObject"):
-            reads = action == "s3:GetObject" and file in own[:2]
-            assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == ({RENEW, SIGN} if reads else {RENEW})
+            reads = {own[0]: {SIGN}, own[1]: {SIGN}, "account.json": {CERTIFY}} if action == "s3:GetObject" else {}
+            assert judge.who_may(Ask(action, f"{BUCKET}/SSL/{file}")) == {RENEW, *reads.get(file, ())}
     assert judge.who_may(Ask("route53:GetChange", "arn:aws:route53:::change/C1")) == {RENEW, "task_changed"}
 
 
@@ -605,6 +605,29 @@ PUSHING = ("InitiateLayerUpload", "UploadLayerPart", "CompleteLayerUpload", "Put
 @pytest.mark.parametrize(
     ("who", "allowed", "refused"),
     [
+        (
+            "certify_server",
+            [
+                ("s3:GetObject", f"{BUCKET}/_secret.json", {}),
+                ("s3:GetObject", f"{BUCKET}/_servers/s.json", {}),
+                *(
+                    (action, f"{BUCKET}/SSL/{name}.json", condition)
+                    for name in ("account", "addresses")
+                    for action, condition in (
+                        ("s3:GetObject", {}),
+                        ("s3:PutObject", {"s3:if-none-match": "*"}),
+                        ("s3:PutObject", {"s3:if-match": '"e"'}),
+                    )
+                ),
+            ],
+            [
+                ("s3:PutObject", f"{BUCKET}/SSL/account.json", {}),
+                ("s3:GetObject", f"{BUCKET}/SSL/servers.example.org/privkey.pem", {}),
+                ("s3:PutObject", f"{BUCKET}/_servers/s.json", {"s3:if-match": '"e"'}),
+                ("s3:GetObject", f"{BUCKET}/project_master_list.json", {}),
+                ("s3:GetObject", f"{BUCKET}/p/users/u/participant.json", {}),
+            ],
+        ),
         (
             "sign_requests",
             [

@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SHARED = {"__init__"}
 AWS_ONLY = {  # and why `make run` has none
     "sign_requests": "servers of one machine write into the data folder",
+    "certify_server": "browsers connect to 127.0.0.1 without TLS",
     "renew_certificate": "browsers connect to 127.0.0.1 without TLS",
     "update_project_master_list": "`hippodrome/local/publish.py` registers the study itself",
 }
@@ -36,9 +37,11 @@ def rows(page: str) -> set[str]:
 
 def calls(role: str) -> set[str]:
     """Return the actions that a role allows, but for writing its own log."""
-    policies = cfn.resources("AWS::IAM::Role")[role].get("Policies", [])
     statements = [
-        one for policy in policies for one in policy["PolicyDocument"]["Statement"] if one["Effect"] == "Allow"
+        one
+        for document in cfn.ReferenceValues().resolve(cfn.role_documents(role))
+        for one in document["Statement"]
+        if one["Effect"] == "Allow"
     ]
     named = [one["Action"] for one in statements]
     actions = {action for one in named for action in ([one] if isinstance(one, str) else one)}

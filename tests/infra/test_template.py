@@ -222,26 +222,27 @@ def test_the_api_has_the_routes_of_the_local_server_and_one_for_servers() -> Non
         assert target
         found.add((route["RouteKey"], integrations[target[1]]))
     local = {(f"{method} {route.path}", route.function) for route in ROUTES for method in route.methods}
-    assert found == local | {("POST /sign", "sign_requests")}
+    assert found == local | {("POST /sign", "sign_requests"), ("POST /certificate", "certify_server")}
 
 
-def test_servers_ask_for_requests_at_a_route_of_the_site() -> None:
+@pytest.mark.parametrize(("variable", "function"), [("SIGN_URL", "SignRequests"), ("CERTIFICATE_URL", "CertifyServer")])
+def test_servers_ask_at_the_apis_own_address_which_no_domain_changes(variable: str, function: str) -> None:
     account = cfn.ReferenceValues()
-    told = account.resolve(cfn.template()["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"])[
-        "SIGN_URL"
-    ]
-    site, _, path = told.removeprefix("https://").partition("/")
-    (domain,) = cfn.resources("AWS::ApiGatewayV2::DomainName").values()
-    assert told.startswith("https://")
-    assert site == account.resolve(domain["DomainName"])
+    start = cfn.template()["Resources"]["StartServer"]["Properties"]["Environment"]["Variables"]
+    host, _, path = account.resolve(start)[variable].removeprefix("https://").partition("/")
+    assert host == f"{account.ref('Api')}.execute-api.us-east-1.amazonaws.com"
     routes = {r["RouteKey"]: r["Target"] for r in cfn.resources("AWS::ApiGatewayV2::Route").values()}
-    assert "SignRequests" in str(routes[f"POST /{path}"])
+    assert function in str(routes[f"POST /{path}"])
 
 
-def test_the_site_has_no_second_address() -> None:
-    """A link works under one name: pages of the API's own address would be another origin, without the site's name."""
-    (api,) = cfn.resources("AWS::ApiGatewayV2::Api").values()
-    assert api["DisableExecuteApiEndpoint"] is True
+def test_without_a_domain_the_site_is_the_apis_own_address_and_nothing_needs_a_zone() -> None:
+    account = cfn.ReferenceValues(parameters={})
+    assert account.resolve(cfn.template()["Outputs"]["Site"]["Value"]) == (
+        f"https://{account.ref('Api')}.execute-api.us-east-1.amazonaws.com"
+    )
+    there = {name: one for name, one in cfn.template()["Resources"].items() if one.get("Condition") != "HasDomain"}
+    assert "route53" not in str(account.resolve([one.get("Properties", {}).get("Policies") for one in there.values()]))
+    assert not [name for name, one in there.items() if one["Type"].startswith(("AWS::Route53", "AWS::Certificate"))]
 
 
 def test_access_logs_hold_no_path_no_query_and_no_address() -> None:
@@ -277,8 +278,9 @@ def test_data_are_private_encrypted_versioned_and_outlive_the_stack() -> None:
 
 def test_servers_are_reached_at_the_games_port_only() -> None:
     (group,) = cfn.resources("AWS::EC2::SecurityGroup").values()
-    opened = [(rule["FromPort"], rule["ToPort"]) for rule in group["SecurityGroupIngress"]]
-    assert opened == [(port, port) for port in PORTS]
+    for parameters, ports in ((cfn.DOMAIN, PORTS), ({}, (*PORTS, 80))):  # 80: the authority asks there
+        rules = cfn.ReferenceValues(parameters=parameters).resolve(group["SecurityGroupIngress"])
+        assert [(rule["FromPort"], rule["ToPort"]) for rule in rules] == [(port, port) for port in ports]
     parameter = cfn.template()["Parameters"]["ServerPort"]
     assert (parameter["Default"], parameter["AllowedValues"]) == (443, [*PORTS])
 

@@ -21,11 +21,11 @@ from hippodrome.control.ports import Settings
 if TYPE_CHECKING:
     from hippodrome.control.aws.bus import SnsBus
     from hippodrome.control.aws.challenges import Route53Challenges
-    from hippodrome.control.aws.dns import Route53Dns
     from hippodrome.control.aws.documents import S3Documents
     from hippodrome.control.aws.signer import S3Signer
     from hippodrome.control.aws.tasks import EcsTasks
     from hippodrome.control.aws.timers import SchedulerTimers
+    from hippodrome.control.ports import Dns
 
 CONNECT_TIMEOUT = 2  # seconds
 READ_TIMEOUT = 5  # seconds; ECS and EC2 get twice as long
@@ -93,11 +93,15 @@ class AwsPlatform:
         return EcsTasks(lambda: self._client("ecs"), lambda: self._client("ec2"), partial(self._need, "tasks"))
 
     @cached_property
-    def dns(self) -> Route53Dns:
-        """The DNS records on Route 53.
+    def dns(self) -> Dns:
+        """The DNS records on Route 53. To list them, the variable `ROOT_DOMAIN` must be set, too.
 
-        The variable `HOSTED_ZONE_ID` must be set to change or list records; to list them, `ROOT_DOMAIN`, too.
+        Without the variable `HOSTED_ZONE_ID` servers have no names, and there are no records.
         """
+        if not self._env.get("HOSTED_ZONE_ID", "").strip():
+            from hippodrome.control.aws.no_dns import NoDns
+
+            return NoDns()
         from hippodrome.control.aws.dns import Route53Dns
 
         host = self.settings.servers_host

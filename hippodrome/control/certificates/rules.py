@@ -8,7 +8,8 @@ is stored under `SSL/<the servers' domain>/`, so that every server reads a certi
 * `fullchain.pem`: a copy of the chain, where HIPPO's `ssl` section and other readers expect it.
 * `certificate.json`: a `CertificateRecord`, which says what was ordered and when.
 
-`SSL/account.json` has the keys of our accounts, one for each ACME directory.
+`SSL/account.json` has the keys of our accounts, one for each ACME directory. Without a domain each server has a
+certificate for its own address (`addresses.py`), and `SSL/addresses.json` counts their orders.
 
 If `privkey.pem` lacks that first line, the administrator has put it there, and no order replaces it.
 
@@ -36,6 +37,7 @@ import msgspec
 from hippodrome.control.model.records import Record
 
 ACCOUNT = "SSL/account.json"
+ADDRESS_ORDERS = "SSL/addresses.json"
 
 PRODUCTION = "https://acme-v02.api.letsencrypt.org/directory"
 STAGING = "https://acme-staging-v02.api.letsencrypt.org/directory"
@@ -47,6 +49,9 @@ CLAIM = timedelta(minutes=15)  # how long a claim counts: no order takes longer 
 BACKOFF = (timedelta(minutes=1), timedelta(minutes=10), timedelta(minutes=100), timedelta(hours=20))
 HOUR = timedelta(hours=1)
 MAX_VALIDATIONS_PER_HOUR = 4  # one less than Let's Encrypt allows
+ORDERS_WINDOW = timedelta(hours=3)
+MAX_ORDERS = 300  # for addresses, in that time (Let's Encrypt's "New Orders per Account")
+MAX_ORDERS_AT_START = 250  # no server is started after so many: those under way still order, some of them twice
 MAX_FAILURES = 10  # failed orders that are stored
 MAX_TEXT = 1000  # characters of a CA's message that are stored
 
@@ -127,6 +132,28 @@ class CertificateRecord(Record, frozen=True):
     claim: str = ""  # the token of the run that is ordering now
     claimed: UtcDatetime | None = None
     challenges: tuple[str, ...] = ()  # values that the TXT record may still have
+
+
+class AddressOrders(Record, frozen=True):
+    """`SSL/addresses.json`: when certificates for servers' addresses were ordered lately, oldest first.
+
+    `until`: the CA takes no order before this time.
+    """
+
+    placed: tuple[UtcDatetime, ...] = ()
+    until: UtcDatetime | None = None
+
+    def count(self, now: datetime) -> int:
+        """Return how many orders count against the CA's limit now."""
+        return sum(now - at < ORDERS_WINDOW for at in self.placed)
+
+    def allows(self, now: datetime, most: int) -> bool:
+        """Return whether another order may be placed, if `most` may count."""
+        return self.count(now) < most and (self.until is None or now >= self.until)
+
+    def with_order(self, now: datetime) -> AddressOrders:
+        """Return the record with one more order; orders that do not count any more leave it."""
+        return AddressOrders((*(at for at in self.placed if now - at < ORDERS_WINDOW), now), self.until)
 
 
 @dataclass(frozen=True)

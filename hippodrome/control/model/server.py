@@ -56,7 +56,7 @@ class Reason(StrEnum):
     ASSIGNED = "assigned"  # a warm server whose resources a participant's record owns now
 
 
-CANNOT_START = ("cannot begin", "ended at once", "never ready", "no port")
+CANNOT_START = ("cannot begin", "ended at once", "never ready", "no port", "no certificate")
 """The causes (`servers.causes.Cause`) of a server on which the game cannot even begin. After two such servers, no
 further one is started without a request: it would fail in the same way."""
 FAILED = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY)  # the reasons that leave no hope for the game
@@ -96,7 +96,7 @@ class Server(Record, frozen=True):
     requested: datetime
     deadline: datetime
     cluster: str
-    dns: str = ""  # its full DNS name
+    dns: str = ""  # its full DNS name; "": browsers connect to its address, for which it has a certificate of its own
     spot: bool = True
     task: str | None = None  # the task's id, once the task runs
     host: str | None = None  # the address in its DNS record, exactly as in the zone
@@ -166,8 +166,8 @@ class Server(Record, frozen=True):
 
     @property
     def dns_record(self) -> DnsRecord | None:
-        """The DNS record that it owns, with exactly the stored values; None if it has no address."""
-        return DnsRecord(self.dns, self.host) if self.host else None
+        """The DNS record that it owns, with exactly the stored values; None if it has no address or no name."""
+        return DnsRecord(self.dns, self.host) if self.dns and self.host else None
 
     @property
     def has_default_name(self) -> bool:
@@ -238,7 +238,7 @@ def new_attempt(
         requested=now,
         deadline=warm_pool.deadline(project, settings, label, now) if is_warm_server else played,
         cluster=name if project.cluster == "participant" else settings.cluster,
-        dns=f"{first}.{settings.servers_domain}",
+        dns=f"{first}.{settings.servers_domain}" if settings.servers_domain else "",
         port=project.server_port,
         spot=attempt <= SPOT_ATTEMPTS,
         cpu=project.size.cpu,
@@ -352,7 +352,7 @@ def with_default_name(server: Server) -> Server:
 
 
 def ready(server: Server, now: datetime) -> Server:
-    """Return the record of a server whose DNS record is INSYNC, so that the participant may connect."""
+    """Return the record of a server to which browsers may connect: its name is INSYNC, or its certificate is issued."""
     return msgspec.structs.replace(server, state=ServerState.READY, ready=now)
 
 

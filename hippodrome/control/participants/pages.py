@@ -128,6 +128,8 @@ def game_page(view: GameView) -> Page:
         "project": view.project.id,
         "step": view.step.key,
     }
+    if "*" not in view.sources:  # the policy lets the page reach this one server: for another, it is loaded again
+        data["server"] = view.sources
     if said := texts.of_server():
         data["said"] = said
     over_title, over_text = _over_texts(view.state, texts) if over else ("", "")

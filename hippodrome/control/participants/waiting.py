@@ -63,9 +63,9 @@ class ServerStates:
                 state.update(_closed(record))
             elif step is not None and step.type.on_server and record.lacks(step.key):
                 state["state"] = ServerState.QUEUED  # `GameStep` has this server stopped, and another will start
-            elif record.state is ServerState.READY and record.dns_record:
+            elif record.state is ServerState.READY and record.host:
                 self._remember(record)
-                host = dns.browser_host(record.dns_record)
+                host = dns.browser_host(record.dns_record) if record.dns_record else record.host
                 state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0

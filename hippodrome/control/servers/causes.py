@@ -42,6 +42,7 @@ class Cause(StrEnum):
     ENDED_AT_ONCE = "ended at once"
     NEVER_READY = "never ready"
     NO_PORT = "no port"
+    NO_CERTIFICATE = "no certificate"
     CRASHED = "crashed"
     OUT_OF_MEMORY = "out of memory"
     KILLED = "killed"
@@ -105,6 +106,12 @@ _EXPLANATIONS = {
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
         "`hippodrome apply --port 5000`, and register once more.",
+    ),
+    Cause.NO_CERTIFICATE: _Explanation(
+        FailureCategory.REFUSED,
+        "The server got no certificate for its address from Let's Encrypt, in three tries.",
+        "`hippodrome doctor --all` says how many orders are left; letsencrypt.status.io says whether it works. "
+        "With a domain (`hippodrome apply --domain`) servers need no certificates of their own.",
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
@@ -185,6 +192,12 @@ _TASK_PATTERNS = (  # the first match counts
     (Cause.CAPACITY, re.compile(r"capacity is unavailable|insufficient capacity|RESOURCE:", re.IGNORECASE)),
     (Cause.CANNOT_BEGIN, re.compile(r"CannotStartContainer|CannotCreateContainer", re.IGNORECASE)),
 )
+_BY_EXIT_CODE = {
+    _KILLED: Cause.OUT_OF_MEMORY,  # Fargate does not always name OutOfMemoryError
+    exits.LATE_AGENT: Cause.NEVER_READY,
+    exits.NO_PORT: Cause.NO_PORT,
+    exits.NO_CERTIFICATE: Cause.NO_CERTIFICATE,
+}
 _REFUSAL_PATTERNS = (
     (Cause.QUOTA, re.compile(r"reached the limit|quota", re.IGNORECASE)),
     (Cause.PERMISSION, re.compile(r"AccessDenied|not authorized|PassRole|Blocked", re.IGNORECASE)),
@@ -203,12 +216,8 @@ def cause_of_task(stopped: TaskStopped, *, was_ready: bool) -> Cause:
         return Cause.MACHINE
     if stopped.exit_code is None:
         return Cause.UNKNOWN
-    if stopped.exit_code == _KILLED:  # Fargate does not always name OutOfMemoryError
-        return Cause.OUT_OF_MEMORY
-    if stopped.exit_code == exits.LATE_AGENT:
-        return Cause.NEVER_READY
-    if stopped.exit_code == exits.NO_PORT:
-        return Cause.NO_PORT
+    if cause := _BY_EXIT_CODE.get(stopped.exit_code):
+        return cause
     return Cause.CRASHED if was_ready and stopped.exit_code != exits.NO_AGENT else Cause.ENDED_AT_ONCE
 
 

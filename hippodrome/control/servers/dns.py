@@ -97,6 +97,7 @@ class DnsRecords:
         again only after its visibility timeout, and not at all after some receives.
         """
         unregistered: list[Server] = []
+        servers = [record for record in servers if record.dns]  # the others wait for a certificate (`certifying.py`)
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
             named = [_attempt_of(record) for record in batch]
             try:

@@ -56,6 +56,8 @@ def _starting(record: Server, task: RunningTask | None, now: datetime) -> Remedy
 def _naming(record: Server, task: RunningTask | None, now: datetime) -> Remedy | None:
     if task is None:
         return _without_task(record, now)
+    if not record.dns:  # its certificate; the server gives up by itself if the authority refuses
+        return Remedy.LOST if now > (record.running or record.requested) + LOST_AFTER else None
     return Remedy.DNS if now > (record.running or record.requested) + RETRY_AFTER else None
 
 

@@ -35,6 +35,7 @@ from hippodrome.control.model import ids, server
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.ports import Documents, Settings
+from hippodrome.control.servers.credentials import record_of, refused
 from hippodrome.control.servers.sessions import members_of
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
@@ -245,12 +246,6 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
     return None
 
 
-def credential_nonce(record: Server, attempt: int) -> str | None:
-    """Return the nonce that the credential of this attempt is derived from; None if the record has none."""
-    runs = (server.past_attempt(record), *record.earlier)
-    return next((run.nonce for run in runs if run.attempt == attempt and run.nonce), None)
-
-
 class Signing:
     """Answers the requests of servers. Each running function has one `Signing`."""
 
@@ -276,26 +271,18 @@ class Signing:
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
         """The access of the server with this credential. Raises the same `Refusal` for any mistake."""
-        refused = Refusal(403, "That is not the credential of a server that may store anything now.")
-        label, attempt = ids.parse_server_name(asked.server) or ("", 0)
-        secret = self._secrets.find() if label else None
-        stored = self._repository.server(label) if secret else None
-        nonce = credential_nonce(stored.server, attempt) if stored else None
-        if secret is None or stored is None or nonce is None:
-            raise refused
-        if not ids.secrets_equal(asked.credential, secret.credential(asked.server, nonce)):
-            raise refused
-        found = self._access(stored.server, asked.server)
+        record = record_of(asked.server, asked.credential, self._repository, self._secrets)
+        found = self._access(record, asked.server)
         if found is not None and found.is_of_session:
             found = replace(found, members=members_of(self._repository, found.project_id, found.user_id))
         if found is None or not found.is_open(self._platform.now()):
             logger.info("a server that has ended asked for requests", extra={"server": asked.server})
-            raise refused
+            raise refused()
         return found
 
     def _access(self, record: Server, name: str) -> ServerAccess | None:
         keys = location(record.domain)
-        certificate = (keys.fullchain, keys.privkey)
+        certificate = (keys.fullchain, keys.privkey) if record.dns else ()
         if not record.is_warm_server:
             return access_of(record, name, certificate)
         if record.assigned_to is not None:

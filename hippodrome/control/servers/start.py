@@ -11,7 +11,7 @@ import secrets
 from dataclasses import replace
 from datetime import timedelta
 
-from hippodrome.control.certificates.rules import location
+from hippodrome.control.certificates.rules import ADDRESS_ORDERS, MAX_ORDERS_AT_START, AddressOrders, location
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.matching import MATCH
@@ -24,6 +24,7 @@ from hippodrome.control.servers import causes
 from hippodrome.control.servers.replacement import Replacement
 from hippodrome.control.servers.services import ServerServices
 from hippodrome.control.servers.termination import Termination
+from hippodrome.control.storage.compare_and_swap import SharedDocuments
 from hippodrome.control.storage.project_cache import FRESH
 from hippodrome.control.storage.repository import Versioned
 from hippodrome.control.storage.secret import Secret
@@ -68,7 +69,7 @@ class Start:
         if stored is None:
             return
         record = stored.server
-        if not self._services.slots.acquire(project, record):
+        if not self._may_get_certificate(record) or not self._services.slots.acquire(project, record):
             self._close_as_full(stored)
             return
         own = self._assign_warm_server(project, stored)
@@ -152,6 +153,16 @@ class Start:
         unfinished = stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING
         return stored if unfinished else None
 
+    def _may_get_certificate(self, record: Server) -> bool:
+        """Whether the authority still takes orders for addresses, so that this server will not be started in vain."""
+        if record.dns:
+            return True
+        orders = SharedDocuments(self._platform.documents).read(ADDRESS_ORDERS, AddressOrders)
+        allowed = orders.allows(self._platform.now(), MAX_ORDERS_AT_START)
+        if not allowed:
+            logger.error("the limit of certificates is reached: no server can start", extra={"server": record.name})
+        return allowed
+
     def _close_as_full(self, stored: Versioned) -> None:
         """Close the record with the reason `full`, which the waiting page shows, because the limits are reached."""
         record, now = stored.server, self._platform.now()
@@ -197,7 +208,6 @@ class Start:
 
 def _environment(project: Project, record: Server, settings: Settings, secret: Secret) -> dict[str, str]:
     """The environment variables of a trial server (`hippodrome/protocol/environment.py`)."""
-    certificate = location(record.domain)
     return {
         **_owner_environment(project, record, settings),
         **({environment.MATCHING: MATCH} if project.asks_match else {}),
@@ -209,9 +219,16 @@ def _environment(project: Project, record: Server, settings: Settings, secret: S
         environment.CREDENTIAL: secret.credential(record.name, record.nonce),
         environment.GAME_STEPS: ",".join(project.game_steps),
         environment.TRIAL: json.dumps(project.trial, separators=(",", ":")),
-        environment.SSL_FULLCHAIN: certificate.fullchain,
-        environment.SSL_PRIVKEY: certificate.privkey,
+        **_certificate_environment(record, settings),
     }
+
+
+def _certificate_environment(record: Server, settings: Settings) -> dict[str, str]:
+    """The variables that say where the server gets its certificate."""
+    if not record.dns:
+        return {environment.CERTIFICATE: settings.certificate_url}
+    certificate = location(record.domain)
+    return {environment.SSL_FULLCHAIN: certificate.fullchain, environment.SSL_PRIVKEY: certificate.privkey}
 
 
 def _owner_environment(project: Project, record: Server, settings: Settings) -> dict[str, str]:

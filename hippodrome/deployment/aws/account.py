@@ -120,6 +120,10 @@ def _of_aws_login(profile: str) -> Problem:
     )
 
 
+_OF_DOMAIN = ("HostedZoneId", "RootDomain", "ServersHost")
+"""The outputs that a stack without a domain lacks."""
+
+
 @dataclass(frozen=True)
 class Installation:
     """An existing stack of Hippodrome: its name, and its outputs under their names in `infra/template.yml`."""
@@ -137,7 +141,9 @@ class Installation:
         return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
 
     def __getitem__(self, output: str) -> str:
-        """Return an output of the stack. Raises `Problem` if the stack has no output of that name."""
+        """Return an output of the stack; "" for one of a domain that it lacks. Raises `Problem` for any other."""
+        if output in _OF_DOMAIN:
+            return self.outputs.get(output, "")
         try:
             return self.outputs[output]
         except KeyError:
@@ -147,8 +153,13 @@ class Installation:
             ) from None
 
     @property
+    def has_domain(self) -> bool:
+        """Whether the site and servers have names; else servers have certificates for their addresses."""
+        return bool(self["RootDomain"])
+
+    @property
     def servers_domain(self) -> str:
-        """The domain directly above servers' names."""
+        """The domain directly above servers' names; "" if they have none."""
         return Settings(
             root_domain=self["RootDomain"].strip(".").lower(), servers_host=self["ServersHost"]
         ).servers_domain
@@ -219,12 +230,13 @@ def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def site_host(parameters: Mapping[str, str]) -> str:
-    """Return the host name of the site of an installation with these parameters."""
-    return f"{parameters.get('SiteHost', '')}.{parameters.get('RootDomain', '')}"
+    """Return the host name of the site of an installation with these parameters; "" if it has no domain."""
+    root = parameters.get("RootDomain", "")
+    return f"{parameters.get('SiteHost', '')}.{root}" if root else ""
 
 
 def servers_domain(parameters: Mapping[str, str]) -> str:
-    """Return the domain directly above servers' names in an installation with these parameters."""
+    """Return the domain directly above servers' names for these parameters; "" if servers have no names."""
     settings = Settings(root_domain=parameters["RootDomain"], servers_host=parameters.get("ServersHost", ""))
     return settings.servers_domain
 
@@ -259,7 +271,7 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
         raise Problem(
             f"There is no stack named {stack} in {account.region}.",
             elsewhere(account, stack)
-            or "Make it with `hippodrome deploy --domain …`; or name another region (AWS_REGION, --region) or "
+            or "Make it with `hippodrome deploy`; or name another region (AWS_REGION, --region) or "
             "installation (--stack).",
         )
     status = found["StackStatus"]

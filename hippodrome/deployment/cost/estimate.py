@@ -201,12 +201,16 @@ def _page_requests(study: StudyToEstimate) -> Range:
     return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
 
 
+SWEEP_REQUESTS = (3, 4)
+"""The listings and reads of a sweep of an installation without servers."""
+
+
 @dataclass(frozen=True)
 class FixedResources:
     """The resources of an installation that cost something without participants, as counted in `infra/template.yml`."""
 
     queues: int = 3  # queues with a function behind them
-    alarms: int = 24
+    alarms: int = 25
     dashboards: int = 1
     metrics: int = 6
     sweeps: int = 12 * HOURS  # every five minutes
@@ -232,7 +236,7 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
     free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
     least = max(0.0, polls - free["sqs"])
     return [
-        CostLine("Hosted zone", "1", Usd.exactly(prices.zone_month.usd)),
+        CostLine("Hosted zone, with a domain", "1", Usd(0, prices.zone_month.usd, prices.zone_month.usd)),
         _fixed("Alarms", fixed.alarms, prices.alarm_month.usd, free["alarm"]),
         _fixed("Metrics", fixed.metrics, prices.metric_month.usd, free["metric"]),
         _fixed("Dashboard", fixed.dashboards, prices.dashboard_month.usd, free["dashboard"]),
@@ -242,6 +246,13 @@ def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
             Usd(least, least, polls) * prices.sqs_request.usd,
         ),
         CostLine("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
+        CostLine(
+            "Sweeps (S3)",
+            f"{fixed.sweeps * sum(SWEEP_REQUESTS):,} requests",
+            Usd.exactly(
+                fixed.sweeps * (SWEEP_REQUESTS[0] * prices.s3_write.usd + SWEEP_REQUESTS[1] * prices.s3_read.usd)
+            ),
+        ),
         CostLine("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ecr_gb_month.usd),
         CostLine("NAT gateway, load balancer, database", "none", Usd()),
     ]

@@ -99,7 +99,8 @@ def command(
 ) -> int:
     """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
 
-    The first time it needs --domain, a domain with a hosted zone in Route 53. For researchers, who may not change the
+    Without --domain the site has AWS's own address, and each server gets a certificate for its own. A domain (with a
+    hosted zone in Route 53) gives both names, and is better for large studies. For researchers, who may not change the
     installation, it only registers the study.
     """
     found, problem = _study(folder)
@@ -117,7 +118,7 @@ def command(
         outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
             applying.report(outcome, settings, False)
-        if not no_certificate:
+        if not no_certificate and outcome.outputs.get("RootDomain"):
             _certify(account, stack, found)
     else:
         screen.info(f"The installation {stack} stays as it is: these credentials are a researcher's.")

@@ -189,6 +189,8 @@ def lines(plan: Plan) -> Iterator[tuple[str, str]]:
         yield from _each([change for change in plan.changes if change.action == action], action)
     if plan.site:
         yield f"Participants will open https://{plan.site}/next", ""
+    elif plan.kind == "create":
+        yield "Participants will open an address of AWS's: it is shown when it is made.", ""
     for danger in plan.dangers:
         yield f"  ! {danger}", "bold red"
 

@@ -67,8 +67,8 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
     found: list[Finding] = []
     checks: dict[str, Callable[[Prepared], Iterable[Finding]]] = {}
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
-        checks |= _OF_ADDRESSES
-    if domain_change.moves(prepared):
+        checks |= _OF_ADDRESSES if after["RootDomain"] else {"servers": _servers_that_run}
+    if domain_change.moves(prepared) and after["RootDomain"]:
         checks |= {"CAA": _authorities, "proof": _proof, "servers' names": _servers_names}
     if (before.get("VpcId") or "") != after["VpcId"]:
         checks["servers"] = _servers_that_run

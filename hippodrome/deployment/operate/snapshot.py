@@ -220,7 +220,8 @@ class InstallationMonitor:
         look.queues = queues(self._account, self._installation.stack)
 
     def _certificate(self, look: Snapshot) -> None:
-        look.certificate = certificate(self._installation, self._platform.documents, look.at)
+        if self._installation.has_domain:
+            look.certificate = certificate(self._installation, self._platform.documents, look.at)
 
     def _alarms(self, look: Snapshot) -> None:
         look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]

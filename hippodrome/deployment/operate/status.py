@@ -204,7 +204,15 @@ def picture(look: Snapshot, installation: Installation) -> RenderableType:
     ]
     if installation.status not in states.COMPLETE:
         parts.append(Text(f"! The stack is in {installation.status}.", style="yellow"))
-    parts += [Text(""), *_projects(look), Text(""), *_servers(look), *_failures(look), Text(""), *_parts(look)]
+    parts += [
+        Text(""),
+        *_projects(look),
+        Text(""),
+        *_servers(look),
+        *_failures(look),
+        Text(""),
+        *_parts(look, installation.has_domain),
+    ]
     parts += [Text(f"! No {part}: {why}", style="yellow") for part, why in look.problems.items()]
     return Group(*parts)
 
@@ -317,7 +325,7 @@ def _kind(server: Server, members: int | None) -> str:
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 
-def _parts(look: Snapshot) -> list[RenderableType]:
+def _parts(look: Snapshot, has_domain: bool) -> list[RenderableType]:
     """Draw the parts on queues, certificate and alarms."""
     parts: list[RenderableType] = []
     dead = sum(queue.waiting for queue in look.queues if queue.dead)
@@ -339,7 +347,7 @@ def _parts(look: Snapshot) -> list[RenderableType]:
         parts.append(
             Text(text + (" STAGING: browsers refuse it." if certificate.staging else ""), "red" if bad else "")
         )
-    elif "certificate" not in look.problems:
+    elif "certificate" not in look.problems and has_domain:
         parts.append(
             Text(
                 as_typed(

@@ -136,6 +136,9 @@ def command(
     choice = Choice(_directory(production, staging, directory), email.strip(), _bundle(ca_file), force)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
+    if not installation.has_domain:
+        screen.result("This installation has no domain: each server gets a certificate for its own address by itself.")
+        return Exit.DONE
     if not dry_run:
         certificate_transfer.take_over(account, installation)
     report = inspect(account, installation, choice) if dry_run else obtain_visibly(account, installation, choice)

@@ -36,9 +36,10 @@ def check(prepared: Prepared) -> None:
     if not moves(prepared):
         return
     before, after = _before(prepared), servers_domain(prepared.parameters)
-    _must_not_be_delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
-    _must_not_cover_a_site(prepared, after)
-    if before is not None:
+    if after:
+        _must_not_be_delegated(prepared.account, prepared.parameters["HostedZoneId"], after)
+        _must_not_cover_a_site(prepared, after)
+    if before is not None and before.has_domain:  # servers without names keep their addresses
         _refuse(
             _running(prepared.account, before),
             f"Servers run below {before.servers_domain}. No page could reach them, and their names would stay.",
@@ -46,17 +47,17 @@ def check(prepared: Prepared) -> None:
 
 
 def check_site(prepared: Prepared) -> None:
-    """Raise `Problem` if the site's address changes and a server uses the present one.
+    """Raise `Problem` if the site's name changes while a server runs.
 
-    A server asks the site for a presigned request for each document (`hippodrome/control/servers/signing.py`). A domain
-    name of API Gateway can only be replaced, so CloudFormation deletes the old one.
+    A domain name of API Gateway can only be replaced, so CloudFormation deletes the old one, and with it the address of
+    the pages that participants have open. The API's own address stays, with and without a domain.
     """
     before, site = _before(prepared), site_host(prepared.before)
-    if before is None or site == site_host(prepared.parameters):
+    if before is None or not before.has_domain or site == site_host(prepared.parameters):
         return
     _refuse(
         _running(prepared.account, before),
-        f"Servers run that store their answers and recordings by way of {site}, which would be gone.",
+        f"Participants are playing, and their pages are at {site}, which would be gone.",
     )
 
 
@@ -86,7 +87,7 @@ def certify(prepared: Prepared) -> None:
     If the present names have no certificate, nothing is ordered here; `certificate` orders one later.
     """
     before = _before(prepared)
-    if before is None or not moves(prepared):
+    if before is None or not before.has_domain or not moves(prepared) or not prepared.parameters["RootDomain"]:
         return
     changed = {key: prepared.parameters.get(key, "") for key in ("RootDomain", "ServersHost", "HostedZoneId")}
     after = replace(before, outputs={**before.outputs, **changed})

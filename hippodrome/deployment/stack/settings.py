@@ -45,7 +45,11 @@ class StackSettings:
 
     domain: Annotated[
         str | None,
-        Option("--domain", help="The domain below which servers get names; its zone is in Route 53. Needed once."),
+        Option(
+            "--domain",
+            help="The domain below which servers get names; its zone is in Route 53. Without one, the site has AWS's "
+            "address, and servers have certificates for their own addresses; '' goes back to that.",
+        ),
     ] = None
     site: Annotated[
         str | None, Option("--site", help="First part of the address that participants open; `study` if never given.")
@@ -121,7 +125,8 @@ class StackSettings:
         limit = concurrency.unreserved_or_none(account) if concurrency.PARAMETER in defaults else None
         if limit is not None:
             found |= concurrency.parameters(limit)
-        _check_site(site_host(found))
+        if found["RootDomain"]:
+            _check_site(site_host(found))
         if set(availability_zones.PARAMETERS) <= set(defaults):
             found |= _zones(account, found, previous, subnets)
         missing = sorted(set(defaults) - set(found))
@@ -134,12 +139,11 @@ class StackSettings:
 
     def _addresses(self, account: Account, previous: Mapping[str, str]) -> dict[str, str]:
         before = previous.get("RootDomain", "")
-        domain = clean_domain(self.domain) if self.domain else before
+        domain = before if self.domain is None else clean_domain(self.domain) if self.domain.strip() else ""
         if not domain:
-            raise Problem(
-                "Which domain? The first time it has to be told.",
-                "Such as --domain example.org. Its zone has to be in Route 53.",
-            )
+            if self.zone:
+                raise Problem("--zone is the zone of a domain.", "Give --domain too, or leave --zone out.")
+            return {"RootDomain": "", "HostedZoneId": ""}
         if self.zone:
             zone = read_zone(account, self.zone)
             if not zone.holds(domain):

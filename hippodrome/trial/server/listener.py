@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Any
 
@@ -15,8 +16,9 @@ from websockets.protocol import Event
 from websockets.typing import Subprotocol
 
 from hippodrome.trial.recordings.store import Store
-from hippodrome.trial.server.certificate import RELOAD_SECONDS, Certificate
+from hippodrome.trial.server.certificate import RELOAD_SECONDS, Certificate, CertificatePair
 from hippodrome.trial.server.handshake import process_request, select_subprotocol
+from hippodrome.trial.server.own_certificate import CertificateAndKey
 from hippodrome.trial.settings import TrialSettings
 from hippodrome.trial.wire.connection import SUBPROTOCOL
 from hippodrome.trial.wire.inbound import RateLimit
@@ -63,21 +65,31 @@ class Listener:
     """Accepts connections. `handle` is called for each one whose WebSocket handshake is done."""
 
     def __init__(
-        self, settings: TrialSettings, store: Store, handle: Callable[[ServerConnection], Awaitable[None]]
+        self,
+        settings: TrialSettings,
+        store: Store,
+        handle: Callable[[ServerConnection], Awaitable[None]],
+        own: Future[CertificateAndKey] | None = None,
     ) -> None:
+        """`own`: the certificate for the server's address, if it gets one; else it is in the store."""
         self._settings = settings
         self._handle = handle
         self._certificate = Certificate(settings, store) if settings.tls else None
+        self._own = own
         self._server: WebSocketServer
         self._unauthenticated: dict[ServerConnection, None] = {}
 
     async def open(self) -> int:
         """Begin to listen, and return the port.
 
-        Raises PortNotPermitted, OSError, and for the certificate SettingsError, ssl.SSLError and the store's errors.
+        Raises PortNotPermitted, OSError, and for the certificate NoCertificate, SettingsError, ssl.SSLError and the
+        store's errors.
         """
         settings, certificate = self._settings, self._certificate
-        if certificate is not None:
+        if certificate is not None and self._own is not None:
+            own = await asyncio.wrap_future(self._own)
+            certificate.use(CertificatePair(own.chain, own.key, (own.chain, own.key)))
+        elif certificate is not None:
             await asyncio.to_thread(certificate.load)
         try:
             self._server = await self._serve()
@@ -114,9 +126,12 @@ class Listener:
         self._unauthenticated.pop(websocket, None)
 
     async def renew_certificate(self) -> None:
-        """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled. Without TLS, return at once."""
+        """Look for a renewed certificate every `RELOAD_SECONDS`, until cancelled.
+
+        Without TLS, or with a certificate of its own, which lives longer than any server, return at once.
+        """
         certificate = self._certificate
-        if certificate is None:
+        if certificate is None or self._own is not None:
             return
         while True:
             await asyncio.sleep(RELOAD_SECONDS)

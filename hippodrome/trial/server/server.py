@@ -13,6 +13,7 @@ import json
 import logging
 import os
 from collections.abc import AsyncIterator, Coroutine
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,6 +44,7 @@ from hippodrome.trial.server.lifetime import Lifetime, exit_hard_after
 from hippodrome.trial.server.listener import CLOSE_SECONDS, Listener
 from hippodrome.trial.server.loop import TrialLoop
 from hippodrome.trial.server.matching import Matching
+from hippodrome.trial.server.own_certificate import CertificateAndKey
 from hippodrome.trial.server.private_log import IdFilter
 from hippodrome.trial.server.started import StartedAgent
 from hippodrome.trial.settings import TrialSettings, trial_section
@@ -66,8 +68,10 @@ _CANNOT_START = "The game cannot be started at the moment. Please wait: it is tr
 class TrialServer:
     """The server of one participant, or of one session. `run` returns the process's exit status."""
 
-    def __init__(self, settings: TrialSettings) -> None:
+    def __init__(self, settings: TrialSettings, own: Future[CertificateAndKey] | None = None) -> None:
+        """`own`: the certificate for the server's own address, if it gets one (`own_certificate.py`)."""
         self.settings = settings
+        self._own = own
         self._store: Store
         self._spool: Spool
         self._listener: Listener
@@ -98,11 +102,11 @@ class TrialServer:
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
         self._search = Search(self._store, settings)
         self._admission = Admission(lambda: self.settings, self._search, self._store, self._finished_steps)
-        self._listener = Listener(settings, self._store, self._connected)
+        self._listener = Listener(settings, self._store, self._connected, self._own)
+        self._agent_ready = asyncio.create_task(self._start_agent())  # while the certificate is fetched
         port = await self._listener.open()
         print(json.dumps({"port": port}), flush=True)
         log.info("listening on port %d", port)
-        self._agent_ready = asyncio.create_task(self._start_agent())
         if not settings.warm_server:
             self._in_background(self._store_files(await self._leftovers(settings)))
         if not settings.assigned:

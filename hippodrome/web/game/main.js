@@ -9,8 +9,8 @@ import { hooks } from "./hooks.js";
 import { onKeyDown, onKeyUp } from "./keyboard.js";
 import { leave } from "./leave.js";
 import { hideMessage, showMessage, showOverlay } from "./overlay.js";
-import { data, find, setText, showSection } from "./page.js";
-import { loadPage, pause, pollUntilAnswered } from "./requests.js";
+import { data, duration, find, setText, showSection } from "./page.js";
+import { loadPage, pause, pollUntilAnswered, secondsBehind } from "./requests.js";
 import { game } from "./state.js";
 import { showStatus } from "./status.js";
 import { clearDrafts } from "./storage.js";
@@ -30,11 +30,12 @@ async function main() {
   let waitsSince = performance.now();
   for (let polls = 0; ; polls += 1) {
     if (state.state === "ready" && state.url) {
+      if ("server" in data && !state.url.startsWith(data.server || "none")) await loadPage();
       const { why, welcome, result } = await playOn(state);
       losses = welcome ? 0 : losses + 1;
       if (welcome) hint = "";
       else if (why === "failed") hint = TEXT.takesLonger;
-      if (why === "lost") hint ? setText(find("overlay-hint"), hint) : showOverlay("lost");
+      if (why === "lost") hint ? setText(find("overlay-hint"), clockHint() || hint) : showOverlay("lost");
       if (why === "done") return leave(result);
       if (why === "moved") await loadPage();
       if (why === "elsewhere") await playHere();
@@ -93,6 +94,12 @@ function playHere() {
       resolve();
     }, { once: true });
   });
+}
+
+// A browser refuses a certificate that is younger than its clock is late. Names have an old one, addresses a new one.
+function clockHint() {
+  const behind = secondsBehind();
+  return "server" in data && behind >= 60 ? TEXT.clockBehind(duration(behind)) : "";
 }
 
 function checkForHang() {

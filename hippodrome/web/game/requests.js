@@ -31,8 +31,16 @@ export async function pollUntilAnswered() {
   }
 }
 
+let behind = 0; // seconds
+
+// Seconds by which this device's clock was behind the site's when it answered last.
+export function secondsBehind() {
+  return behind;
+}
+
 async function poll() {
   const answer = await request(data.poll, { headers: { Accept: "application/json" } });
+  behind = (Date.parse(answer.headers.get("date")) - Date.now()) / 1000 || 0;
   const state = answer.ok ? await answer.json() : null;
   if (typeof state?.state !== "string") throw new Error("no answer");
   return state;

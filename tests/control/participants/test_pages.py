@@ -548,7 +548,7 @@ def test_pages_are_small(capsys: pytest.CaptureFixture[str]) -> None:
     sizes |= {path.stem: len(gzip.compress(step(path.read_text()).html.encode())) for path in EXAMPLES}
     with capsys.disabled():
         print("\ncompressed pages, bytes:", sizes)
-    assert max(sizes.values()) < 14_000
+    assert max(sizes.values()) < 14_500  # what a server may send before the first acknowledgement: 10 x 1,460 bytes
 
 
 def test_the_page_of_a_game_drawn_by_objects_is_small(capsys: pytest.CaptureFixture[str]) -> None:
@@ -565,7 +565,7 @@ def test_the_page_of_a_game_for_several_participants_is_small_and_no_other_page_
     size = len(gzip.compress(game(project=TOGETHER, **LOBBY).html.encode()))
     with capsys.disabled():
         print("\ncompressed page of a game for several participants, bytes:", size)
-    assert size < 18_000
+    assert size < 18_500
     assert not [part for part in ("lobby", "company", "#people", "sendBeacon") if part in game().html]
 
 

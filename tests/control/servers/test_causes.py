@@ -130,6 +130,7 @@ def test_the_values_of_causes_stay_as_they_are_in_stored_records() -> None:
         "ended at once",
         "never ready",
         "no port",
+        "no certificate",
         "crashed",
         "out of memory",
         "killed",

@@ -57,7 +57,7 @@ def test_running_servers_stop_a_change_of_their_domain(world: Installed, moved: 
 def test_running_servers_stop_a_change_of_the_site(world: Installed, state: ServerState) -> None:
     world.record("alice", state)
     for moved in (prepared(world, SiteHost="lab"), prepared(world, RootDomain="pilot.example.org")):
-        with pytest.raises(Problem, match=r"by way of study\.example\.org, which would be gone") as caught:
+        with pytest.raises(Problem, match=r"their pages are at study\.example\.org, which would be gone") as caught:
             domain_change.check_site(moved)
         assert "hippodrome stop --all" in caught.value.advice
         assert caught.value.details == ("1 of them",)

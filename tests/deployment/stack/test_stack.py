@@ -189,7 +189,8 @@ def test_our_template_can_be_read() -> None:
     assert template.functions == handlers
     assert set(template.function_names().values()) == handlers
     assert template.defaults["SiteHost"] == "study"
-    assert template.defaults["RootDomain"] is None
+    assert template.defaults["RootDomain"] == ""
+    assert template.defaults["CodeBucket"] is None
     bucket = template.body["Resources"]["Bucket"]
     assert bucket["DeletionPolicy"] == "Retain"
 
@@ -450,9 +451,13 @@ def test_parameters_that_the_template_no_longer_has_are_dropped(world: World) ->
     assert "Old" not in decide(world, StackSettings(), world.parameters(Old="1"))
 
 
-def test_a_first_installation_needs_a_domain(world: World) -> None:
-    with pytest.raises(Problem, match="Which domain"):
-        decide(world, StackSettings())
+def test_an_installation_needs_no_domain_and_may_give_it_up(world: World) -> None:
+    without = {"RootDomain": "", "HostedZoneId": ""}
+    assert decide(world, StackSettings()).items() >= without.items()
+    assert decide(world, StackSettings(), world.parameters())["RootDomain"] == "example.org", "it stays"
+    assert decide(world, StackSettings(domain=""), world.parameters()).items() >= without.items()
+    with pytest.raises(Problem, match="--zone is the zone of a domain"):
+        decide(world, StackSettings(zone=world.zone))
 
 
 def test_the_same_domain_keeps_its_zone_without_a_request(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ def test_register_makes_the_task_definition(register_world: RegisterWorld, folde
     assert container["readonlyRootFilesystem"] is True
     assert container["linuxParameters"]["initProcessEnabled"] is True
     assert container["portMappings"][0]["containerPort"] == 443
-    assert container["systemControls"] == [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": "443"}]
+    assert container["systemControls"] == [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": "80"}]
     assert container["user"] == "10001:10001"
     assert container["linuxParameters"]["capabilities"]["drop"] == ["ALL"]
     assert register_world.project().server_port == 443

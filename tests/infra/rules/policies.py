@@ -148,7 +148,7 @@ def _sid(template: Template) -> None:
 
 def _blinded(template: Template) -> None:
     for statement in template["Resources"]["SweepRole"]["Properties"]["Policies"][0]["PolicyDocument"]["Statement"]:
-        if statement["Action"] == "s3:GetObject":
+        if statement.get("Action") == "s3:GetObject":
             statement["Resource"].remove({"Fn::Sub": "${Bucket.Arn}/_lobbies/*"})
 
 

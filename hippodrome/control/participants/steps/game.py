@@ -65,7 +65,7 @@ class GameStep:
             poll=request.url(poll=step.key, **proof),
             page=request.url(),
             ticket=ticket,
-            sources=self._services.platform.settings.game_sources,
+            sources=self._services.platform.settings.game_sources or state.get("url", "").rstrip("/"),
         )
         if request.wants_json:
             return http.as_json(200, {"page": _page_for_program(view, request.method), "css": frame.style(), **state})

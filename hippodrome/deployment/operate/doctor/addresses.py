@@ -11,19 +11,29 @@ from collections.abc import Iterator
 import certifi
 
 from hippodrome.console.problem import Problem
-from hippodrome.control.certificates.rules import names_of
+from hippodrome.control.certificates.rules import (
+    ADDRESS_ORDERS,
+    MAX_ORDERS,
+    MAX_ORDERS_AT_START,
+    AddressOrders,
+    names_of,
+)
+from hippodrome.control.storage.compare_and_swap import SharedDocuments
 from hippodrome.deployment.aws.hosted_zone import read_zone
 from hippodrome.deployment.core.finding import Finding, bad, good, look
 from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 from hippodrome.deployment.stack.stack import Stack
 
+DOMAIN = "With a domain there is no such limit: `hippodrome apply --domain …`."
 PATIENCE = 10  # seconds to wait for the site
 
 
 def zone(context: CheckContext) -> Iterator[Finding]:
     """Check whether the hosted zone exists, is for the domain, and is delegated."""
     domain = context.installation["RootDomain"]
+    if not domain:
+        return
     try:
         found = read_zone(context.account, context.installation["HostedZoneId"])
     except Problem as problem:
@@ -57,7 +67,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
     """Check the site's certificate, which ACM renews by itself if DNS is right."""
     stack = Stack(context.account, context.installation.stack)
     arns = stack.ids_of("AWS::CertificateManager::Certificate")
-    if not arns:
+    if not arns and context.installation.has_domain:
         yield look("site certificate", "The stack has none.", "Bring it up to date with `hippodrome apply`.")
     for arn in arns:
         found = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
@@ -122,8 +132,28 @@ def authorities() -> ssl.SSLContext:
     return context
 
 
+def _address_orders(context: CheckContext) -> Finding:
+    shared = SharedDocuments(context.platform.documents)
+    orders = shared.read(ADDRESS_ORDERS, AddressOrders)
+    placed = f"{orders.count(context.now)} certificates for servers' addresses were ordered in the last three hours"
+    limit = f"{placed}; Let's Encrypt allows {MAX_ORDERS}, and one more every 36 seconds."
+    if orders.until and context.now < orders.until:
+        return bad("certificates", f"Let's Encrypt takes no orders until {orders.until:%d %B %Y, %H:%M} UTC.", DOMAIN)
+    if not orders.allows(context.now, MAX_ORDERS_AT_START):
+        return bad("certificates", f"{limit} No server starts.", DOMAIN)
+    if context.at_once > MAX_ORDERS_AT_START - orders.count(context.now):
+        return look("certificates", limit, DOMAIN)
+    return good("certificates", limit)
+
+
 def certificate(context: CheckContext) -> Iterator[Finding]:
-    """Check whether the servers' wildcard certificate is in place, valid, and renewed in time."""
+    """Check whether the servers' wildcard certificate is in place, valid, and renewed in time.
+
+    Without a domain, check whether the authority still takes orders for servers' addresses.
+    """
+    if not context.installation.has_domain:
+        yield _address_orders(context)
+        return
     order = "Order one: `hippodrome certificate --production`."
     try:
         found = snapshot.certificate(context.installation, context.platform.documents, context.now)

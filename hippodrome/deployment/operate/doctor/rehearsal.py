@@ -132,17 +132,17 @@ class Rehearsal:
             )
         if record is not None and record.state is ServerState.NAMING:
             return CheckFailed(
-                f"It runs, and its name is not known everywhere after {WAIT:.0f} seconds.",
-                "See `hippodrome logs --all --function task_changed`.",
+                f"It runs, and its name is not known everywhere, or it has no certificate, after {WAIT:.0f} seconds.",
+                "See `hippodrome logs --all --function task_changed`, or `… certify_server` without a domain.",
             )
         return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `hippodrome logs --all --errors`.")
 
     def _visit(self) -> list[Finding]:
-        """Connect to the server by its name, as a browser does, which proves DNS, the port, TLS and the certificate."""
+        """Connect to the server as a browser does, which proves its name, the port, TLS and the certificate."""
         record = self._record
-        if self._reach is None or record is None or record.dns_record is None:
+        if self._reach is None or record is None or record.host is None:
             return []
-        host = self._platform.dns.browser_host(record.dns_record)
+        host = self._platform.dns.browser_host(record.dns_record) if record.dns_record else record.host
         self._progress(f"connecting to {host}")
         try:
             self._reach(f"https://{host}:{record.port}/")

@@ -1,0 +1,157 @@
+"""`certify_server`: a server without a DNS name gets a certificate for its own IPv4 address, whose key never leaves it.
+
+The server shows its credential, first to place an order, then again and again until the certificate is there:
+
+    {"server": "s…-1", "credential": "…"}
+    {"address": "203.0.113.7", "order": "https://…", "token": "…", "proof": "…"}
+
+    {"server": "s…-1", "credential": "…", "order": "https://…", "csr": "-----BEGIN CERTIFICATE REQUEST-----…"}
+    {} or {"certificate": "-----BEGIN CERTIFICATE-----…"}
+
+Instead, `{"failed": "…"}` says that another order is needed, and `{"refused": "…"}` that none may be placed now. The
+address is the one that the request comes from, so no server gets a certificate for an address that it does not have.
+The certificate is handed out once `task_changed` has seen the task's address, and makes the server `ready`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Protocol
+
+import msgspec
+
+from hippodrome.control.certificates.rules import (
+    ADDRESS_ORDERS,
+    MAX_ORDERS,
+    AddressOrders,
+    FailureReason,
+    OrderFailed,
+)
+from hippodrome.control.http import Refusal, Request, Response
+from hippodrome.control.log import logger
+from hippodrome.control.model.messages import DnsChanged, ServerAttempt, to_message
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import Server, ServerState
+from hippodrome.control.ports import Platform
+from hippodrome.control.servers.credentials import record_of
+from hippodrome.control.storage.compare_and_swap import SharedDocuments
+from hippodrome.control.storage.repository import Repository
+from hippodrome.control.storage.secret import SecretCache
+
+MAX_BODY = 16 * 1024  # bytes
+_WAITING = (ServerState.STARTING, ServerState.NAMING)
+_ISSUED = (ServerState.NAMING, ServerState.READY)  # READY: it asks again, because an answer was lost
+
+
+class PlacedOrder(Protocol):
+    """A new order at the authority, as in `certificates.addresses.AddressOrder`."""
+
+    @property
+    def url(self) -> str: ...
+    @property
+    def token(self) -> str: ...
+    @property
+    def proof(self) -> str: ...
+
+
+class Authority(Protocol):
+    """An ACME authority with our account, as in `certificates.addresses.AddressAuthority`."""
+
+    def order(self, address: str) -> PlacedOrder: ...
+    def advance(self, url: str, address: str, csr: str, *, may_issue: bool) -> str: ...
+
+
+class CertificateRequest(msgspec.Struct, frozen=True):
+    """What a server sends: without an `order` it wants to place one."""
+
+    server: str
+    credential: str
+    order: str = ""
+    csr: str = ""
+
+
+class Certifying:
+    """Answers the requests of servers. Each running function has one `Certifying`."""
+
+    def __init__(self, platform: Platform, open_authority: Callable[[], Authority]) -> None:
+        """`open_authority` returns the client of the authority, and may raise OrderFailed."""
+        self._platform = platform
+        self._repository = Repository(platform.documents)
+        self._secrets = SecretCache(platform.documents)
+        self._shared = SharedDocuments(platform.documents)
+        self._open_authority = open_authority
+        self._authority: Authority | None = None
+
+    def respond(self, request: Request) -> Response:
+        """Place an order, or take its next step.
+
+        AWS calls: one read of the server's record; two for a new order; one message once the certificate is issued.
+        """
+        try:
+            wanted = _read(request)
+            record = record_of(wanted.server, wanted.credential, self._repository, self._secrets)
+            if record.dns or not record.owns(wanted.server) or record.state not in {*_WAITING, *_ISSUED}:
+                raise Refusal(409, "This server needs no certificate now.")
+            answer = self._advance(record, wanted, request.source) if wanted.order else self._place(request.source)
+        except Refusal as refusal:
+            return _json(refusal.status, {"message": refusal.text})
+        except OrderFailed as failed:
+            logger.warning("a certificate was not issued", extra={"server": wanted.server, "why": failed.reason.value})
+            return self._failed(failed)
+        return _json(200, answer)
+
+    def _place(self, address: str) -> dict[str, str]:
+        now = self._platform.now()
+
+        def placed(orders: AddressOrders) -> AddressOrders:
+            return orders.with_order(now) if orders.allows(now, MAX_ORDERS) else orders
+
+        orders = self._shared.change(ADDRESS_ORDERS, AddressOrders, placed)
+        if orders.after == orders.before:
+            return {"refused": "the limit of certificates is reached"}
+        order = self._client().order(address)
+        return {"address": address, "order": order.url, "token": order.token, "proof": order.proof}
+
+    def _advance(self, record: Server, wanted: CertificateRequest, address: str) -> dict[str, str]:
+        may_issue = record.state in _ISSUED and record.host == address
+        try:
+            chain = self._client().advance(wanted.order, address, wanted.csr, may_issue=may_issue)
+        except PermissionError:
+            raise Refusal(403, "That order is for another address.") from None
+        except ValueError:
+            raise Refusal(400, "That is no certificate request.") from None
+        if not chain:
+            return {}
+        if record.state is ServerState.NAMING:
+            issued = DnsChanged("", [ServerAttempt(record.label, record.attempt)])
+            self._platform.bus.send_delayed(to_message(issued), 0)
+        return {"certificate": chain}
+
+    def _failed(self, failed: OrderFailed) -> Response:
+        if failed.reason is not FailureReason.RATE_LIMITED:
+            return _json(200, {"failed": failed.reason.value})
+        until = failed.until
+        self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: msgspec.structs.replace(orders, until=until))
+        return _json(200, {"refused": failed.reason.value})
+
+    def _client(self) -> Authority:
+        self._authority = self._authority or self._open_authority()
+        return self._authority
+
+
+def _json(status: int, data: dict[str, str]) -> Response:
+    """A JSON response, without CORS headers: no page of another origin needs it."""
+    return Response(status, json.dumps(data), {"Content-Type": "application/json"})
+
+
+def _read(request: Request) -> CertificateRequest:
+    """Parse the body, which may be hostile. Raises `Refusal`."""
+    if request.method != "POST":
+        raise Refusal(405, "Use POST.")
+    if request.body is None or len(request.body) > MAX_BODY:
+        raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
+    try:
+        return from_json(request.body, CertificateRequest)
+    except ValueError:
+        raise Refusal(400, "The body must be JSON with server and credential, or with order and csr too.") from None

@@ -1,0 +1,247 @@
+"""A server without a DNS name gets a certificate for its address: a real trial, the function, and a real authority."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import os
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from cryptography import x509
+
+from hippodrome.control.certificates.accounts import account_key
+from hippodrome.control.certificates.addresses import AddressAuthority
+from hippodrome.control.certificates.rules import ACCOUNT, ADDRESS_ORDERS, MAX_ORDERS, AddressOrders
+from hippodrome.control.http import Request
+from hippodrome.control.model import server as servers
+from hippodrome.control.model.messages import DnsChanged, ServerAttempt, parse_dns_changed
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import Server, ServerState
+from hippodrome.control.servers.certifying import Certifying
+from hippodrome.control.storage.secret import SecretCache
+from hippodrome.protocol import exits
+from hippodrome.trial.server.own_certificate import NoCertificate, Order
+from testing.fake_platform import FakePlatform
+from testing.studies import study
+from tests.certificate.pebble import Pebble
+
+ROOT = Path(__file__).resolve().parents[2]
+HOST = "127.0.0.1"
+AGENT = """
+class Agent:
+    def start(self, game): pass
+    def reset(self): pass
+    def step(self, action): pass
+    def render(self): pass
+    def close(self): pass
+"""
+PROGRAM = """
+import sys
+from hippodrome.trial.server import own_certificate
+own_certificate.Order.__init__.__defaults__ = (PORT,)
+own_certificate.BETWEEN_ORDERS = 0.1
+from hippodrome.trial.__main__ import main
+sys.exit(main())
+"""
+
+
+class Installation(FakePlatform):
+    """An installation without a domain, whose function `certify_server` is served at `url`."""
+
+    def __init__(self, pebble: Pebble) -> None:
+        super().__init__()
+        self.settings = replace(self.settings, root_domain="", servers_host="", game_sources="")
+        self.pebble, self.url = pebble, ""
+        self.secrets = SecretCache(self.documents)
+        self.secrets.get_or_create()
+        self.certifying = Certifying(self, self.open_authority)
+
+    def open_authority(self) -> AddressAuthority:
+        directory = self.pebble.directory
+        return AddressAuthority(directory, account_key(self.documents, directory), self.pebble.trusted)
+
+    def server(self, state: ServerState = ServerState.NAMING, host: str = HOST) -> Server:
+        """Store the record of a server whose task runs at this address."""
+        record = servers.new_attempt(
+            study(id="maze"), "alice", 1, nonce="nonce", settings=self.settings, now=self.now()
+        )
+        record = msgspec.structs.replace(record, state=state, host=host, task="task")
+        self.documents.put(servers.key(record.label), to_json(record))
+        return record
+
+    def credential(self, record: Server) -> str:
+        return self.secrets.get_or_create().credential(record.name, record.nonce)
+
+    def ask(self, record: Server, source: str = HOST, **more: str) -> tuple[int, dict[str, Any]]:
+        body = json.dumps({"server": record.name, "credential": self.credential(record), **more}).encode()
+        answer = self.certifying.respond(Request("POST", "/certificate", (), {}, body, source))
+        return answer.status, json.loads(answer.body)
+
+    @property
+    def ready(self) -> list[DnsChanged]:
+        """The messages that make servers ready."""
+        return [message for _, sent in self.bus.delayed if (message := parse_dns_changed(sent))]
+
+    @property
+    def orders(self) -> int:
+        found = self.documents.get(ADDRESS_ORDERS)
+        return len(from_json(found.body, AddressOrders).placed) if found else 0
+
+
+def free_port() -> int:
+    with socket.create_server((HOST, 0)) as listening:
+        port: int = listening.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def installation(pebble: Pebble) -> Iterator[Installation]:
+    made = Installation(pebble)
+
+    class Function(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            answer = made.certifying.respond(Request("POST", self.path, (), {}, body, self.client_address[0]))
+            self.send_response(answer.status)
+            self.end_headers()
+            self.wfile.write(str(answer.body).encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer((HOST, 0), Function) as function:
+        thread = threading.Thread(target=function.serve_forever, args=(0.05,))
+        thread.start()
+        made.url = f"http://{HOST}:{function.server_port}/certificate"
+        yield made
+        function.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def trial(installation: Installation, tmp_path: Path) -> Iterator[Callable[[Server], subprocess.Popen[str]]]:
+    """A function that starts the trial of a server."""
+    (tmp_path / "agent.py").write_text(AGENT)
+    started = []
+
+    def start(record: Server, elsewhere: bool = False) -> subprocess.Popen[str]:
+        env = {
+            **{key: value for key, value in os.environ.items() if key not in {"SPOOL", "DEADLINE"}},
+            "PROJECT_ID": record.project_id,
+            "USER_ID": record.user_id,
+            "SERVER": record.name,
+            "CREDENTIAL": installation.credential(record),
+            "CERTIFICATE": installation.url,
+            "TOKEN": "the-secret-token",
+            "GAME_STEPS": "3",
+            "STORE": str(tmp_path / "bucket"),
+            "TRIAL": '{"game": "none", "actionSpace": ["noop"]}',
+            "HOST": HOST,
+            "PORT": "0",
+            "AGENT_DIR": str(tmp_path),
+            "PYTHONPATH": str(ROOT),
+        }
+        program = PROGRAM.replace("PORT", str(free_port() if elsewhere else installation.pebble.http_port), 1)
+        process = subprocess.Popen([sys.executable, "-c", program], env=env, stdout=subprocess.PIPE, text=True)
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        assert process.stdout
+        process.stdout.close()
+
+
+def test_a_trial_listens_with_a_certificate_for_its_address(installation, trial, pebble) -> None:
+    record = installation.server()
+    port = json.loads(trial(record).stdout.readline())["port"]
+    context = ssl.create_default_context(cadata=pebble.root())
+    with (
+        socket.create_connection((HOST, port), 10) as plain,
+        context.wrap_socket(plain, server_hostname=HOST) as secure,  # checks the address against the certificate
+    ):
+        shown = x509.load_der_x509_certificate(secure.getpeercert(True))
+    names = shown.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(name) for name in names.get_values_for_type(x509.IPAddress)] == [HOST]
+    assert len(list(names)) == 1
+    assert DnsChanged("", [ServerAttempt(record.label, 1)]) in installation.ready
+    assert installation.orders == 1
+
+
+def test_a_server_waits_for_its_certificate_until_its_task_was_seen(installation, pebble) -> None:
+    record = installation.server(ServerState.STARTING, host="")
+    order = Order(installation.url, record.name, installation.credential(record), pebble.http_port)
+    issued = []
+    thread = threading.Thread(target=lambda: issued.append(order.certificate()))
+    thread.start()
+    thread.join(3)
+    assert not issued
+    assert not installation.ready
+    installation.server(ServerState.NAMING)
+    thread.join(30)
+    assert issued
+    assert installation.ready
+
+
+def test_after_three_failed_orders_the_trial_ends_with_an_exit_code_of_its_own(installation, trial) -> None:
+    process = trial(installation.server(), elsewhere=True)  # not where the authority looks
+    assert process.wait(60) == exits.NO_CERTIFICATE
+    assert installation.orders == 3
+    assert not installation.ready
+
+
+def test_an_order_belongs_to_the_address_that_the_request_comes_from(installation) -> None:
+    record = installation.server()
+    _, placed = installation.ask(record)
+    assert placed["address"] == HOST
+    assert installation.ask(record, "127.0.0.2", order=placed["order"], csr="") == (
+        403,
+        {"message": "That order is for another address."},
+    )
+    elsewhere = "http://169.254.169.254/order"
+    assert installation.ask(record, order=elsewhere, csr="")[0] == 403
+
+
+def test_a_wrong_credential_and_a_server_that_has_a_name_or_has_ended_get_nothing(installation) -> None:
+    record = installation.server()
+    assert installation.ask(record, credential="wrong")[0] == 403
+    for change in ({"dns": "s1.servers.example.org"}, {"state": ServerState.CLOSED}, {"state": ServerState.DRAINING}):
+        installation.documents.put(servers.key(record.label), to_json(msgspec.structs.replace(record, **change)))
+        assert installation.ask(record)[0] == 409
+    assert installation.orders == 0
+
+
+def test_no_order_is_placed_beyond_the_limit_until_three_hours_have_passed(installation) -> None:
+    record, now = installation.server(), installation.now()
+    placed = AddressOrders(tuple(now - timedelta(minutes=1) for _ in range(MAX_ORDERS)))
+    installation.documents.put(ADDRESS_ORDERS, to_json(placed))
+    assert installation.ask(record) == (200, {"refused": "the limit of certificates is reached"})
+    order = Order(installation.url, record.name, installation.credential(record))
+    with pytest.raises(NoCertificate, match="takes no orders now"):
+        order.certificate()
+    installation.wait(hours=3)
+    assert "order" in installation.ask(record)[1]
+    assert installation.orders == 1
+
+
+def test_the_account_is_opened_once(installation, pebble) -> None:
+    before = pebble.accounts()
+    record = installation.server()
+    installation.ask(record)
+    installation.certifying = Certifying(installation, installation.open_authority)
+    installation.ask(record)
+    assert pebble.accounts() - before == 1
+    assert installation.documents.get(ACCOUNT)
