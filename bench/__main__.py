@@ -39,6 +39,7 @@ MEASURES = (  # each is `module.function`
     "crowds.small_account",
     "crowds.pairs",
     "crowds.warm",
+    "crowds.addresses",
     "data.download",
     "designs.balance",
     "designs.calls",

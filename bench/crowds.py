@@ -23,7 +23,7 @@ from testing.quiet_log import quiet
 from testing.simulation import session_checks
 from testing.simulation.assumptions import assumptions
 from testing.simulation.aws_bound import aws_alone, aws_alone_together
-from testing.simulation.conditions import Conditions
+from testing.simulation.conditions import AUTHORITY, Conditions
 from testing.simulation.members import SimulatedMember
 from testing.simulation.people import SimulatedParticipant
 from testing.simulation.world import PROJECT, WIRES, SimulatedWorld
@@ -106,6 +106,30 @@ def pairs() -> Iterator[Row]:
         decides=WAIT,
         detail={"p50, p95, max": spread(waits), "AWS alone": spread(alone)},
     )
+
+
+def addresses() -> Iterator[Row]:
+    """Compare certificates for addresses with names in Route 53: alone, and fifty participants in a minute."""
+    for name, people, within in (("alone", 60, 3600.0), ("50 within a minute", 50, 60.0)):
+        waits = {}
+        for conditions in (Conditions(authority=AUTHORITY), Conditions()):
+            world, came = crowd(people, within, conditions)
+            yield from () if not any(world.left().values()) else [through(name, world, came)]
+            waits[conditions.authority] = [person.visit.ready - person.visit.asked for person in came]
+        with_addresses, with_names = waits[AUTHORITY], waits[None]
+        yield row(
+            f"simulated: without a domain, {name}: answer to server, p50, against names in Route 53",
+            quantile(with_addresses, 0.5),
+            "s",
+            yardstick=quantile(with_names, 0.5),
+            at_most=0.75,
+            decides="whether an installation without a domain is only for trying",
+            detail={
+                "p50, p95, max": spread(with_addresses),
+                "names": spread(with_names),
+                "assumed: the authority": f"{AUTHORITY[0]:g} to {AUTHORITY[1]:g} s from RUNNING",
+            },
+        )
 
 
 def warm() -> Iterator[Row]:

@@ -28,6 +28,9 @@ def assumptions(conditions: Conditions) -> Mapping[str, str]:
         f"{_span(conditions.slow_propagation)} (libdns/route53 issue 14; shares: {OURS})",
         "zone busy after a change": f"{_span(conditions.busy_zone)} ({OURS})",
         "changes of the zone in a call": f"{MAX_CHANGES:,}, an UPSERT counts twice (Route 53 Developer Guide, Quotas)",
+        "certificate of an address": _span(conditions.authority) + f" after RUNNING ({OURS})"
+        if conditions.authority
+        else "none: servers have names",
         "quotas": f"{rate} (ECS Developer Guide, API throttling and Fargate throttling quotas; Route 53, Quotas)",
         "latency of a call": f"{delays} ({OURS})",
         "S3": f"a read or listing shows every write answered before it; a listing is a call for {PAGE:,} keys (S3 User "

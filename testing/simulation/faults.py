@@ -15,7 +15,7 @@ import msgspec
 from hippodrome.protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import design_checks, session_checks
-from testing.simulation.conditions import Conditions
+from testing.simulation.conditions import AUTHORITY, Conditions
 from testing.simulation.designs import LOOKS, PAGES, PAY, SOUP, TOGETHER, WRONG, Designed, DesignedMember, Ways
 from testing.simulation.members import Habits, SimulatedMember
 from testing.simulation.people import SimulatedParticipant, SimulatedVisit
@@ -80,6 +80,11 @@ JOURNEYS = (
         limits={"max_servers": 1, "max_server_hours": 1},
     ),
     SimulatedJourney("two come and there is room for one", limits={"max_servers": 1, "max_server_hours": 1}, others=1),
+    SimulatedJourney("servers without names", conditions=lambda: Conditions(authority=AUTHORITY)),
+    SimulatedJourney(
+        "Spot takes a server without a name back",
+        conditions=lambda: Conditions(authority=AUTHORITY, interrupted=1.0, interrupted_after=(70.0, 110.0)),
+    ),
     SimulatedJourney("a participant takes a warm server", limits={"warm_servers": 1}, comes=150.0, closes=600.0),
     SimulatedJourney(
         "Spot takes back warm servers, assigned or not",

@@ -133,9 +133,7 @@ class SimulatedMember(SimulatedParticipant):
 
     def _play_on(self, state: dict[str, Any]) -> str:
         """Connect and play with the others. Return `done`, `lost` or `unreachable`."""
-        tasks, names = self.world.platform.tasks, self.world.platform.dns
-        host = names.records.get(state["url"].split("/")[2].split(":")[0])
-        task = tasks.at(host) if host else None
+        task = self.world.task_at(state["url"])
         trial = self.world.trials.at(task, str(state["step"]), self._play) if task else None
         if task is None or trial is None or not trial.connect(self.visit.user, state["token"]):
             return "unreachable"

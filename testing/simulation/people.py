@@ -213,9 +213,7 @@ class SimulatedParticipant:
 
     def _play_on(self, state: dict[str, Any]) -> str:
         """Connect and play. Return `done`, `lost` if the server was lost before the game was over, or `unreachable`."""
-        tasks, names = self.world.platform.tasks, self.world.platform.dns
-        host = names.records.get(state["url"].split("/")[2].split(":")[0])
-        task = tasks.at(host) if host else None
+        tasks, task = self.world.platform.tasks, self.world.task_at(state["url"])
         if task is None or state["token"] != task.request.environment["TOKEN"]:
             return "unreachable"
         if task.is_warm_server and tasks.owner(task) != self.visit.user:

@@ -13,10 +13,10 @@ import msgspec
 from hippodrome.control.limits.rules import SERVER_SLOTS
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.messages import KeepWarm, to_message
+from hippodrome.control.model.messages import DnsChanged, KeepWarm, ServerAttempt, parse_task_changed, to_message
 from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Project
 from hippodrome.control.model.records import from_json, to_json
-from hippodrome.control.model.server import Server
+from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.model.warm_pool import POOLS
 from hippodrome.control.participants import assigning
 from hippodrome.control.ports import Message, Settings, Topic
@@ -39,6 +39,7 @@ from testing.simulation.trials import SimTrials
 from testing.tasks import Life
 
 SWEEP_EVERY = 300.0  # seconds
+POLL = 1.0  # seconds between two questions of a server that waits for its certificate
 WIRES = {  # the event source mappings of the template; tests/simulation/test_simulation.py compares them
     "start_server": Wire(batch=1, window=0, concurrency=20, visibility=90),
     "stop_server": Wire(batch=100, window=1, concurrency=2, visibility=90),
@@ -96,7 +97,8 @@ class SimulatedWorld:
         self.clock = GreenletClock(seed)
         self.clock.resumed, self.clock.ends = functions.enter, functions.ends
         self.cloud = Cloud(self.clock, concurrency, {"s3": self.conditions.s3})
-        settings = Settings(bucket="bucket", root_domain="example.org", max_runtime=120, game_sources="wss://*:*")
+        domain = "" if self.conditions.authority else "example.org"
+        settings = Settings(bucket="bucket", root_domain=domain, max_runtime=120, game_sources="wss://*:*")
         self.platform = platform = SimPlatform(self.clock, self.cloud, settings, self.conditions)
         platform.timers = SimTimers(self.cloud, lambda message: self.publish(Topic.STOP, message))
 
@@ -113,7 +115,7 @@ class SimulatedWorld:
             for function in (self.start_server, self.stop_server, self.task_changed)
         )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
-        platform.tasks.changed = self.task_queue.send
+        platform.tasks.changed = self._changed
         platform.tasks.owner = self._owner
         self._store_project()
         self.trials = SimTrials(platform, project.id, self.conditions.idle)
@@ -236,6 +238,32 @@ class SimulatedWorld:
         documents = self.platform.documents
         documents.keep(MASTER_LIST, to_json(MasterList(projects=[self.project])), documents.kept[MASTER_LIST][1])
         self.ask_for_warm_servers()
+
+    def task_at(self, url: str) -> TimedTask | None:
+        """Return the task that a browser reaches at this address; None if there is none."""
+        name = url.split("/")[2].split(":", maxsplit=1)[0]
+        host = name if self.conditions.authority else self.platform.dns.records.get(name)
+        return self.platform.tasks.at(host) if host else None
+
+    def _changed(self, event: Mapping[str, Any], delay: float) -> None:
+        """Deliver an event of ECS. Without a domain, a task that runs also orders a certificate for its address."""
+        self.task_queue.send(event, delay)
+        changed = parse_task_changed(event)
+        if self.conditions.authority and changed and changed.status == "RUNNING":
+            seconds = self.clock.random.uniform(*self.conditions.authority)
+            self.clock.after(seconds, lambda: self._certify(changed.name))
+
+    def _certify(self, name: str) -> None:
+        """Do what `certify_server` does: the certificate is handed out once the server's record has its address."""
+        label, attempt = ids.parse_server_name(name) or ("", 0)
+        stored = self.platform.documents.kept.get(server.key(label))
+        record = from_json(stored[0], Server) if stored else None
+        if record is None or not record.is_open(attempt):
+            return
+        if record.state is ServerState.STARTING:
+            self.clock.after(POLL, lambda: self._certify(name))
+        elif record.state is ServerState.NAMING:
+            self.task_queue.send(to_message(DnsChanged("", [ServerAttempt(label, attempt)])), 0)
 
     def _owner(self, task: TimedTask) -> str:
         """Return the id of the participant or session to whom this server belongs: a warm server by its handover.

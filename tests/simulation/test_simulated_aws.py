@@ -378,6 +378,7 @@ WORSE = {
     "interrupted_after": (1.0, 2.0), "untold": 0.1, "late_addresses": 0.5, "address_late": (1.0, 2.0), "stillborn": 0.5,
     "starts": (1.0, 2.0, 3.0), "propagation": (1.0, 2.0), "slow_zone": 0.5, "slow_propagation": (1.0, 2.0),
     "busy_zone": (1.0, 2.0), "s3": (1.0, 2.0), "idle": 1.0,
+    "authority": (1.0, 2.0),
 }  # fmt: skip
 
 
