@@ -94,6 +94,10 @@ class World:
     """What the trial server answers to `start`."""
     before_pictures: Callable[[], object] = lambda: None
     """What the trial server waits for between its first message and the first picture."""
+    named: bool = True
+    """Whether servers have names; else a page may reach the one server that is ready when the page is loaded."""
+    ahead: float = 0.0
+    """Seconds by which the control plane's clock is ahead of the browser's."""
     refusal: str = ""
     """What the trial server says instead if the game cannot begin on it."""
     url: str = ""
@@ -104,7 +108,8 @@ class World:
         if step.type.on_server:
             study = msgspec.structs.replace(PROJECT, trial=self.trial, **self.more)
             texts: dict[str, tuple[str, dict[str, Any]]] = {key: (text, {}) for key, text in self.texts.items()}
-            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "T", "ws://127.0.0.1:*", texts)
+            sources = "ws://127.0.0.1:*" if self.named else self.state.get("url", "").rstrip("/")
+            view = pages.GameView(study, step, "P1", self.state, "/?poll=1", "/", "T", sources, texts)
             page = pages.game_page(view)
             return page if self.joined else page._replace(html=MODULES.sub(r'\1 src="/game/main.js">\2', page.html))
         return pages.step_page(pages.StepView(PROJECT, step, "P1", self.source, {}, "T", "/", self.step == 3))
@@ -164,6 +169,9 @@ def world() -> Iterator[World]:
     class Handler(BaseHTTPRequestHandler):
         def log_message(self, *_: Any) -> None:
             pass
+
+        def date_time_string(self, timestamp: float | None = None) -> str:
+            return super().date_time_string(time.time() + here.ahead)
 
         def reply(self, status: int, kind: str, body: str, headers: dict[str, str]) -> None:
             self.send_response(status)

@@ -81,7 +81,8 @@ _WAITING = {
     "usually": "Usually it takes about {time}.",
     "takesLonger": "This takes longer than usual. Please stay on this page.",
     "clockBehind": (
-        "Your device's clock is {time} behind, so it cannot connect yet. Please set it right, or wait: we keep trying."
+        "Your device's clock is {minutes} minutes behind, so it cannot connect yet. Please set it right, or wait: we "
+        "keep trying."
     ),
     "noConnection": (
         "No connection – trying again… Your answers are kept. Please stay on this page: it continues by itself. "

@@ -9,7 +9,7 @@ import { hooks } from "./hooks.js";
 import { onKeyDown, onKeyUp } from "./keyboard.js";
 import { leave } from "./leave.js";
 import { hideMessage, showMessage, showOverlay } from "./overlay.js";
-import { data, duration, find, setText, showSection } from "./page.js";
+import { data, find, setText, showSection } from "./page.js";
 import { loadPage, pause, pollUntilAnswered, secondsBehind } from "./requests.js";
 import { game } from "./state.js";
 import { showStatus } from "./status.js";
@@ -98,8 +98,8 @@ function playHere() {
 
 // A browser refuses a certificate that is younger than its clock is late. Names have an old one, addresses a new one.
 function clockHint() {
-  const behind = secondsBehind();
-  return "server" in data && behind >= 60 ? TEXT.clockBehind(duration(behind)) : "";
+  const minutes = Math.round(secondsBehind() / 60);
+  return "server" in data && minutes > 1 ? TEXT.clockBehind(minutes.toLocaleString(TEXT.language)) : "";
 }
 
 function checkForHang() {
