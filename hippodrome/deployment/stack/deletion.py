@@ -9,7 +9,7 @@ from hippodrome.console.formatting import duration
 from hippodrome.console.problem import Problem
 from hippodrome.deployment.aws.account import Account
 from hippodrome.deployment.core.stages import Executor
-from hippodrome.deployment.stack import acm_records, policies
+from hippodrome.deployment.stack import acm_records, guardduty, policies
 from hippodrome.deployment.stack.deletion_failures import Recovery, recoveries, recovery_from
 from hippodrome.deployment.stack.stack import FailedResource, NotDeleted, Stack
 
@@ -100,10 +100,14 @@ class StackDeletion:
             )
 
     def _network_free(self) -> None:
-        """Wait until the stack's network has no network interface. Raises `Problem` after `NETWORK_IN_USE` seconds."""
+        """Wait until the stack's network has no network interface. Raises `Problem` after `NETWORK_IN_USE` seconds.
+
+        What GuardDuty has put into the stack's own VPC is removed.
+        """
         vpcs, groups = self._stack.ids_of("AWS::EC2::VPC"), self._stack.ids_of("AWS::EC2::SecurityGroup")
         where = {"Name": "vpc-id", "Values": vpcs} if vpcs else {"Name": "group-id", "Values": groups}
         client = self._account.client("ec2")
+        guardduty.remove_endpoints(client, vpcs)
 
         def interfaces() -> list[str]:
             pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
@@ -122,6 +126,7 @@ class StackDeletion:
                 f"After {duration(NETWORK_IN_USE)} the network still has the interfaces {', '.join(left)}.",
                 "See in the EC2 console what they belong to, remove that, and run the same command again.",
             )
+        guardduty.remove_groups(client, vpcs)
 
     def _until_none(
         self, look: Callable[[], Sequence[str]], title: str, seconds: float, disagreeing: float

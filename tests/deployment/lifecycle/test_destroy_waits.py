@@ -223,6 +223,20 @@ def test_network_interfaces_that_stay_are_named(
     assert interfaces(stack.world)[0] in capsys.readouterr().err
 
 
+def test_what_guardduty_has_put_into_the_network_is_removed(stack: RealStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    ec2 = stack.client("ec2")
+    vpc = ec2.describe_subnets(SubnetIds=[stack.subnet])["Subnets"][0]["VpcId"]
+    service = f"com.amazonaws.{REGION}.guardduty-data"
+    ec2.create_vpc_endpoint(VpcId=vpc, ServiceName=service, VpcEndpointType="Interface", SubnetIds=[stack.subnet])
+    name = f"GuardDutyManagedSecurityGroup-{vpc}"
+    ec2.create_security_group(GroupName=name, Description="Associated with GuardDuty's endpoint", VpcId=vpc)
+    stack.add_interface(60)
+    assert run(stack.world, "--yes", monkeypatch=monkeypatch) == Exit.DONE
+    (endpoint,) = [one for one in ec2.describe_vpc_endpoints()["VpcEndpoints"] if one["ServiceName"] == service]
+    assert endpoint["State"] == "deleted"
+    assert [one for one in ec2.describe_security_groups()["SecurityGroups"] if one["GroupName"] == name] == []
+
+
 # -- creating it again
 
 
