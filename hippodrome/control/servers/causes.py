@@ -136,8 +136,8 @@ _EXPLANATIONS = {
     Cause.PERMISSION: _Explanation(
         FailureCategory.REFUSED,
         "AWS does not allow the installation to run servers.",
-        "`hippodrome plan` shows which role has changed and `apply` puts it back; if AWS has blocked the "
-        "account, its Support Center says why.",
+        "`hippodrome plan` shows which role has changed and `apply` puts it back. AWS blocks Fargate in some new "
+        "accounts: start the smallest EC2 instance, end it, and try again after some hours, or ask its Support Center.",
     ),
     Cause.SIZE: _Explanation(
         FailureCategory.REFUSED,

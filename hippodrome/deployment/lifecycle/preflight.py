@@ -132,6 +132,13 @@ def _servers(checked: AccountCheck) -> Iterator[Finding]:
     if study and not study.plays:
         return
     cpu = float(study.registration["awsSetup"]["cpu"]) if study else USUAL
+    if quotas.applied(account, quotas.SPOT) == quotas.applied(account, quotas.ON_DEMAND) == 0:
+        yield bad(
+            "Fargate",
+            "This account may run no server at all: both of Fargate's quotas are 0 vCPU.",
+            quotas.ask_for(account, quotas.ON_DEMAND, FEW * cpu),
+        )
+        return
     for kind, quota in (("Spot", quotas.SPOT), ("on demand", quotas.ON_DEMAND)):
         value = quotas.applied(account, quota)
         if value is None or value >= FEW * cpu:

@@ -24,7 +24,8 @@ def remove_endpoints(client: Any, vpcs: Sequence[str]) -> None:
             endpoint["VpcEndpointId"]
             for page in pages
             for endpoint in page["VpcEndpoints"]
-            if endpoint["ServiceName"].endswith(f".{SERVICE}") and endpoint["State"].lower() not in ("deleting", "deleted")
+            if endpoint["ServiceName"].endswith(f".{SERVICE}")
+            and endpoint["State"].lower() not in ("deleting", "deleted")
         ]
         if endpoints:
             client.delete_vpc_endpoints(VpcEndpointIds=endpoints)

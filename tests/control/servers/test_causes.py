@@ -122,6 +122,12 @@ def test_a_refusal_of_run_task_gives_the_cause(error: NoCapacity | Refused, caus
     assert causes.cause_of_refusal(error) is cause
 
 
+def test_a_blocked_account_is_told_what_helps() -> None:
+    blocked = causes.cause_of_refusal(Refused("BlockedException: Your account has been blocked."))
+    assert "AWS does not allow the installation to run servers." in blocked.sentence
+    assert "start the smallest EC2 instance" in blocked.sentence
+
+
 def test_the_values_of_causes_stay_as_they_are_in_stored_records() -> None:
     assert [cause.value for cause in Cause] == [
         "image",

@@ -196,7 +196,7 @@ def test_few_executions_are_a_remark_that_says_how_they_are_divided(world: World
     assert findings(world) == []
 
 
-@pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server"), (0, "0 servers")])
+@pytest.mark.parametrize(("vcpu", "servers"), [(6, "6 servers"), (1, "1 server")])
 def test_few_vcpus_are_a_remark(world: World, game: project_folder.ProjectFolder, vcpu: float, servers: str) -> None:
     world.limits.quotas |= {quotas.SPOT: vcpu, quotas.ON_DEMAND: vcpu}
     spot, on_demand = findings(world, game=game)
@@ -205,6 +205,15 @@ def test_few_vcpus_are_a_remark(world: World, game: project_folder.ProjectFolder
     assert on_demand.text == f"{vcpu} vCPU: {servers} of 1 vCPU may run at once, if Spot has no room."
     assert "--quota-code L-36FBB829 --desired-value 20" in spot.advice
     assert "--quota-code L-3032A538 --desired-value 20" in on_demand.advice
+
+
+def test_an_account_that_may_run_no_server_is_a_problem_for_a_study_with_a_game(
+    world: World, game: project_folder.ProjectFolder
+) -> None:
+    world.limits.quotas |= {quotas.SPOT: 0, quotas.ON_DEMAND: 0}
+    found = only(findings(world, game=game))
+    assert (found.mark, found.text.partition(":")[0]) == (Mark.BAD, "This account may run no server at all")
+    assert "--quota-code L-3032A538 --desired-value 20" in found.advice
 
 
 def test_a_study_without_a_game_needs_no_servers(world: World, tmp_path: Path) -> None:
