@@ -16,17 +16,23 @@ from hippodrome.deployment.aws.account import Account
 
 
 class Quota(NamedTuple):
-    """A quota: the code of its service, its own, and where AWS's console has it."""
+    """A quota: the code of its service, and its own."""
 
     service: str
     code: str
-    place: str
 
 
-SPOT = Quota("fargate", "L-36FBB829", "AWS Fargate, Fargate Spot vCPU resource count")  # vCPUs
-ON_DEMAND = Quota("fargate", "L-3032A538", "AWS Fargate, Fargate On-Demand vCPU resource count")  # vCPUs
-EXECUTIONS = Quota("lambda", "L-B99A9384", "AWS Lambda, Concurrent executions")
-VPCS = Quota("vpc", "L-F678F1CE", "Amazon Virtual Private Cloud, VPCs per Region")
+SPOT = Quota("fargate", "L-36FBB829")  # vCPUs
+ON_DEMAND = Quota("fargate", "L-3032A538")  # vCPUs
+EXECUTIONS = Quota("lambda", "L-B99A9384")
+VPCS = Quota("vpc", "L-F678F1CE")
+_PLACES = {
+    SPOT: "AWS Fargate, Fargate Spot vCPU resource count",
+    ON_DEMAND: "AWS Fargate, Fargate On-Demand vCPU resource count",
+    EXECUTIONS: "AWS Lambda, Concurrent executions",
+    VPCS: "Amazon Virtual Private Cloud, VPCs per Region",
+}
+"""Where the console has them, below Service Quotas."""
 
 
 def applied(account: Account, quota: Quota) -> float | None:
@@ -49,7 +55,7 @@ def applied(account: Account, quota: Quota) -> float | None:
 def request(account: Account, quota: Quota, wanted: float) -> str:
     """Return where to ask for a higher value, in the console or by a command. AWS grants it after hours or days."""
     return (
-        f"{wanted:g} in the console, Service Quotas, {quota.place}; or by: "
+        f"{wanted:g} in the console, Service Quotas, {_PLACES[quota]}; or by: "
         f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
         f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"
     )
