@@ -240,5 +240,5 @@ def _zone(found: FoundInstallation) -> str:
 def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:
     """Return the installation of a stack in any state; None if outputs are missing, since it was never complete."""
     installation = Installation.of(account, found) if found else None
-    whole = installation and {"Cluster", "Bucket", "HostedZoneId", "RootDomain"} <= set(installation.outputs)
+    whole = installation and {"Cluster", "Bucket"} <= set(installation.outputs)
     return installation if whole else None
