@@ -33,7 +33,7 @@ class DesignedStudy:
 
     def __init__(self, folder: Path, platform: FakePlatform) -> None:
         self.platform = platform
-        config = read_project(folder)
+        self.config = config = read_project(folder)
         self.id = config.project.id
         for file in {file for step in config.steps for file in step.files} | {*(folder / "steps").glob("*.html")}:
             platform.documents.keep(step_key(self.id, file.stem), file.read_bytes())

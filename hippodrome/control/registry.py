@@ -13,6 +13,7 @@ from hippodrome.control.config import ConfigErrors, hippo_registration, parse_re
 from hippodrome.control.limits.slots import Slots
 from hippodrome.control.log import failure, logger
 from hippodrome.control.model import ids
+from hippodrome.control.model.balance import Cells, cells_key
 from hippodrome.control.model.design import Step
 from hippodrome.control.model.project import (
     GAME_PAGES,
@@ -24,7 +25,7 @@ from hippodrome.control.model.project import (
     read_list,
     write_list,
 )
-from hippodrome.control.model.records import from_data
+from hippodrome.control.model.records import from_data, from_json
 from hippodrome.control.ports import Conflict, Document, Platform
 from hippodrome.control.servers.warm.pools import Pools
 from hippodrome.control.storage import uploaded_pages
@@ -36,6 +37,10 @@ MAX_SIGNED = 5_000  # the most links that one call signs
 ALONE = (  # because functions look up a participant's session only in a project with several players
     "project.players: the study is registered with players: {players}, and participants who play together would be "
     "separated; give a study for one participant another project.id"
+)
+OTHER_FACTORS = (
+    "project.conditions and each: {people} were assigned to levels and orders that the study would no longer have; "
+    "give the changed study another project.id"
 )
 
 NOT_UTF8 = "the registration cannot be written as JSON in UTF-8: a text holds half of a character, or it is too deep"
@@ -69,6 +74,8 @@ def _enter(platform: Platform, project: Project) -> Project:
         before = listed.find(project.id)
         if before and before.has_sessions and not project.has_sessions:
             raise NotRegistered([ALONE.format(players=before.players)])
+        if assigned := _assigned_to_others(platform, before, project):
+            raise NotRegistered([OTHER_FACTORS.format(people=assigned)])
         salt = listed.salt(project.id) or secrets.token_hex(8)
         entry = msgspec.structs.replace(project.following(before), salt=salt, version=secrets.token_hex(4))
         body = write_list(listed.with_project(entry))
@@ -85,6 +92,18 @@ def _enter(platform: Platform, project: Project) -> Project:
             _warm_up(platform, entry)
         return entry
     raise NotRegistered(["too many registrations at this moment; please try again"])
+
+
+def _assigned_to_others(platform: Platform, before: Project | None, project: Project) -> str:
+    """How many have been assigned, if this registration has other factors than the one before; "" if nobody has.
+
+    On one machine, where studies are tried while they are written, any change is allowed.
+    """
+    if before is None or not project.use_a_w_s or before.factors == project.factors:
+        return ""
+    document = platform.documents.get(cells_key(project.id))
+    people = sum(from_json(document.body, Cells).people.values()) if document else 0
+    return f"{people:,} {'sessions' if project.has_sessions else 'people'}" if people else ""
 
 
 def _master_list(platform: Platform) -> tuple[Document | None, MasterList]:

@@ -74,7 +74,7 @@ WHO_MAY: dict[str, set[str]] = {
     "s3:PutObject assignment.json": {NEXT},
     "s3:GetObject end.json": {NEXT},
     "s3:PutObject end.json": {NEXT},
-    "s3:GetObject _cells": {NEXT},
+    "s3:GetObject _cells": {NEXT, REGISTER},
     "s3:PutObject _cells": {NEXT},
     # Servers have no role: sign_requests presigns the requests with which they read and create documents, and may do no
     # more.

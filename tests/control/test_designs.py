@@ -12,7 +12,10 @@ from typing import Any
 
 import pytest
 
+from hippodrome.control import registry
+from hippodrome.control.config import read_project
 from hippodrome.control.model.design import latin_rows
+from hippodrome.control.model.project import step_key
 from hippodrome.control.ports import Conflict, Topic
 from testing.designed import DesignedStudy, write
 from testing.fake_platform import FakePlatform
@@ -263,6 +266,29 @@ def test_an_end_that_asks_for_the_condition_draws_it(tmp_path: Path, platform: F
     assert heading(alice.get()) == "Thank you"
     assert study.stored("alice", "end")["end"] == "quota"
     assert study.stored("alice", "assignment")["condition"]["partner"] in ("helpful", "lazy")
+
+
+@pytest.mark.parametrize("on_aws", [True, False])
+def test_other_factors_are_refused_on_aws_once_people_are_assigned(
+    tmp_path: Path, platform: FakePlatform, on_aws: bool
+) -> None:
+    study = last(tmp_path, platform)
+    three = write(tmp_path / "three", LAST.replace("lazy]", "lazy, mean]"), {**PAGES, **LAST_PAGES, "debrief-mean": ""})
+    place = {"useAWS": on_aws, "awsSetup": {"cpu": 1, "memory": 2}}
+    before, after = study.config.registration() | place, read_project(three).registration() | place
+    platform.documents.put(step_key("last", "debrief-mean"), b"<h1>Thanks</h1>")
+    registry.register(platform, after)  # nobody was assigned yet
+    registry.register(platform, before)
+    alice = study.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.answer(alice.get(), q1="1")
+    alice.get()
+    registry.register(platform, {**before, "name": "Another name"})
+    if on_aws:
+        with pytest.raises(registry.NotRegistered, match="1 people were assigned to levels and orders"):
+            registry.register(platform, after)
+    else:
+        registry.register(platform, after)
 
 
 def test_who_was_erased_and_comes_again_is_on_the_path_of_the_new_assignment(

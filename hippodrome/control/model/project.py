@@ -123,6 +123,15 @@ class Project(Record, frozen=True):
         """
         return bool(self.conditions or self.blocks or any(step.sections or step.name for step in self.steps))
 
+    @property
+    def factors(self) -> object:
+        """What participants are assigned to, to be compared: the names of factors and levels, and the orders."""
+
+        def named(factors: Iterable[Factor]) -> list[tuple[str, list[str]]]:
+            return [(factor.name, list(factor.levels)) for factor in factors]
+
+        return named(self.conditions), [(named(block.factors), block.order, block.take) for block in self.blocks]
+
     def own(self, assignment: Assignment | None) -> Project:
         """Return the project with the path of a participant who has this assignment, or none yet."""
         if not self.assigns:
