@@ -10,8 +10,7 @@ authorities. These bridges take the place of the Internet and of parts of AWS th
   header.
 - Gap: the emulator has no quotas. Bridge: those of a new account: 6 vCPUs of Fargate, 10 executions of Lambda, 5 VPCs.
 - Gap: the emulator has no scan findings of ECR images. Bridge: a complete scan without findings.
-- Gap: the emulator's ECR is no registry, and AWS's public mirror is not reachable. Bridge: an image is not assembled, but
-  put into ECR with the caller's rights (tests/deployment/study/test_image_runs.py assembles images).
+- `images.py` puts images into the emulator's ECR.
 """
 
 from __future__ import annotations
@@ -104,26 +103,13 @@ def account() -> None:
     ]
 
 
-def images() -> None:
-    """Put a manifest into ECR in the place of an assembled image."""
-    from hippodrome.deployment.study.image import assembled
-
-    def build(order: Any) -> None:
-        order.repository.password()
-        manifest = json.dumps({"schemaVersion": 2, "config": {}, "layers": [], "annotations": {"tag": order.tag}})
-        ecr = order.repository.account.client("ecr")
-        ecr.put_image(repositoryName=order.repository.name, imageTag=order.tag, imageManifest=manifest)
-
-    assembled.build = build
-
-
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()  # as with `python -m`
     if sys.argv[1:3] == ["-m", "hippodrome"]:
         certificates()
         internet()
         account()
-        images()
+        runpy.run_path(str(Path(__file__).with_name("images.py")))
     if sys.argv[1] == "-m":
         module = sys.argv[2]
         del sys.argv[:2]

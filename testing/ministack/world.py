@@ -180,6 +180,7 @@ class MinistackWorld:
                 shutil.copytree(folder, self.source / folder.name, ignore=skip)
         for name in ("agent.py", "config.yml", "pyproject.toml"):
             shutil.copy(ROOT / name, self.source / name)
+        shutil.copy(ROOT / "testing/ministack/images.py", self.source)
 
     # -- callers
 
@@ -246,7 +247,7 @@ class MinistackWorld:
         began = time.monotonic()
         with tempfile.TemporaryFile("w+") as errors:
             process = processes.start(
-                "hippodrome", arguments, cwd=self.source, env=env, stdout=subprocess.PIPE, stderr=errors
+                "images", arguments, cwd=self.source, env=env, stdout=subprocess.PIPE, stderr=errors
             )
             try:
                 out, _ = process.communicate(timeout=280)  # a busy machine takes its time; the tests may take 300 s

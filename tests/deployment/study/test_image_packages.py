@@ -35,16 +35,20 @@ def wheel(folder: Path, name: str, version: str, needs: tuple[str, ...] = (), ta
         for member, text in members.items()
     ]
     members[f"{info}/RECORD"] = "\n".join([*rows, f"{info}/RECORD,,", ""])
-    file = folder / f"{name}-{version}-{tag}.whl"
+    place = folder / name
+    place.mkdir(exist_ok=True)
+    file = place / f"{name}-{version}-{tag}.whl"
     with zipfile.ZipFile(file, "w") as archive:
         for member, text in members.items():
             archive.writestr(member, text)
+    links = "".join(f'<a href="{each.name}">{each.name}</a>' for each in place.glob("*.whl"))
+    (place / "index.html").write_text(f"<!DOCTYPE html><html><body>{links}</body></html>")
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 @pytest.fixture
 def wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A trial that needs `game`, which brings `base` along; and wheels for studies, in place of an index."""
+    """A trial that needs `game`, which brings `base` along; and an index with these and what studies need."""
     folder, root = tmp_path / "wheels", tmp_path / "root/requirements"
     folder.mkdir()
     root.mkdir(parents=True)
@@ -66,8 +70,8 @@ def wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (root / "trial.txt").write_text("game==1.0\n")
     (root / "image.txt").write_text("".join(f"{name}==1.0 --hash=sha256:{value}\n" for name, value in hashes.items()))
     monkeypatch.setattr(places, "ROOT", tmp_path / "root")
-    for name, value in (("PIP_NO_INDEX", "1"), ("PIP_FIND_LINKS", str(folder))):
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PIP_INDEX_URL", folder.as_uri())
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))  # it would remember the pages of this index
     return folder
 
 
@@ -143,16 +147,14 @@ def test_a_network_that_fails_is_not_blamed_on_a_package() -> None:
     assert str(problem) == "The packages could not be downloaded."
 
 
-def test_pips_indexes_are_uvs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("PIP_FIND_LINKS", "PIP_INDEX_URL", "PIP_EXTRA_INDEX_URL"):
-        monkeypatch.delenv(name, raising=False)
-    (tmp_path / "pip.conf").write_text(
-        "[global]\nindex-url = https://mirror.example/simple\n[install]\nfind-links = /w\n"
-    )
+def test_pips_index_is_uvs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PIP_INDEX_URL", raising=False)
+    text = "[global]\nindex-url = https://mirror.example/simple\nextra-index-url = https://piwheels.example/simple\n"
+    (tmp_path / "pip.conf").write_text(text)
     monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
-    assert packages._indexes() == ["--default-index", "https://mirror.example/simple", "--find-links", "/w"]
+    assert packages._index() == ["--default-index", "https://mirror.example/simple"]
     monkeypatch.setenv("PIP_INDEX_URL", "https://other.example/simple")
-    assert packages._indexes()[:2] == ["--default-index", "https://other.example/simple"]
+    assert packages._index() == ["--default-index", "https://other.example/simple"]
 
 
 def test_the_lock_has_the_trials_packages() -> None:

@@ -116,10 +116,7 @@ def find_base(name: str, cache: Path, *, fresh: bool = False) -> Base:
 def make_layers(bundle: Bundle, installed: list[packages.Packages], cache: Path) -> list[Layer]:
     """Return our layers, in their order: first what changes least."""
     store = cache / "layers"
-    names = ["the trial's packages", "the study's packages"] if len(installed) > 1 else ["packages"]
-    layers = [
-        layer(name, each.key, store, partial(_files_of, each)) for name, each in zip(names, installed, strict=True)
-    ]
+    layers = [layer(each.name, each.key, store, partial(_files_of, each)) for each in installed]
     scratch = Folder(0o700, int(USER.partition(":")[0]))
     ours = Files(_with_bytecode(bundle.below("hippodrome")), {SCRATCH[1:]: scratch})
     study = Files({**bundle.below("project"), "project/requirements.txt": bundle.requirements.encode()})

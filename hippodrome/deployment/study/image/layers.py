@@ -81,14 +81,15 @@ def layer(name: str, key: str, cache: Path, content: Callable[[], Files]) -> Lay
     """Return the layer that was made under this key, or make it. `content` says what it holds."""
     cache.mkdir(parents=True, exist_ok=True)
     file, facts = cache / f"{key}.tar.gz", cache / f"{key}.json"
-    if not facts.is_file():
+    if not (facts.is_file() and file.is_file()):
         with tempfile.TemporaryDirectory(dir=cache, prefix="coming-") as coming:
             made = _write(name, Path(coming, "layer"), content())
             os.replace(made.file, file)
             known = {key: value for key, value in asdict(made).items() if key not in {"name", "file"}}
             Path(coming, "facts").write_text(json.dumps(known))
             os.replace(Path(coming, "facts"), facts)  # last: where the facts are, the layer is whole
-    os.utime(facts)  # `prune` removes what has not been used for long
+    for path in (file, facts):
+        os.utime(path)  # what has not been used for long is removed from the cache
     return Layer(name, file, **json.loads(facts.read_text()))
 
 

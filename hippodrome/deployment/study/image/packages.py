@@ -35,13 +35,15 @@ _TARGET = ("--python-platform", "x86_64-manylinux_2_34", "--python-version", PYT
 _VARIES = re.compile(r"(^|/)(\.lock|[^/]+\.dist-info/(INSTALLER|REQUESTED|RECORD|direct_url\.json|uv_cache\.json))$")
 # What servers do not need of the trial's packages. Those of a study stay whole: nobody here knows them.
 _NEEDLESS = re.compile(r"(^|/)tests?/|\.(pyi|h|c|cpp|pyx|pxd|a)$|\.libs/.*\.debug$")
+_TRIALS = "the trial's packages"
 _COMPILER = "public.ecr.aws/docker/library/python:3.13-trixie"
 
 
 @dataclass(frozen=True)
 class Packages:
-    """Installed packages: a folder like site-packages, and a key that says what is in it."""
+    """Installed packages: whose they are, a key that says what they are, and a folder like site-packages."""
 
+    name: str
     key: str
     folder: Path
 
@@ -61,14 +63,15 @@ def install(requirements: str, cache: Path, *, fresh: bool = False) -> list[Pack
     """
     lock = (places.ROOT / "requirements/image.txt").read_text(encoding="utf-8")
     if not _lines(requirements):
-        return [_installed(lock, cache, slim=True)]
+        return [_installed(_TRIALS, lock, cache, slim=True)]
     options = "".join(f"{line}\n" for line in _lines(requirements) if line.startswith("-"))
     pins = _resolved(lock, requirements, cache, fresh)
     known, wanted = _pins(lock), _pins(pins)
     if not known.keys() <= wanted.keys() or any(_version(known[name]) != _version(wanted[name]) for name in known):
-        return [_installed(options + pins, cache)]
+        return [_installed("all packages", options + pins, cache)]
     own = "".join(f"{wanted[name]}\n" for name in wanted if name not in known)
-    return [_installed(lock, cache, slim=True), *([_installed(options + own, cache)] if own else [])]
+    studys = [_installed("the study's packages", options + own, cache)] if own else []
+    return [_installed(_TRIALS, lock, cache, slim=True), *studys]
 
 
 def _resolved(lock: str, requirements: str, cache: Path, fresh: bool) -> str:
@@ -90,7 +93,7 @@ def _resolved(lock: str, requirements: str, cache: Path, fresh: bool) -> str:
     return file.read_text(encoding="utf-8")
 
 
-def _installed(pins: str, cache: Path, *, slim: bool = False) -> Packages:
+def _installed(name: str, pins: str, cache: Path, *, slim: bool = False) -> Packages:
     python = bytecode.compiler(PYTHON)
     key = _hash(*_TARGET, pins, str(slim), str(python is not None))
     place = cache / "packages" / key
@@ -103,8 +106,8 @@ def _installed(pins: str, cache: Path, *, slim: bool = False) -> Packages:
             _uv(["install", *_TARGET, *options], Path(coming))
             shutil.rmtree(folder / "bin", ignore_errors=True)  # scripts with the path of this machine's Python
             for path in [path for path in folder.rglob("*") if path.is_file()]:
-                name = path.relative_to(folder).as_posix()
-                if _VARIES.search(name) or (slim and _NEEDLESS.search(name)):
+                inner = path.relative_to(folder).as_posix()
+                if _VARIES.search(inner) or (slim and _NEEDLESS.search(inner)):
                     path.unlink()
             if python:
                 bytecode.compile_folder(folder, f"/{SITE}", python)
@@ -114,7 +117,7 @@ def _installed(pins: str, cache: Path, *, slim: bool = False) -> Packages:
                 if not place.is_dir():  # otherwise another process has made it
                     raise
     os.utime(place)
-    return Packages(key, place)
+    return Packages(name, key, place)
 
 
 def _uv(words: list[str], folder: Path) -> None:
@@ -123,7 +126,7 @@ def _uv(words: list[str], folder: Path) -> None:
 
     command = [uv.find_uv_bin(), "pip", words[0], "--quiet", "--no-progress", "--color", "never"]
     # As pip does: the best version of all indexes, and the certificates that this machine trusts.
-    command += ["--index-strategy", "unsafe-best-match", "--python", sys.executable, *_indexes(), *words[1:]]
+    command += ["--index-strategy", "unsafe-best-match", "--python", sys.executable, *_index(), *words[1:]]
     environment = {**os.environ, "UV_SYSTEM_CERTS": "true", "UV_NATIVE_TLS": "true"}
     screen.info("Fetching packages …" if words[0] == "install" else "Choosing the versions of packages …")
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -131,21 +134,15 @@ def _uv(words: list[str], folder: Path) -> None:
         raise explained(done.stderr)
 
 
-def _indexes() -> list[str]:
-    """Return the indexes of pip's configuration as uv's options: uv does not read pip's own."""
+def _index() -> list[str]:
+    """Return the index that pip is configured for as uv's option: uv does not read pip's configuration.
+
+    pip's further indexes are left out: such as piwheels, they are for this machine, and not for the servers.
+    """
     asked = [sys.executable, "-P", "-m", "pip", "config", "list", "--disable-pip-version-check"]
     told = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
-    settings = re.findall(r"(?m)^[\w:.]+\.([\w-]+)='(.*)'$", told)
-    found = dict(settings)  # variables come last, and count more than files
-    options = {"index-url": "--default-index", "extra-index-url": "--index", "find-links": "--find-links"}
-    words = [
-        word
-        for theirs, ours in options.items()
-        for value in re.split(r"\s+|\\n", found.get(theirs, ""))
-        if value
-        for word in (ours, value)
-    ]
-    return [*words, "--no-index"] if found.get("no-index", "").lower() in {"1", "true", "yes", "on"} else words
+    found = re.findall(r"(?m)^[\w:.]+\.index-url='(.*)'$", told)
+    return ["--default-index", found[-1]] if found else []  # variables come last, and count more than files
 
 
 def explained(said: str) -> Problem:
