@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import pip
 import requests
 
 from hippodrome.deployment.code.packages import cache_folder
@@ -34,8 +35,8 @@ DOCKERS = tuple(
 )
 OCIS = tuple(f"{OCI}.{kind}" for kind in ("manifest.v1+json", "config.v1+json", "layer.v1.tar+gzip"))
 
-# What the base has beside apt and the essential packages, as Debian's official images. Its documents and translations are left out.
-_INCLUDED = ("python3.13", "ca-certificates", "openssl")
+# The base has apt and the essential packages, as Debian's official images, and these; no documents and translations.
+_INCLUDED = ("python3.13", "ca-certificates", "openssl", "passwd")
 _PATHS = (f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in ("doc", "man", "locale", "info"))
 _RECIPE = ("--variant=apt", f"--include={','.join(_INCLUDED)}", *_PATHS)
 
@@ -102,28 +103,49 @@ def push_debian(address: str, name: str, folder: Path) -> str:
 def push_official(address: str, name: str, folder: Path, version: str = "3.13.5") -> str:
     """Push the base as Docker's official image is: Python in /usr/local, an index, media types of Docker."""
     moved = {f"usr/{path}": f"usr/local/{path}" for path in ("lib/python3.13", "bin/python3.13")}
-    body = _repacked({"usr/local/bin/python": "python3.13"}, moved)
+    body = _repacked({"usr/local/bin/python": "python3.13"}, moved, {"usr/local/bin/pip": _PIP, **_pip()})
     variables = {"PATH": "/usr/local/bin:/usr/local/sbin:/usr/sbin:/usr/bin:/sbin:/bin", "PYTHON_VERSION": version}
     return _push(Repository(f"http://{address}", name), body, folder, variables, official=True)
 
 
-def _repacked(links: Mapping[str, str], moved: Mapping[str, str]) -> bytes:
-    """Pack Debian's files anew, with these links beside them, and without devices and apt's lists."""
+_PIP = b"#!/usr/local/bin/python\nimport sys\nfrom pip._internal.cli.main import main\nsys.exit(main())\n"
+
+
+def _pip() -> dict[str, bytes]:
+    """Return the files of this machine's pip, as they lie in the official image."""
+    folder = Path(pip.__file__).parent
+    files = [*folder.rglob("*"), *folder.parent.glob("pip-*.dist-info/*")]
+    return {
+        f"usr/local/lib/python3.13/dist-packages/{path.relative_to(folder.parent).as_posix()}": path.read_bytes()
+        for path in files
+        if path.is_file() and path.suffix != ".pyc"
+    }
+
+
+def _repacked(links: Mapping[str, str], moved: Mapping[str, str], files: Mapping[str, bytes] | None = None) -> bytes:
+    """Pack Debian's files anew, with these links and files beside them, and without devices and apt's lists."""
 
     def place(path: str) -> str:
         path = path.removeprefix("./").rstrip("/")
         old = next((old for old in moved if path == old or path.startswith(f"{old}/")), "")
         return moved[old] + path.removeprefix(old) if old else path
 
-    out = io.BytesIO()
+    out, known = io.BytesIO(), {""}  # /usr/local has its folder for Python already
     with tarfile.open(debian()) as debians, tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT) as tar:
         for info in debians:
             info.name = place(info.name)
-            if info.name and not info.isdev() and not info.name.startswith(("dev/", "var/cache/", "var/lib/apt/")):
+            needless = info.isdev() or info.name.startswith(("dev/", "var/cache/", "var/lib/apt/"))
+            # Docker's Python has no such file: it lets pip install.
+            if info.name not in known and not needless and not info.name.endswith("/EXTERNALLY-MANAGED"):
+                known.add(info.name)
                 body = debians.extractfile(info) if info.isreg() else None
                 if info.islnk():
                     info.linkname = place(info.linkname)
                 tar.addfile(info, body)
+        for name, content in (files or {}).items():
+            member = tarfile.TarInfo(name)
+            member.size, member.mode = len(content), 0o755
+            tar.addfile(member, io.BytesIO(content))
         for name, target in links.items():
             link = tarfile.TarInfo(name)
             link.type, link.linkname = tarfile.SYMTYPE, target
@@ -170,6 +192,31 @@ def _put(there: Repository, document: Mapping[str, Any], reference: str) -> None
         timeout=30,
     )
     assert answer.ok, answer.text
+
+
+def buildahs_settings(folder: Path, address: str) -> dict[str, str]:
+    """Return variables with which Buildah builds here as root, in a folder of its own, without user namespaces.
+
+    The registry speaks plain HTTP, and what runs in a build trusts the certificates that this machine trusts.
+    """
+    folder.mkdir()
+    trusted = "/etc/ssl/certs"
+    texts = {
+        "registries.conf": f'[[registry]]\nlocation = "{address}"\ninsecure = true\n',
+        "storage.conf": f'[storage]\ndriver = "vfs"\ngraphroot = "{folder}/graph"\nrunroot = "{folder}/run"\n',
+        "policy.json": '{"default": [{"type": "insecureAcceptAnything"}]}',
+        "containers.conf": f'[containers]\nvolumes = ["{trusted}:{trusted}:ro"]\nenv = ["PIP_DEFAULT_TIMEOUT=180"]\n',
+        "auth.json": "{}",
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    return {
+        "BUILDAH_ISOLATION": "chroot",
+        "CONTAINERS_REGISTRIES_CONF": str(folder / "registries.conf"),
+        "CONTAINERS_STORAGE_CONF": str(folder / "storage.conf"),
+        "CONTAINERS_CONF": str(folder / "containers.conf"),
+        "REGISTRY_AUTH_FILE": str(folder / "auth.json"),
+    }
 
 
 def unpack(address: str, name: str, tag: str, root: Path) -> dict[str, Any]:

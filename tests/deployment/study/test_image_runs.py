@@ -28,7 +28,7 @@ from hippodrome.bots.game import GameConnection
 from hippodrome.bots.report import BotReport, PlayedStep
 from hippodrome.console.problem import Problem
 from hippodrome.deployment.code import bytecode
-from hippodrome.deployment.study.image import assembled, packages
+from hippodrome.deployment.study.image import assembled, builders, packages
 from hippodrome.deployment.study.image.bundle import make_bundle
 from hippodrome.deployment.study.image.order import Order
 from hippodrome.deployment.study.image.registry import Repository
@@ -50,7 +50,13 @@ class Images:
 
     def order(self, study: Path, base: str, tag: str, **options: Any) -> Order:
         bundle = make_bundle(study, self.bases[base], {"game": "ALE/MsPacman-v5"})
-        repository: Any = SimpleNamespace(address=f"http://{self.address}", name=STUDY, password=lambda: "")
+        repository: Any = SimpleNamespace(
+            uri=f"{self.address}/{STUDY}",
+            registry=self.address,
+            address=f"http://{self.address}",
+            name=STUDY,
+            password=lambda: "",
+        )
         return Order(repository, tag, tag, bundle, **options)
 
 
@@ -140,6 +146,23 @@ def played(root: Path, config: Mapping[str, Any], folder: Path) -> PlayedStep:
         process.kill()
         process.wait()
     return play
+
+
+def test_an_image_that_buildah_builds_plays_likewise(
+    images: Images, study: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if lacking := sandbox.missing("buildah"):
+        assert not os.environ.get("REQUIRE_IMAGES"), lacking
+        pytest.skip(lacking)
+    for name, value in sandbox.buildahs_settings(tmp_path / "buildah", images.address).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(builders, "BUILDERS", [each for each in builders.BUILDERS if each.program == "buildah"])
+    monkeypatch.setattr(builders, "_login", lambda *_: None)  # buildah logs in by TLS alone
+    builders.build(images.order(study, "the official layout", "built"))
+    config = sandbox.unpack(images.address, STUDY, "built", root)
+    play = played(root, config, tmp_path)
+    assert play.done
+    assert play.frames > 30
 
 
 def test_a_changed_agent_is_all_that_is_sent(images: Images, study: Path, capsys: pytest.CaptureFixture[str]) -> None:
