@@ -14,10 +14,10 @@ from hippodrome.deployment.core.finding import Finding, Mark
 SCHEMA = 1
 LINES: Mapping[str, str] = {
     "study": "S3 takes the pages, and Lambda runs the function that registers a study",
-    "site": "the domain leads to the site, served by API Gateway with ACM's certificate, and it says HSTS",
+    "site": "the address leads to the site, served by API Gateway with a certificate, and it says HSTS",
     "links": "a link without its signature, or with another's, is refused",
     "pages": "participants come by signed links, and the pages take their answers",
-    "servers": "servers start, on Fargate Spot or on demand, get an address, a name that resolves, and a certificate",
+    "servers": "servers start, on Fargate Spot or on demand, and get an address, a certificate, and perhaps a name",
     "game": "players get in by their token, see frames, press keys, and come to the end",
     "killed": "a server whose task is killed is replaced, and the game goes on",
     "end": "the stop step ends a server, and nothing of it is left",

@@ -29,7 +29,6 @@ READY = 420.0  # seconds until a server must be ready, a lost attempt included
 SOON = timedelta(seconds=75)  # the time from now until the moved timer; a timer fires within the minute after its time
 FIRED = 330.0  # seconds until the timer's server must be closed
 TASK_GONE = 240.0  # seconds until its task, timer and name must be gone
-LEFTOVERS = 2  # a timer and a name, which the sweep has to remove
 SEEN = 30.0  # seconds until AWS's lists must show what was made or removed
 ACTED = 60.0  # seconds until CloudWatch must have sent to the topic
 NOWHERE = "192.0.2.1"  # an address for documentation (RFC 5737), which no host has
@@ -119,19 +118,25 @@ class Timer:
 
 
 def sweep(scene: RehearsalContext, closed: Server | None) -> None:
-    """Make a timer and a name for a closed server, and run the sweep. Raises `CheckFailed` if it leaves one of them."""
+    """Make a timer and a name for a closed server, and run the sweep. Raises `CheckFailed` if it leaves one of them.
+
+    Without a domain servers have no names.
+    """
     if closed is None or not closed.is_closed:
         raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
     platform = scene.platform
     later = platform.now() + timedelta(days=1)
     stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
     platform.timers.set(closed.name, later, to_message(stop))
-    platform.dns.change(add=[DnsRecord(closed.dns, NOWHERE)])
+    made = ["a timer"]
+    if closed.dns:
+        platform.dns.change(add=[DnsRecord(closed.dns, NOWHERE)])
+        made.append("a name")
     scene.wait(
-        lambda: True if len(left(scene, closed.user_id)) == LEFTOVERS else None,
+        lambda: True if len(left(scene, closed.user_id)) == len(made) else None,
         "waiting until the leftovers can be seen",
         SEEN,
-        CheckFailed("A timer and a name were made, and AWS does not list them.", "Run it again."),
+        CheckFailed(f"{' and '.join(made).capitalize()} were made, and AWS does not list them.", "Run it again."),
     )
     scene.progress("running the sweep")
     answer = scene.context.account.client("lambda").invoke(
@@ -149,7 +154,7 @@ def sweep(scene: RehearsalContext, closed: Server | None) -> None:
             "The sweep has left something of a closed server.", "See `hippodrome logs --all --function sweep`."
         ),
     )
-    scene.transcript.good("sweep", "It removed a timer and a name that a closed server had left.")
+    scene.transcript.good("sweep", f"It removed {' and '.join(made)} that a closed server had left.")
 
 
 def _type_of(body: bytes) -> str:
@@ -224,7 +229,7 @@ def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
         started = task.get("startedAt")
         _add_seconds(measured["start"], task.get("createdAt"), started)
         _add_seconds(measured["told"], started, record.running)
-        _add_seconds(measured["name"], record.running, record.ready)
+        _add_seconds(measured["name" if record.dns else "certificate"], record.running, record.ready)
         _add_seconds(measured["gone"], task.get("executionStoppedAt"), task.get("stoppedAt"))
     texts, slow = [], []
     for stage, seconds in measured.items():
