@@ -153,6 +153,10 @@ def _started(folder: Path, lifetime: timedelta) -> Iterator[Pebble]:
         "ocspResponderURL": "",
         "externalAccountBindingRequired": False,
         "domainBlocklist": ["blocked.example"],
+        "profiles": {  # Pebble 2.7 and later; earlier ones know no profiles
+            "default": {"description": "for names", "validityPeriod": int(lifetime.total_seconds())},
+            "shortlived": {"description": "for addresses", "validityPeriod": 160 * 3600},
+        },
         "certificateValidityPeriod": int(lifetime.total_seconds()),
     }
     (folder / "pebble.json").write_text(json.dumps({"pebble": config}))

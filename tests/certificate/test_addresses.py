@@ -7,14 +7,17 @@ import json
 import os
 import socket
 import ssl
+import struct
 import subprocess
 import sys
 import threading
+import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 import pytest
@@ -22,7 +25,14 @@ from cryptography import x509
 
 from hippodrome.control.certificates.accounts import account_key
 from hippodrome.control.certificates.addresses import AddressAuthority
-from hippodrome.control.certificates.rules import ACCOUNT, ADDRESS_ORDERS, MAX_ORDERS, AddressOrders
+from hippodrome.control.certificates.rules import (
+    ACCOUNT,
+    ADDRESS_ORDERS,
+    MAX_ORDERS,
+    AddressOrders,
+    FailureReason,
+    OrderFailed,
+)
 from hippodrome.control.http import Request
 from hippodrome.control.model import server as servers
 from hippodrome.control.model.messages import DnsChanged, ServerAttempt, parse_dns_changed
@@ -31,6 +41,7 @@ from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.servers.certifying import Certifying
 from hippodrome.control.storage.secret import SecretCache
 from hippodrome.protocol import exits
+from hippodrome.trial.server import own_certificate
 from hippodrome.trial.server.own_certificate import NoCertificate, Order
 from testing.fake_platform import FakePlatform
 from testing.studies import study
@@ -39,8 +50,9 @@ from tests.certificate.pebble import Pebble
 ROOT = Path(__file__).resolve().parents[2]
 HOST = "127.0.0.1"
 AGENT = """
+import pathlib
 class Agent:
-    def start(self, game): pass
+    def start(self, game): pathlib.Path(__file__).with_name("started").touch()
     def reset(self): pass
     def step(self, action): pass
     def render(self): pass
@@ -63,6 +75,7 @@ class Installation(FakePlatform):
         super().__init__()
         self.settings = replace(self.settings, root_domain="", servers_host="", game_sources="")
         self.pebble, self.url = pebble, ""
+        self.received: list[tuple[str, dict[str, Any]]] = []  # the source and the body of each request of a trial
         self.secrets = SecretCache(self.documents)
         self.secrets.get_or_create()
         self.certifying = Certifying(self, self.open_authority)
@@ -83,7 +96,7 @@ class Installation(FakePlatform):
     def credential(self, record: Server) -> str:
         return self.secrets.get_or_create().credential(record.name, record.nonce)
 
-    def ask(self, record: Server, source: str = HOST, **more: str) -> tuple[int, dict[str, Any]]:
+    def ask(self, record: Server, source: str = HOST, **more: str | bool) -> tuple[int, dict[str, Any]]:
         body = json.dumps({"server": record.name, "credential": self.credential(record), **more}).encode()
         answer = self.certifying.respond(Request("POST", "/certificate", (), {}, body, source))
         return answer.status, json.loads(answer.body)
@@ -112,6 +125,7 @@ def installation(pebble: Pebble) -> Iterator[Installation]:
     class Function(http.server.BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"]))
+            made.received.append((self.client_address[0], json.loads(body)))
             answer = made.certifying.respond(Request("POST", self.path, (), {}, body, self.client_address[0]))
             self.send_response(answer.status)
             self.end_headers()
@@ -193,6 +207,7 @@ def test_a_server_waits_for_its_certificate_until_its_task_was_seen(installation
     installation.server(ServerState.NAMING)
     thread.join(30)
     assert issued
+    assert sum("answer" in sent for _, sent in installation.received) == 1  # each answer is another validation
     assert installation.ready
 
 
@@ -204,7 +219,7 @@ def test_after_three_failed_orders_the_trial_ends_with_an_exit_code_of_its_own(i
 
 
 def test_an_order_belongs_to_the_address_that_the_request_comes_from(installation) -> None:
-    record = installation.server()
+    record = installation.server(ServerState.STARTING, host="")
     _, placed = installation.ask(record)
     assert placed["address"] == HOST
     assert installation.ask(record, "127.0.0.2", order=placed["order"], csr="") == (
@@ -213,6 +228,117 @@ def test_an_order_belongs_to_the_address_that_the_request_comes_from(installatio
     )
     elsewhere = "http://169.254.169.254/order"
     assert installation.ask(record, order=elsewhere, csr="")[0] == 403
+
+
+def test_no_order_is_placed_for_another_address_than_the_tasks(installation) -> None:
+    assert installation.ask(installation.server(), "127.0.0.2")[0] == 409
+    assert installation.orders == 0
+
+
+def test_the_authority_looks_when_the_server_says_so_and_the_failure_is_the_validations(installation) -> None:
+    record = installation.server()
+    order = installation.ask(record)[1]["order"]
+    for _ in range(3):
+        time.sleep(0.2)
+        assert installation.ask(record, order=order, csr="") == (200, {})
+    answer = installation.ask(record, order=order, csr="", answer=True)
+    for _ in range(50):
+        if answer != (200, {}):
+            break
+        time.sleep(0.2)
+        answer = installation.ask(record, order=order, csr="")
+    assert answer == (200, {"failed": "validation"})
+
+
+class Refusing:
+    """An authority that refuses each order with this text."""
+
+    def __init__(self, text: str, until: datetime, reason: FailureReason = FailureReason.RATE_LIMITED) -> None:
+        self.error = OrderFailed(reason, text, until)
+
+    def order(self, address: str) -> NoReturn:
+        raise self.error
+
+    def advance(self, *args: str, **options: bool) -> NoReturn:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "too many certificates (5) already issued for this exact set of identifiers in the last 168h0m0s, retry after …",
+        'too many failed authorizations (5) for "203.0.113.7" in the last 1h0m0s, retry after …',
+    ],
+)
+def test_the_limit_of_one_address_keeps_no_other_server_from_ordering(installation, text) -> None:
+    record = installation.server()
+    installation.certifying = Certifying(installation, lambda: Refusing(text, installation.now() + timedelta(hours=34)))
+    assert installation.ask(record) == (200, {"refused": "the limit of this address"})
+    installation.certifying = Certifying(installation, installation.open_authority)
+    assert "order" in installation.ask(record)[1]
+
+
+def test_the_limit_of_the_account_keeps_all_from_ordering_until_it_is_over(installation) -> None:
+    record = installation.server()
+    text = "too many new orders (300) from this account in the last 3h0m0s, retry after …"
+    installation.certifying = Certifying(
+        installation, lambda: Refusing(text, installation.now() + timedelta(minutes=1))
+    )
+    assert installation.ask(record) == (200, {"refused": "the limit of this account"})
+    installation.certifying = Certifying(installation, installation.open_authority)
+    assert "refused" in installation.ask(record)[1]
+    installation.wait(minutes=2)
+    assert "order" in installation.ask(record)[1]
+
+
+@pytest.mark.parametrize("reason", [FailureReason.RATE_LIMITED, FailureReason.UNREACHABLE])
+def test_a_busy_authority_costs_no_order_and_the_server_asks_again(installation, reason) -> None:
+    record = installation.server()
+    order = installation.ask(record)[1]["order"]
+    busy = Refusing("Service busy; retry later.", installation.now() + timedelta(hours=1), reason)
+    installation.certifying = Certifying(installation, lambda: busy)
+    assert installation.ask(record)[0] == 503
+    assert installation.ask(record, order=order, csr="")[0] == 503
+    installation.certifying = Certifying(installation, installation.open_authority)
+    assert installation.ask(record, order=order, csr="") == (200, {})
+    assert installation.orders == 1
+
+
+def test_a_trial_that_waits_for_its_certificate_ends_when_asked_to(installation, trial, tmp_path) -> None:
+    process = trial(installation.server(ServerState.STARTING, host=""))
+    while not (tmp_path / "started").exists():
+        time.sleep(0.05)
+    process.terminate()
+    assert process.wait(10) == 0
+
+
+def test_a_trial_asks_over_ipv4_although_the_functions_name_has_an_ipv6_address_too(installation, monkeypatch) -> None:
+    asked = socket.getaddrinfo
+    v6 = (socket.AF_INET6, socket.SOCK_STREAM, 6, "", ("::1", 1, 0, 0))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *wanted: [v6, *asked(*wanted)])
+    connected = []
+    connect = socket.socket.connect
+    monkeypatch.setattr(
+        socket.socket, "connect", lambda this, to: (connected.append(this.family), connect(this, to))[1]
+    )
+    record = installation.server()
+    placed = Order(installation.url, record.name, installation.credential(record))._post(
+        {"server": "", "credential": ""}
+    )
+    assert placed[0] == 403
+    assert connected == [socket.AF_INET]
+
+
+def test_who_hangs_up_on_the_proof_leaves_nothing_in_the_log(capfd) -> None:
+    port = free_port()
+    with own_certificate._serving(port, "token", "proof"):
+        for _ in range(3):
+            with socket.create_connection((HOST, port)) as scanner:
+                scanner.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closes by a reset
+                scanner.sendall(b"GET / HTTP/1.0\r\n")
+        url = f"http://{HOST}:{port}/.well-known/acme-challenge/token"
+        assert urllib.request.urlopen(url, timeout=5).read() == b"proof"
+    assert capfd.readouterr().err == ""
 
 
 def test_a_wrong_credential_and_a_server_that_has_a_name_or_has_ended_get_nothing(installation) -> None:

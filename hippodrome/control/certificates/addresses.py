@@ -6,7 +6,9 @@ execution while the CA works. Nothing is kept between the calls, except the clie
 Facts of Let's Encrypt (its pages "Profiles", 8 September 2026, "Rate Limits", 12 June 2025, and its announcement of 15
 January 2026; read November 2026): certificates for addresses come with the profile `shortlived` alone, live for 160
 hours, and need HTTP-01 or TLS-ALPN-01. An account may place 300 orders in 3 hours, one more every 36 seconds; an
-address gets 5 certificates in 7 days, over all accounts. A failed order cannot be repeated: each try is a new one.
+address gets 5 certificates in 7 days, over all accounts, and 5 failed validations an hour. A failed order cannot be
+repeated: each try is a new one. Each answer to a challenge starts a validation, also while another one runs, and each
+counts if it fails (boulder's `PerformValidation`, August 2026), so a challenge is answered once.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from acme import challenges, client, messages
 from cryptography import x509
 
 from hippodrome.control.certificates.rules import FailureReason, OrderFailed
-from hippodrome.control.certificates.session import errors_translated, open_account, open_network
+from hippodrome.control.certificates.session import errors_translated, open_account, open_network, text_of
 
 PROFILE = "shortlived"
 
@@ -63,10 +65,11 @@ class AddressAuthority:
                 url, challenge.chall.encode("token"), challenge.chall.key_authorization(self._network.key)
             )
 
-    def advance(self, url: str, address: str, csr: str, *, may_issue: bool) -> str:
+    def advance(self, url: str, address: str, csr: str, *, answer: bool, may_issue: bool) -> str:
         """Take the order's next step; return the chain of certificates (PEM) once it is issued, else "".
 
-        Without `may_issue` the order stops before its certificate. Raises OrderFailed if the order has failed, and
+        With `answer` the CA is asked to look at the address. Without `may_issue` the order stops before its
+        certificate. Raises OrderFailed if the order has failed, and
         PermissionError if it is no order for this address at this authority.
         """
         if urlsplit(url)[:2] != urlsplit(self._directory)[:2]:
@@ -76,26 +79,29 @@ class AddressAuthority:
             named = [(identifier.typ, identifier.value) for identifier in order.identifiers]
             if named != [(messages.IDENTIFIER_IP, address)]:
                 raise PermissionError("the order is for another address")
-            if order.status == messages.STATUS_PENDING:
+            if order.status == messages.STATUS_PENDING and answer:
                 self._answer(order)
             elif order.status == messages.STATUS_READY and may_issue:
                 wanted = messages.CertificateRequest(csr=_request(csr))
                 order = messages.Order.from_json(self._post(order.finalize, wanted).json())
             if order.status == messages.STATUS_INVALID:
-                raise OrderFailed(FailureReason.REFUSED, _reason(order.error))
+                raise self._failure(order)
             if order.status == messages.STATUS_VALID and may_issue:
                 return str(self._post(order.certificate).text)
         return ""
 
     def _answer(self, order: messages.Order) -> None:
-        """Ask the CA to look at the address, once. Raises OrderFailed if it has looked in vain."""
+        """Ask the CA to look at the address."""
         challenge = self._challenge(order)
-        if challenge is None:
-            return
-        if challenge.status == messages.STATUS_INVALID:
-            raise OrderFailed(FailureReason.VALIDATION, _reason(challenge.error))
-        if challenge.status == messages.STATUS_PENDING:
+        if challenge is not None and challenge.status == messages.STATUS_PENDING:
             self._authority.answer_challenge(challenge, challenge.response(self._network.key))
+
+    def _failure(self, order: messages.Order) -> OrderFailed:
+        """Why this order is invalid: the challenge says it, or the order if its certificate was refused."""
+        challenge = self._challenge(order)
+        if challenge is not None and challenge.error is not None:
+            return OrderFailed(FailureReason.VALIDATION, text_of(challenge.error))
+        return OrderFailed(FailureReason.REFUSED, text_of(order.error) if order.error else "it gave no reason")
 
     def _challenge(self, order: messages.Order) -> messages.ChallengeBody | None:
         """The order's HTTP-01 challenge; None if the address is proven. Raises OrderFailed if there is none."""
@@ -116,7 +122,3 @@ class AddressAuthority:
 
 def _request(csr: str) -> x509.CertificateSigningRequest:
     return x509.load_pem_x509_csr(csr.encode())
-
-
-def _reason(error: messages.Error | None) -> str:
-    return str((error and (error.detail or error.title)) or "it gave no reason")

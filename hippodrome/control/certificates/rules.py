@@ -95,6 +95,23 @@ class FailureReason(StrEnum):
     BROKEN = "broken"  # anything else
 
 
+class Limit(StrEnum):
+    """What a `rateLimited` order has too much of: another address does not help against all of these limits."""
+
+    ACCOUNT = "account"  # orders of our account
+    ADDRESS = "address"  # certificates for this address, or failed validations of it
+    REQUESTS = "requests"  # requests to the CA, from whomever: it is busy
+
+
+def limit_in(text: str) -> Limit:
+    """Return the limit that Let's Encrypt names in this refusal (boulder's ratelimits/limiter.go, August 2026)."""
+    if "from this account" in text:
+        return Limit.ACCOUNT
+    if "too many" in text or "temporarily prevented" in text:
+        return Limit.ADDRESS
+    return Limit.REQUESTS
+
+
 class OrderFailed(Exception):
     """The order failed, and the certificate in use stays. `until`: the CA asks for no retry before this time."""
 

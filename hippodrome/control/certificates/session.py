@@ -131,7 +131,7 @@ def errors_translated(retry_after: Mapping[str, datetime]) -> Iterator[None]:
 
 
 def _refusal(error: messages.Error, retry_after: Mapping[str, datetime]) -> OrderFailed:
-    text = _text(error)
+    text = text_of(error)
     match error.code:
         case "rateLimited":
             until = retry_after.get("until") or _retry_after_in(text) or datetime.now(UTC) + DEFAULT_WAIT
@@ -154,11 +154,11 @@ def _invalid(error: errors.ValidationError, retry_after: Mapping[str, datetime])
     for reason in reasons:
         if reason.code in {"caa", "rateLimited"}:
             return _refusal(reason, retry_after)
-    return OrderFailed(FailureReason.VALIDATION, "; ".join(map(_text, reasons)) or "it gave no reason")
+    return OrderFailed(FailureReason.VALIDATION, "; ".join(map(text_of, reasons)) or "it gave no reason")
 
 
-def _text(error: messages.Error) -> str:
-    """The CA's message in one line, without control characters, since it may be printed in a terminal."""
+def text_of(error: messages.Error) -> str:
+    """Return the CA's message in one line, without control characters, since it may be printed in a terminal."""
     sentences = [error.detail or error.title or str(error.typ or "no reason given")]
     sentences += [problem.detail for problem in error.subproblems or () if problem.detail]
     return " ".join("".join(c if c.isprintable() else " " for c in " ".join(sentences)).split())[:1000]

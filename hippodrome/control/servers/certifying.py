@@ -5,11 +5,13 @@ The server shows its credential, first to place an order, then again and again u
     {"server": "s…-1", "credential": "…"}
     {"address": "203.0.113.7", "order": "https://…", "token": "…", "proof": "…"}
 
-    {"server": "s…-1", "credential": "…", "order": "https://…", "csr": "-----BEGIN CERTIFICATE REQUEST-----…"}
+    {"server": "s…-1", "credential": "…", "order": "https://…", "csr": "-----BEGIN CERTIFICATE …", "answer": true}
     {} or {"certificate": "-----BEGIN CERTIFICATE-----…"}
 
-Instead, `{"failed": "…"}` says that another order is needed, and `{"refused": "…"}` that none may be placed now. The
-address is the one that the request comes from, so no server gets a certificate for an address that it does not have.
+The first of these has `answer`: the server shows the proof now. Instead, `{"failed": "…"}` says that another order is
+needed, and `{"refused": "…"}` that none may be placed for this address now. Status 503: ask again.
+
+The address is the one that the request comes from, so no server gets a certificate for an address that is not its own.
 The certificate is handed out once `task_changed` has seen the task's address, and makes the server `ready`.
 """
 
@@ -26,7 +28,9 @@ from hippodrome.control.certificates.rules import (
     MAX_ORDERS,
     AddressOrders,
     FailureReason,
+    Limit,
     OrderFailed,
+    limit_in,
 )
 from hippodrome.control.http import Refusal, Request, Response
 from hippodrome.control.log import logger
@@ -59,7 +63,7 @@ class Authority(Protocol):
     """An ACME authority with our account, as in `certificates.addresses.AddressAuthority`."""
 
     def order(self, address: str) -> PlacedOrder: ...
-    def advance(self, url: str, address: str, csr: str, *, may_issue: bool) -> str: ...
+    def advance(self, url: str, address: str, csr: str, *, answer: bool, may_issue: bool) -> str: ...
 
 
 class CertificateRequest(msgspec.Struct, frozen=True):
@@ -69,6 +73,7 @@ class CertificateRequest(msgspec.Struct, frozen=True):
     credential: str
     order: str = ""
     csr: str = ""
+    answer: bool = False  # the CA may look at the address now
 
 
 class Certifying:
@@ -86,37 +91,37 @@ class Certifying:
     def respond(self, request: Request) -> Response:
         """Place an order, or take its next step.
 
-        AWS calls: one read of the server's record; two for a new order; one message once the certificate is issued.
+        AWS calls: one read of the server's record; three for a new order; one message once the certificate is issued.
         """
         try:
             wanted = _read(request)
             record = record_of(wanted.server, wanted.credential, self._repository, self._secrets)
             if record.dns or not record.owns(wanted.server) or record.state not in {*_WAITING, *_ISSUED}:
                 raise Refusal(409, "This server needs no certificate now.")
+            if record.host and record.host != request.source:
+                raise Refusal(409, "The request does not come from the address of the server's task.")
             answer = self._advance(record, wanted, request.source) if wanted.order else self._place(request.source)
         except Refusal as refusal:
             return _json(refusal.status, {"message": refusal.text})
         except OrderFailed as failed:
-            logger.warning("a certificate was not issued", extra={"server": wanted.server, "why": failed.reason.value})
+            about = {"server": wanted.server, "why": failed.reason.value, "text": str(failed)}
+            logger.warning("a certificate was not issued", extra=about)
             return self._failed(failed)
         return _json(200, answer)
 
     def _place(self, address: str) -> dict[str, str]:
         now = self._platform.now()
-
-        def placed(orders: AddressOrders) -> AddressOrders:
-            return orders.with_order(now) if orders.allows(now, MAX_ORDERS) else orders
-
-        orders = self._shared.change(ADDRESS_ORDERS, AddressOrders, placed)
-        if orders.after == orders.before:
+        if not self._shared.read(ADDRESS_ORDERS, AddressOrders).allows(now, MAX_ORDERS):
             return {"refused": "the limit of certificates is reached"}
         order = self._client().order(address)
+        # Not before: while the CA is away, servers ask each second, which would use up three hours' orders in vain.
+        self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: orders.with_order(now))
         return {"address": address, "order": order.url, "token": order.token, "proof": order.proof}
 
     def _advance(self, record: Server, wanted: CertificateRequest, address: str) -> dict[str, str]:
         may_issue = record.state in _ISSUED and record.host == address
         try:
-            chain = self._client().advance(wanted.order, address, wanted.csr, may_issue=may_issue)
+            chain = self._client().advance(wanted.order, address, wanted.csr, answer=wanted.answer, may_issue=may_issue)
         except PermissionError:
             raise Refusal(403, "That order is for another address.") from None
         except ValueError:
@@ -129,11 +134,22 @@ class Certifying:
         return {"certificate": chain}
 
     def _failed(self, failed: OrderFailed) -> Response:
-        if failed.reason is not FailureReason.RATE_LIMITED:
+        """The answer after a failure: only a limit of our account keeps other servers from ordering, too.
+
+        Addresses are used again, by AWS's other customers as well, so any of them may have used up its own limit.
+        """
+        limit = limit_in(str(failed)) if failed.reason is FailureReason.RATE_LIMITED else None
+        if failed.reason is FailureReason.UNREACHABLE or limit is Limit.REQUESTS:
+            self._authority = None  # perhaps its connection is broken
+            return _json(503, {"message": "The certificate authority does not answer now."})
+        if limit is None:
             return _json(200, {"failed": failed.reason.value})
-        until = failed.until
-        self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: msgspec.structs.replace(orders, until=until))
-        return _json(200, {"refused": failed.reason.value})
+        if limit is Limit.ACCOUNT:
+            until = failed.until
+            self._shared.change(
+                ADDRESS_ORDERS, AddressOrders, lambda orders: msgspec.structs.replace(orders, until=until)
+            )
+        return _json(200, {"refused": f"the limit of this {limit.value}"})
 
     def _client(self) -> Authority:
         self._authority = self._authority or self._open_authority()

@@ -33,8 +33,10 @@ ORDERS = 3  # tries
 ORDER_SECONDS = 60.0  # for one order; Let's Encrypt usually takes less than ten
 PAUSES = (0.3, 2.0)  # seconds between questions: the first, and the longest; each is a quarter longer than the last
 BETWEEN_ORDERS = 5.0  # seconds
+BUSY = 2.0  # seconds until the same question is sent again if it was not answered
 TIMEOUT = 20.0  # seconds for one answer
 CHALLENGE_PORT = 80  # RFC 8555, section 8.3
+_IPV4 = ("0.0.0.0", 0)  # noqa: S104 - the local address: in a network with IPv6 the function would see that address
 _PATH = "/.well-known/acme-challenge/"
 _NEW_REQUEST = "openssl req -new -newkey ec -pkeyopt ec_paramgen_curve:P-256 -noenc -batch -subj /"
 
@@ -98,13 +100,16 @@ class Order:
             command = [*_NEW_REQUEST.split(), *names, "-keyout", str(key), "-out", str(request)]
             subprocess.run(command, check=True, capture_output=True)  # noqa: S603 - the address is the function's
             pause, longest = PAUSES
-            while (answer := self._ask(deadline, order=order["order"], csr=request.read_text())) == {}:
+            wanted = {"order": order["order"], "csr": request.read_text()}
+            answer = self._ask(deadline, **wanted, answer=True)
+            while answer == {}:
                 time.sleep(pause)
                 pause = min(longest, pause * 1.25)
+                answer = self._ask(deadline, **wanted)
             chain = answer.get("certificate") if answer else None
             return CertificateAndKey(chain.encode(), key.read_bytes()) if chain else None
 
-    def _ask(self, deadline: float, **more: str) -> dict[str, str] | None:
+    def _ask(self, deadline: float, **more: str | bool) -> dict[str, str] | None:
         """Ask the function; None if the order has failed or takes too long. Raises NoCertificate if it says no."""
         while time.monotonic() < deadline:
             status, answer = self._post({**self._sent, **more})
@@ -117,17 +122,19 @@ class Order:
                 return answer
             if status in (400, 403, 409):
                 raise NoCertificate(str(answer.get("message", status)))
-            time.sleep(1.0)  # no answer, a busy function, or an error on our side
+            time.sleep(BUSY)  # no answer, a busy function, or an error on our side
         log.warning("an order of a certificate takes too long")
         return None
 
-    def _post(self, body: Mapping[str, str]) -> tuple[int, dict[str, Any]]:
-        """Send a request on a connection of its own; status 0 if there is no answer."""
+    def _post(self, body: Mapping[str, str | bool]) -> tuple[int, dict[str, Any]]:
+        """Send a request on a connection of its own, over IPv4; status 0 if there is no answer."""
         host, port = self._url.hostname or "", self._url.port
         connection = (
-            http.client.HTTPSConnection(host, port, timeout=TIMEOUT, context=ssl.create_default_context())
+            http.client.HTTPSConnection(
+                host, port, timeout=TIMEOUT, source_address=_IPV4, context=ssl.create_default_context()
+            )
             if self._url.scheme == "https"
-            else http.client.HTTPConnection(host, port, timeout=TIMEOUT)
+            else http.client.HTTPConnection(host, port, timeout=TIMEOUT, source_address=_IPV4)
         )
         try:
             connection.request("POST", self._url.path, json.dumps(body), {"Content-Type": "application/json"})
@@ -139,6 +146,11 @@ class Order:
             return 0, {}
         finally:
             connection.close()
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Log nothing: a scanner that hangs up would write its address and a traceback into the log."""
 
 
 @contextmanager
@@ -161,7 +173,7 @@ def _serving(port: int, token: str, proof: str) -> Iterator[None]:
         def log_message(self, format: str, *args: object) -> None:
             """Log nothing: anybody may send anything to this port."""
 
-    with ThreadingHTTPServer(("0.0.0.0", port), Proof) as server:  # noqa: S104 - the authority asks from anywhere
+    with _Server(("0.0.0.0", port), Proof) as server:  # noqa: S104 - the authority asks from anywhere
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
         thread.start()
         try:

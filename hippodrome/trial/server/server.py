@@ -104,7 +104,12 @@ class TrialServer:
         self._admission = Admission(lambda: self.settings, self._search, self._store, self._finished_steps)
         self._listener = Listener(settings, self._store, self._connected, self._own)
         self._agent_ready = asyncio.create_task(self._start_agent())  # while the certificate is fetched
-        port = await self._listener.open()
+        ending, opening = asyncio.create_task(self._lifetime.over()), asyncio.create_task(self._listener.open())
+        await asyncio.wait((ending, opening), return_when=asyncio.FIRST_COMPLETED)
+        if not opening.done():  # the certificate may take minutes
+            log.info("ending without a certificate: %s", ending.result())
+            return self._failure if ending.result() == "error" else 0
+        port = await opening
         print(json.dumps({"port": port}), flush=True)
         log.info("listening on port %d", port)
         if not settings.warm_server:
@@ -115,7 +120,7 @@ class TrialServer:
                 self._in_background(self._match())
         self._in_background(self._listener.renew_certificate())
         self._lifetime.watch()
-        reason = await self._lifetime.over()
+        reason = await ending
         log.info("ending: %s", reason)
         exit_hard_after(self.settings.stop_seconds - EXIT_MARGIN)
         await self._close(reason)
