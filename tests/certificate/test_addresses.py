@@ -297,8 +297,8 @@ def test_a_busy_authority_costs_no_order_and_the_server_asks_again(installation,
     order = installation.ask(record)[1]["order"]
     busy = Refusing("Service busy; retry later.", installation.now() + timedelta(hours=1), reason)
     installation.certifying = Certifying(installation, lambda: busy)
-    assert installation.ask(record)[0] == 503
-    assert installation.ask(record, order=order, csr="")[0] == 503
+    assert installation.ask(record)[0] == 429
+    assert installation.ask(record, order=order, csr="")[0] == 429
     installation.certifying = Certifying(installation, installation.open_authority)
     assert installation.ask(record, order=order, csr="") == (200, {})
     assert installation.orders == 1

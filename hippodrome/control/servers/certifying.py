@@ -9,7 +9,7 @@ The server shows its credential, first to place an order, then again and again u
     {} or {"certificate": "-----BEGIN CERTIFICATE-----…"}
 
 The first of these has `answer`: the server shows the proof now. Instead, `{"failed": "…"}` says that another order is
-needed, and `{"refused": "…"}` that none may be placed for this address now. Status 503: ask again.
+needed, and `{"refused": "…"}` that none may be placed for this address now. Status 429: ask again.
 
 The address is the one that the request comes from, so no server gets a certificate for an address that is not its own.
 The certificate is handed out once `task_changed` has seen the task's address, and makes the server `ready`.
@@ -141,7 +141,8 @@ class Certifying:
         limit = limit_in(str(failed)) if failed.reason is FailureReason.RATE_LIMITED else None
         if failed.reason is FailureReason.UNREACHABLE or limit is Limit.REQUESTS:
             self._authority = None  # perhaps its connection is broken
-            return _json(503, {"message": "The certificate authority does not answer now."})
+            # Not 5xx, of which the alarm `site-errors` says that participants saw an error.
+            return _json(429, {"message": "The certificate authority does not answer now."})
         if limit is None:
             return _json(200, {"failed": failed.reason.value})
         if limit is Limit.ACCOUNT:
