@@ -147,6 +147,7 @@ class Bot:
         if step in self.report.answers and not right:
             raise Failed(f"step {step} was answered, and its page is shown once more")
         self.report.stage = f"answers step {step}"
+        await asyncio.sleep(page.least_seconds)
         pairs = form_filling.fill(form, self.random)
         if self._steering:
             pairs = self._steering.fill(step, form, pairs)

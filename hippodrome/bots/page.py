@@ -43,6 +43,12 @@ class VisitedPage:
         return html.unescape(found[1]) if found else ""
 
     @property
+    def least_seconds(self) -> float:
+        """The seconds before which the page's answers are not taken."""
+        found = re.search(r'<body[^>]*\bdata-least="([0-9.]+)"', self.text)
+        return float(found[1]) if found else 0
+
+    @property
     def is_last(self) -> bool:
         """Whether this is the study's last page."""
         return re.search(r"<body[^>]*\bdata-done\b", self.text) is not None

@@ -90,6 +90,7 @@
   const status = inForm(".status:last-of-type").at(0);
   let sending = false;
   let warnedOffline = false;
+  const shownAt = performance.now();
   let timers = [];
 
   function say(text, warn = false) {
@@ -131,6 +132,12 @@
   function onSubmit(event) {
     if (sending) {
       event.preventDefault();
+      return;
+    }
+    const left = Number(page.least ?? 0) - (performance.now() - shownAt) / 1000; // the server takes no answers before
+    if (left > 0) {
+      event.preventDefault();
+      idle(TEXT.tooSoon(Math.ceil(left)), true);
       return;
     }
     const submitter = event.submitter?.name ? event.submitter : undefined;

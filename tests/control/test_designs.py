@@ -403,6 +403,7 @@ def test_a_page_has_a_least_and_a_longest_time(tmp_path: Path, platform: FakePla
     times = study(config, tmp_path, platform)
     alice = times.visitor("alice")
     page = alice.get()
+    assert 'data-least="60"' in page  # the script of the page says how many seconds are left
     alice.answer(page, agree="yes")
     assert heading(alice.get()) == "Consent"
     platform.wait(seconds=61)

@@ -105,11 +105,19 @@ class Config:
         """The files of Hippodrome's own pages that the study uses. They do not lie in the project's folder."""
         return [file for step in self.steps for file in step.files if file == CLOSING]
 
+    @property
+    def end_pages(self) -> list[str]:
+        """The names of the files that ends before the last step show."""
+        return [f"{end.page.removesuffix('.html')}.html" for end in self.design.ends if end.page]
+
     def summary(self) -> str:
         """Return the project in one line: "6 steps, step 4 is the game (CartPole-v1), …"."""
         parts = ["1 step" if len(self.steps) == 1 else f"{len(self.steps)} steps"]
         together = f" for {self.project.players} participants together" if self.project.has_sessions else ""
-        parts += [f"{step_name(step.key)} is the game ({self.trial.game}){together}" for step in self.game_steps]
+        games = " and ".join(step_name(step.key) for step in self.game_steps)
+        if games:
+            verb = "is the game" if len(self.game_steps) == 1 else "are games"
+            parts.append(f"{games} {verb} ({self.trial.game}){together}")
         parts += [f"{step.page} in {step.variants} groups" for step in (*self.steps, *self.game_pages) if step.variants]
         start, stop = self.events.start_server_step, self.events.stop_server_step
         if start and stop:

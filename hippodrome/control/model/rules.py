@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
+from hippodrome.protocol.similar import nearest
+
 ROOTS = ("answers", "condition", "order", "participant", "run")
 """What a rule may ask about."""
 FUNCTIONS = ("sum", "min", "max", "count")
@@ -164,6 +166,8 @@ def _check_names(names: Sequence[str]) -> None:
     if len(names) == 1:
         raise BadRule(f'{names[0]} is not a name here; put texts in quotes ("{names[0]}")')
     written = ".".join(names)
+    if close := nearest(names[0], ROOTS):
+        raise BadRule(f"{written} is not known here; did you mean {'.'.join([close, *names[1:]])}?")
     raise BadRule(f"{written} is not known here; write answers.{written} for the answer to a step")
 
 

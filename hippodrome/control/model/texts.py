@@ -57,6 +57,7 @@ _PAGES = {
     "copied": "Copied",
     "wrongOne": "One answer is not right yet.",
     "wrongSome": "{number} answers are not right yet.",
+    "tooSoon": "Please take your time: you can go on in {seconds} s.",
     "triesOne": "You have one try left.",
     "triesSome": "You have {number} tries left.",
     "endTitle": "Thank you",

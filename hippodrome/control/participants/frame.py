@@ -97,13 +97,15 @@ def frame(
     texts = Texts(project.texts)
     lang = lang or texts.language
     name = project.name or project.id
-    at, steps = project.index(step.key) or 0, len(project.steps)
-    progress = fill("progress", texts, step=at + 1, steps=steps, done=at, all=steps - 1) if steps > 1 else Html()
+    at, steps = project.index(step.key), len(project.steps)
+    shows_progress = at is not None and steps > 1  # the page of an end is no step
+    numbers = {"step": (at or 0) + 1, "steps": steps}
+    progress = fill("progress", texts, **numbers, done=at, all=steps - 1) if shows_progress else Html()
     return fill(
         "frame.html",
         lang=lang,
         dir=_direction(lang),
-        title=texts.say("titleStep", title=title or name, step=at + 1, steps=steps) if steps > 1 else title or name,
+        title=texts.say("titleStep", title=title or name, **numbers) if shows_progress else title or name,
         head=head,
         style=Html(style(body) + (_sheet(sheet) if sheet else "") + _of_direction(lang)),
         body=body,
@@ -171,6 +173,7 @@ _PARTS = {
     "progress": '<label class="progress">TEXT.step <progress max="$all" value="$done"></progress></label>',
     "footer": "<footer><p>TEXT.studyBy</p></footer>",
     "data": ' data-project="$project" data-user="$user" data-step="$step"',
+    "least": ' data-least="$seconds"',
     "end": ' data-end="$end"',
     "named": """<input type="hidden" name="hippodrome-step" value="$step">
 <input type="hidden" name="hippodrome-ticket" value="$ticket">
@@ -234,6 +237,12 @@ def style(kind: str | None = None) -> str:
     if kind:
         text = _SECTION.sub(lambda section: section[2] if section[1] == kind else "", text)
     return _plain("style.css", text)
+
+
+def style_of_pages_in_game() -> str:
+    """Return the sections of `style.css` for step pages, for what the game page shows of the researcher's pages."""
+    sections = [section[2] for section in _SECTION.finditer(_read("style.css")) if section[1] == "step"]
+    return _plain("pages-in-game.css", f"#reading {{\n{''.join(sections)}\n}}")
 
 
 def _direction(lang: str) -> Html:

@@ -23,6 +23,7 @@ from hippodrome.control.participants.frame import (
     headers,
     script,
     script_json,
+    style_of_pages_in_game,
 )
 from hippodrome.protocol.answer import FAILED
 
@@ -160,6 +161,7 @@ def game_page(view: GameView) -> Page:
         data=script_json(data),
         reading=_reading(view, nonce, texts),
     )
+    refresh = Html() if over or in_lobby(view.state) else _REFRESH
     text = frame(
         view.project,
         view.step,
@@ -167,7 +169,7 @@ def game_page(view: GameView) -> Page:
         nonce,
         main=main,
         script=script("game/main.js", nonce, module=True, also=game_modules.modules_of(view.project), texts=texts),
-        head=Html() if over or in_lobby(view.state) else _REFRESH,
+        head=Html(refresh + (f"<style>\n{style_of_pages_in_game()}</style>\n" if view.texts else "")),
         sheet="sessions.css" if together else "",
         body="game",
     )
@@ -212,6 +214,8 @@ def _done(view: StepView, is_asked: bool) -> Html:
     """The attributes of the body of a page after which nothing is asked any more."""
     if view.end:
         return fill("end", end=view.end)
+    if view.step.min_seconds and not view.final:
+        return fill("least", seconds=f"{view.step.min_seconds:g}")
     return Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html()
 
 

@@ -52,6 +52,7 @@ class EarlierAnswers:
     def before_page(cls, folder: Path, config: Config | None, name: str) -> EarlierAnswers:
         """Return what a participant who comes to the page with this file may have answered."""
         steps = list(config.steps) if config else []
+        end = len(steps) - 1 if config and name in config.end_pages else 0
         in_game = [file.name for page in (config.game_pages if config else ()) for file in page.files]
         place = next(
             (
@@ -59,7 +60,7 @@ class EarlierAnswers:
                 for at, step in enumerate(steps)
                 if name in [file.name for file in step.files] or (step.type.on_server and name in in_game)
             ),
-            0,
+            end,
         )
         return cls(folder, config, steps[:place], steps[place].variants if steps else 0)
 

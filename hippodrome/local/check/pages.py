@@ -123,4 +123,6 @@ def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | 
     for step in (*config.steps, *config.game_pages):
         for group, file in enumerate(step.files):
             pages[file.name] = [group] if step.variants else config.each_group
+    for name in config.end_pages:
+        pages.setdefault(name, config.each_group)
     return pages

@@ -197,6 +197,8 @@ def copy_of(project: Path, folder: Path) -> list[str]:
     if tree["project"].get("players", 1) != 1 and tree["project"].get("patience", 300) > PATIENCE:
         tree["project"]["patience"] = PATIENCE
         changes.append(f"`patience` is {PATIENCE}")
+    if _without_least_times(tree["project"].get("steps")):
+        changes.append("no page has `minSeconds`")
     trial = tree.get("trial") or {}
     ui = trial.get("ui")
     if isinstance(ui, list):
@@ -207,6 +209,18 @@ def copy_of(project: Path, folder: Path) -> list[str]:
         changes.append("the game may be stopped (`ui.stop`)")
     (folder / config.name).write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return changes
+
+
+def _without_least_times(steps: Any) -> bool:
+    """Remove `minSeconds` from pages in a list of steps, also from those in blocks; return whether there were any."""
+    found = False
+    for item in steps if isinstance(steps, list) else ():
+        for name, settings in item.items() if isinstance(item, dict) else ():
+            if name == "steps":
+                found |= _without_least_times(settings)
+            elif isinstance(settings, dict):
+                found |= settings.pop("minSeconds", None) is not None
+    return found
 
 
 def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> None:

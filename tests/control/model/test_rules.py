@@ -67,6 +67,7 @@ def test_a_rule_compares_as_people_mean_it(rule: str, value: Any) -> None:
             'consent.agree == "no"',
             "consent.agree is not known here; write answers.consent.agree for the answer to a step",
         ),
+        ("answer.pre.age < 18", "answer.pre.age is not known here; did you mean answers.pre.age?"),
         ("answers.a && answers.b", "write and, or, not"),
         ("1 < answers.pre.age < 3", "compares three values; write a < b and b < c"),
         ("answers.x | int < 3", "filters such as | int are for pages; here a text that is a number compares as one"),

@@ -385,6 +385,16 @@ def test_a_page_without_a_step_is_remarked(folder: Path) -> None:
     ]
 
 
+def test_the_page_of_an_end_belongs_to_the_study_and_knows_the_answers_before_it(folder: Path) -> None:
+    config = 'project:\n  id: p\n  steps: [consent, debrief]\n  ends:\n    declined: {when: answers.consent.agree == "no", page: sorry}\n'
+    (folder / "config.yml").write_text(config, encoding="utf-8")
+    page(folder, '<button name="agree" value="no">No</button>', "consent")
+    page(folder, "<p>{{ completion_code }}</p>", "debrief")
+    page(folder, "<p>{{ answers.consent.agree }}{{ answers.consent.agreed }}</p>", "sorry")
+    (line,) = [line for line in looked(folder) if "sorry" in line]
+    assert "step consent has no answer agreed; did you mean agree?" in line
+
+
 def test_several_pages_without_a_step_are_one_remark(folder: Path) -> None:
     for name in ("left", "forgotten"):
         page(folder, "<p>Hi</p>", name)
