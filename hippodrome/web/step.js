@@ -138,6 +138,7 @@
     if (left > 0) {
       event.preventDefault();
       idle(TEXT.tooSoon(Math.ceil(left)), true);
+      timers = [setTimeout(say, left * 1000, "")];
       return;
     }
     const submitter = event.submitter?.name ? event.submitter : undefined;

@@ -385,6 +385,15 @@ def test_a_server_starts_at_the_first_run_and_stops_after_the_last(tmp_path: Pat
     assert kinds == [Topic.START, Topic.STOP]
 
 
+def test_the_page_of_an_end_is_no_step(tmp_path: Path, platform: FakePlatform) -> None:
+    config = 'project:\n  id: leave\n  steps: [consent, debrief]\n  ends:\n    declined: {when: answers.consent.agree == "no", page: rate}\n'
+    alice = study(config, tmp_path, platform).visitor("alice")
+    assert "Step 1 of 2" in alice.get()
+    alice.answer(alice.get(), agree="no")
+    page = alice.get()
+    assert (heading(page), "Step 1" in page) == ("Rate", False)
+
+
 # Steps that are skipped
 
 

@@ -27,3 +27,16 @@ def test_the_policies_of_the_copy_can_be_read(tmp_path: Path) -> None:
     for name in ("policies/one.onnx", "two.onnx"):
         assert _file(copy, name).read_text() == name
     assert yaml.safe_load((copy / "config.yml").read_text())["trial"]["ui"]["stop"]
+
+
+def test_no_bot_waits_for_the_least_time_of_a_page(tmp_path: Path) -> None:
+    project, copy = tmp_path / "mine", tmp_path / "copy"
+    project.mkdir()
+    steps = [
+        {"hello": {"minSeconds": 60}},
+        {"each": {"kind": ["a", "b"]}, "steps": [{"ask": {"minSeconds": 9}}]},
+        "bye",
+    ]
+    (project / "config.yml").write_text(yaml.safe_dump({"project": {"id": "slow", "steps": steps}}))
+    assert "no page has `minSeconds`" in copy_of(project, copy)
+    assert "minSeconds" not in (copy / "config.yml").read_text()

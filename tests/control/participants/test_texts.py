@@ -63,7 +63,10 @@ def test_scripts_show_only_texts_of_the_table(file: Path) -> None:
 
 def test_templates_show_only_texts_of_the_table() -> None:
     templates = [(WEB / name).read_text() for name in ("frame.html", "game.html", "lobby.html")]
-    for template in [*templates, *(part for name, part in frame._PARTS.items() if name not in ("data", "end", "least"))]:
+    for template in [
+        *templates,
+        *(part for name, part in frame._PARTS.items() if name not in ("data", "end", "least")),
+    ]:
         read = " ".join([re.sub(r"<[^>]*>", " ", template), *re.findall(r'aria-label="([^"]*)"', template)])
         assert re.findall(r"[A-Za-z]{2,}", re.sub(r"TEXT\.\w+|\$\w+", " ", read)) == []
 
