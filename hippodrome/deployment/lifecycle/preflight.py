@@ -302,6 +302,24 @@ def _subnets(prepared: Prepared) -> Iterator[Finding]:
             "All those subnets are in one zone: when Spot runs out of room there, servers cost more.",
             "Name subnets in two zones: --subnets.",
         )
+    yield from _endpoint(prepared, vpc)
+
+
+def _endpoint(prepared: Prepared, vpc: str) -> Iterator[Finding]:
+    """Check for an endpoint that answers for the addresses of all APIs, but reaches private ones alone.
+
+    Its servers would get status 403 for each request (AWS re:Post, "api-gateway-vpc-connections", read November 2026).
+    """
+    filters = [{"Name": "vpc-id", "Values": [vpc]}]
+    pages = prepared.account.client("ec2").get_paginator("describe_vpc_endpoints").paginate(Filters=filters)
+    for one in (endpoint for page in pages for endpoint in page["VpcEndpoints"]):
+        if one["ServiceName"].endswith(".execute-api") and one.get("PrivateDnsEnabled"):
+            yield bad(
+                "network",
+                f"The endpoint {one['VpcEndpointId']} of {vpc} has private DNS, so servers could not reach the "
+                "functions, to store data and to get certificates.",
+                "Switch its private DNS off, or name another VPC: --vpc and --subnets.",
+            )
 
 
 def _vpcs(prepared: Prepared) -> Iterator[Finding]:

@@ -431,6 +431,17 @@ def test_subnets_are_checked(world: World) -> None:
     ((mark, said),) = found("subnet-12345678")
     assert (mark, "does not exist" in said) == (Mark.BAD, True)
     assert found(subnets[0]) == [in_one_zone]
+    ec2.create_vpc_endpoint(
+        VpcId=vpcs[0],
+        ServiceName="com.amazonaws.us-east-1.execute-api",
+        VpcEndpointType="Interface",
+        SubnetIds=[subnets[0]],
+        PrivateDnsEnabled=True,
+    )
+    assert [(mark, "has private DNS" in text) for mark, text in found(subnets[0])] == [
+        (Mark.LOOK, False),
+        (Mark.BAD, True),
+    ]
 
 
 def test_remains_of_an_unfinished_destroy_are_a_problem(world: World) -> None:
