@@ -79,7 +79,7 @@ def read_project(folder: Path) -> Config:
     checked = check(source.adapted.values, [mistake.path for mistake in source.parsed.mistakes])
     steps, file_mistakes = _step_files(folder, checked)
     game_pages, page_mistakes = _game_pages(folder, checked, steps)
-    file_mistakes += [*page_mistakes, *_missing_policies(source.layout, checked)]
+    file_mistakes += [*page_mistakes, *_of_end_pages(folder, checked), *_missing_policies(source.layout, checked)]
     if checked.valid(STEPS) and not file_mistakes:
         groups = number_of_groups(page.variants for page in (*steps, *game_pages))
         file_mistakes += sessions.mistakes_of_groups(checked, groups)
@@ -176,6 +176,21 @@ def _files_of(folder: StepFolder, page: str, checked: Checked, step: Step | None
     if not named:
         raise StepFileError(f"there is no factor of the name in {page}")
     return 0, tuple(file for levels in cells(named) for file in folder.find(fill(page, levels))[1])
+
+
+def _of_end_pages(folder: Path, checked: Checked) -> Iterator[Mistake]:
+    """The mistakes in the files of ends. Whoever comes to an end without its file would get an error page."""
+    for end in checked.design.ends:
+        if not end.page:
+            continue
+        path = ("project", "ends", end.name, "page")
+        try:
+            variants, _ = open_folder(folder).find(end.page)
+        except StepFileError as error:
+            yield Mistake(path, str(error))
+        else:
+            if variants:
+                yield Mistake(path, f"the page of an end is one for all groups; write {end.page}.html alone")
 
 
 def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hippodrome.bots import forms
 from hippodrome.control.config import Config, Diagnostic
-from hippodrome.control.config.folder import read_source
+from hippodrome.control.config.folder import ConfigSource, read_source
 from hippodrome.control.model import rules
 from hippodrome.protocol.similar import did_you_mean
 
@@ -25,7 +25,30 @@ def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
         if known and field not in known | OF_EVERY_STEP:
             message = f"the page of {step} has no field {field}{did_you_mean(field, known)}{why}"
             found.append(source.diagnostic(path, message, remark=not why))
-    return found
+    return found + list(_not_offered(config, source))
+
+
+def _not_offered(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:
+    """A mistake for each right answer that none of the choices of its field has: everybody would fail the check."""
+    for step in config.steps:
+        for field, right in step.step.right.items() if step.step else ():
+            path = (*config.design.paths.get(step.key, ("project", "steps")), "right", field)
+            for file in step.files:
+                choices = _choices(file, field)
+                if choices and str(right).strip().casefold() not in [each.strip().casefold() for each in choices]:
+                    message = f"{file.name} offers no {right} for {field}; it has {', '.join(choices)}"
+                    yield source.diagnostic(path, message)
+
+
+def _choices(file: Path, field: str) -> list[str]:
+    """The values among which participants choose for a field; none if they may type, or if Jinja fills them in."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    controls = [each for form in forms.read(f"<form>{text}</form>") for each in form.controls if each.name == field]
+    if any(each.kind not in ("radio", "select") for each in controls):
+        return []
+    values = [each.value or "on" for each in controls if each.kind == "radio"]
+    values += [option.value for each in controls for option in each.options if option.value]
+    return [] if any("{" in value for value in values) else list(dict.fromkeys(values))
 
 
 def _of_checks(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str, str]]:

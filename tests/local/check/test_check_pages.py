@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hippodrome.control.config import read_project
+from hippodrome.control.config import ConfigErrors, read_project
 from hippodrome.local.check.pages import check_pages
 from tests.local.check.checking import config, looked, page
 
@@ -393,6 +393,25 @@ def test_the_page_of_an_end_belongs_to_the_study_and_knows_the_answers_before_it
     page(folder, "<p>{{ answers.consent.agree }}{{ answers.consent.agreed }}</p>", "sorry")
     (line,) = [line for line in looked(folder) if "sorry" in line]
     assert "step consent has no answer agreed; did you mean agree?" in line
+
+
+def test_the_right_answer_of_a_check_is_one_of_the_choices(folder: Path) -> None:
+    config = "project:\n  id: p\n  steps:\n    - quiz: {right: {side: middle, sure: yes}}\n    - debrief\n"
+    (folder / "config.yml").write_text(config, encoding="utf-8")
+    sides = '<select name="side"><option value="">?</option><option>Left</option><option>Right</option></select>'
+    page(folder, f'{sides}<input type="radio" name="sure" value="Yes">', "quiz")
+    page(folder, "<p>{{ completion_code }}</p>", "debrief")
+    (line,) = [line for line in looked(folder) if "offers" in line]
+    assert line.endswith("quiz.right.side: quiz.html offers no middle for side; it has Left, Right")
+
+
+def test_the_page_of_an_end_must_be_there(folder: Path) -> None:
+    config = "project:\n  id: p\n  steps: [consent, debrief]\n  ends:\n    late: {minutes: 9, page: sory}\n"
+    (folder / "config.yml").write_text(config, encoding="utf-8")
+    for name in ("consent", "debrief", "sorry"):
+        page(folder, "<p>{{ completion_code }}</p>", name)
+    with pytest.raises(ConfigErrors, match=r"ends\.late\.page: there is no sory\.html in steps/; did you mean sorry\?"):
+        looked(folder)
 
 
 def test_several_pages_without_a_step_are_one_remark(folder: Path) -> None:
