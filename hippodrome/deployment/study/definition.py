@@ -17,6 +17,7 @@ from hippodrome.protocol import environment
 STOP_TIMEOUT = 120  # seconds from SIGTERM to SIGKILL, for a server's last recording; Fargate allows no more
 SCRATCH = "/scratch"  # the only folder into which a trial may write (infra/Dockerfile)
 USER = "10001:10001"
+PRIVILEGED = 1024  # only a privileged user may listen on lower ports
 LOWEST_PORT = 80  # on which the trial may listen: the certificate authority asks there (control/certificates/)
 
 
@@ -45,7 +46,6 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
         "user": USER,
         "readonlyRootFilesystem": True,
         "portMappings": [{"containerPort": port(installation), "protocol": "tcp"}],
-        "systemControls": [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(LOWEST_PORT)}],
         "mountPoints": [{"sourceVolume": "scratch", "containerPath": SCRATCH, "readOnly": False}],
         "linuxParameters": {"initProcessEnabled": True, "capabilities": {"drop": ["ALL"]}},
         "stopTimeout": STOP_TIMEOUT,
@@ -61,6 +61,8 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
             },
         },
     }
+    if not installation.has_domain or port(installation) < PRIVILEGED:
+        container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(LOWEST_PORT)}]
     return {
         "family": resource_names.family(installation.stack, project_id),
         "networkMode": "awsvpc",

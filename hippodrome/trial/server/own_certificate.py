@@ -31,7 +31,7 @@ log = logging.getLogger("trial")
 
 ORDERS = 3  # tries
 ORDER_SECONDS = 60.0  # for one order; Let's Encrypt usually takes less than ten
-PAUSES = (0.3, 2.0)  # seconds between questions: the first, and the longest; each is a quarter longer than the last
+PAUSES = (1.0, 2.0)  # seconds between questions: the first, and the longest; each is a quarter longer than the last
 BETWEEN_ORDERS = 5.0  # seconds
 BUSY = 2.0  # seconds until the same question is sent again if it was not answered
 TIMEOUT = 20.0  # seconds for one answer

@@ -468,9 +468,7 @@ def test_a_module_that_does_not_compile_is_left_out() -> None:
 def test_a_file_of_several_functions_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bytecode, "_made", {})
     compiled, given = bytecode._compile, []
-    monkeypatch.setattr(
-        bytecode, "_compile", lambda sources, python: given.append({*sources}) or compiled(sources, python)
-    )
+    monkeypatch.setattr(bytecode, "_compile", lambda sources, *how: given.append({*sources}) or compiled(sources, *how))
     shared, bad = {"p/__init__.py": b"", "p/q.py": b"x = 1\n"}, {"p/bad.py": b"def (:\n"}
     first = bytecode.compiled({**shared, **bad, "one.py": b"y = 1\n"}, sys.executable)
     second = bytecode.compiled({**shared, **bad, "one.py": b"y = 2\n"}, sys.executable)
