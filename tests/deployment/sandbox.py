@@ -46,9 +46,16 @@ def missing(*programs: str) -> str:
     lacking = [PROGRAMS.get(name, name) for name in (*PROGRAMS, *programs) if shutil.which(name) is None]
     if lacking:
         return f"Images run only where these are installed: apt-get install {' '.join(lacking)}"
-    return (
-        "" if os.geteuid() == 0 else "Images run only for root: their files belong to users, and setpriv changes to one"
-    )
+    if os.geteuid() != 0:
+        return "Images run only for root: their files belong to users, and setpriv changes to one"
+    probe = ["bwrap", "--unshare-user", "--unshare-pid", "--ro-bind", "/", "/", "true"]
+    if subprocess.run(probe, capture_output=True, check=False).returncode:
+        return "Images run only where user namespaces may be made, which this container forbids"
+    try:
+        debian()
+    except subprocess.CalledProcessError:
+        return "Images need a base, and none could be made from Debian's mirror"
+    return ""
 
 
 @contextlib.contextmanager
