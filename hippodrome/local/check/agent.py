@@ -109,10 +109,23 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.TRIAL: json.dumps(config.registration()["trial"]),
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
+        "OPTIONS": json.dumps(_other_options(config)),
         "SECONDS": str(seconds),
         "CALL_SECONDS": str(CALL_SECONDS),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
+
+
+def _other_options(config: Config) -> list[dict[str, Any]]:
+    """The options that `reset` gets in other games of the study, and at other levels, each once."""
+    registered = config.registration()
+    seen = [registered["trial"].get("options") or {}]
+    for step in registered["steps"] if isinstance(registered["steps"], list) else ():
+        for section in step.get("sections", ()):
+            options = section["trial"].get("options")
+            if options is not None and options not in seen:
+                seen.append(options)
+    return seen[1:]
 
 
 def _question(folder: Path, config: Config) -> dict[str, Any]:

@@ -109,7 +109,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     game = CheckedGame(joint, players, config, progress)
     if game.load(folder, adapter.agent_module) and game.play(reset):
         _note_idle(joint, players, config, progress)
-        if game.close():
+        if game.begin_each(json.loads(os.environ.pop("OPTIONS", "[]")), player.set_options) and game.close():
             progress.over()
 
 

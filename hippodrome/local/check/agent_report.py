@@ -428,11 +428,13 @@ class AgentReport:
         policy = self._asked_policy()
         if policy is not None:
             return f"{call.rpartition(' ')[2]}() of {printable(self._plays(policy))}"
-        return {
+        named = {
             "policies": "making the policies",
             "start": f'start("{printable(self._config.trial.game or "")}")',
             "step": f"step({self._report.get('action', 0)})",
         }.get(call, f"{call}()")
+        options = self._report.get("options")
+        return f"{named}, with the options {json.dumps(options, ensure_ascii=False)}," if options else named
 
     def _at(
         self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False

@@ -7,7 +7,7 @@ is timed by itself. If there are several humans, `substitute` plays in each of t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from hippodrome.trial.policies.places import load_policies
 from hippodrome.trial.policies.policy import Policy
 from hippodrome.trial.policies.simple import AgentPolicy
 
+BEGUN = 5  # steps of an episode with the options of another game or level
 STAYS = 20  # steps for which a substitute plays in one place
 
 
@@ -106,6 +107,36 @@ class CheckedGame:
             progress.episodes = episode
             callbacks.episode_ended(now.why if now.over else "truncated")
         callbacks.session_ended()
+        return True
+
+    def begin_each(self, others: Sequence[Mapping[str, Any]], set_options: Callable[[Mapping[str, Any]], None]) -> bool:
+        """Begin an episode with the options of each other game and level; return False if a call failed."""
+        for options in others:
+            if self._progress.time_over():
+                break
+            set_options(options)
+            self._progress.known["options"] = options
+            if not self._begin():
+                return False
+        self._progress.known.pop("options", None)
+        return True
+
+    def _begin(self) -> bool:
+        """Reset, and play some steps; return False if a call failed, which is reported."""
+        progress = self._progress
+        if not progress.call("reset", partial(self._adapter.reset, 1)):
+            return False
+        now: Joint = progress.result[0]
+        if not (progress.call("render", self._adapter.pictures) and self._reset_policies(1)):
+            return False
+        for step in range(BEGUN):
+            actions = None if now.over else self._actions(now, step)
+            if actions is None:
+                return now.over
+            progress.action = actions[PLAYER] if isinstance(self._adapter, OnePlayer) else actions
+            if not progress.call("step", partial(self._adapter.step, actions)):
+                return False
+            now = progress.result
         return True
 
     def close(self) -> bool:

@@ -118,6 +118,21 @@ def test_an_agent_that_fails_late_is_reported(folder: Path) -> None:
     assert "fails (episode 1, after 24 steps in all): AssertionError: late" in line
 
 
+def test_an_agent_that_fails_with_the_options_of_one_level_only_is_reported(folder: Path) -> None:
+    config(folder, "project:\n", "project:\n  conditions: {advice: [shown, hidden]}\n")
+    config(folder, "trial:\n", 'trial:\n  options: {advice: "{advice}"}\n')
+    agent(
+        folder,
+        "    def reset(self, seed=None):\n        return self.env",
+        "    def reset(self, seed=None, options=None):\n"
+        "        assert options['advice'] == 'shown'\n"
+        "        return self.env",
+    )
+    (problem,) = tried(folder)
+    assert 'reset(), with the options {"advice": "hidden"}, fails' in problem
+    assert "AssertionError" in problem
+
+
 def test_an_agent_that_fails_in_one_group_only_is_reported(folder: Path) -> None:
     (folder / "steps" / "hello.html").unlink()
     page(folder, "<p>0", "hello-0")
