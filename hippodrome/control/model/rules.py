@@ -78,6 +78,21 @@ def constants(rule: str) -> list[Any]:
     return found
 
 
+def compared(rule: str) -> list[tuple[tuple[str, ...], str]]:
+    """Return the names that a rule compares with texts, each with a text: by `==`, `!=` and `in`. Raises `BadRule`."""
+    found = []
+    for node in ast.walk(_tree(rule)):
+        sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
+        texts = [text for side in sides if _names(side) is None for text in _texts(side)]
+        found += [(names, text) for side in sides if (names := _names(side)) for text in texts]
+    return found
+
+
+def _texts(node: ast.expr) -> list[str]:
+    constants = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+    return [value for value in constants if isinstance(value, str)]
+
+
 def steps_mentioned(rule: str) -> set[str]:
     """Return the steps whose answers a rule asks about. Raises `BadRule`."""
     return {names[1] for names in mentioned(rule) if names[0] == "answers" and len(names) > 1}

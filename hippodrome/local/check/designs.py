@@ -25,7 +25,7 @@ def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
         if known and field not in known | OF_EVERY_STEP:
             message = f"the page of {step} has no field {field}{did_you_mean(field, known)}{why}"
             found.append(source.diagnostic(path, message, remark=not why))
-    return found + list(_not_offered(config, source))
+    return found + list(_not_offered(config, source)) + list(_never_compared(config, source))
 
 
 def _not_offered(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:
@@ -38,6 +38,29 @@ def _not_offered(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:
                 if choices and str(right).strip().casefold() not in [each.strip().casefold() for each in choices]:
                     message = f"{file.name} offers no {right} for {field}; it has {', '.join(choices)}"
                     yield source.diagnostic(path, message)
+
+
+def _never_compared(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:
+    """A remark for each text in a rule that none of the choices of its field has, such as No instead of no."""
+    files = {step.key: step.files for step in config.steps}
+    for path, rule in _rules(config):
+        for names, text in rules.compared(rule):
+            if names[0] != "answers" or len(names) != 3 or not text:
+                continue
+            choices = [choice for file in files.get(names[1], ()) for choice in _choices(file, names[2])]
+            if choices and text not in choices:
+                message = f"{names[1]} offers no {text} for {names[2]}; it has {', '.join(dict.fromkeys(choices))}"
+                yield source.diagnostic(path, message, remark=True)
+
+
+def _rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """The rules of steps and ends, each with its place in config.yml."""
+    for step in config.steps:
+        if step.step and step.step.when:
+            yield (*config.design.paths.get(step.key, ("project", "steps")), "when"), step.step.when
+    for end in config.design.ends:
+        for rule in end.when:
+            yield ("project", "ends", end.name), rule
 
 
 def _choices(file: Path, field: str) -> list[str]:
@@ -59,11 +82,10 @@ def _of_checks(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str
 
 
 def _of_rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str, str]]:
-    for end in config.design.ends:
-        for rule in end.when:
-            for names in rules.mentioned(rule):
-                if names[0] == "answers" and len(names) == 3:
-                    yield ("project", "ends", end.name), names[1], names[2], ""
+    for path, rule in _rules(config):
+        for names in rules.mentioned(rule):
+            if names[0] == "answers" and len(names) == 3:
+                yield path, names[1], names[2], ""
 
 
 def _fields(files: tuple[Path, ...]) -> set[str]:

@@ -405,6 +405,18 @@ def test_the_right_answer_of_a_check_is_one_of_the_choices(folder: Path) -> None
     assert line.endswith("quiz.right.side: quiz.html offers no middle for side; it has Left, Right")
 
 
+@pytest.mark.parametrize(
+    "rule", ['answers.consent.agree == "No"', '"No" != answers.consent.agree', 'answers.consent.agree in ["No", "no"]']
+)
+def test_a_text_in_a_rule_that_no_choice_has_is_remarked(folder: Path, rule: str) -> None:
+    config = f"project:\n  id: p\n  steps: [consent, debrief]\n  ends: {{declined: '{rule}'}}\n"
+    (folder / "config.yml").write_text(config, encoding="utf-8")
+    page(folder, '<input type="radio" name="agree" value="yes"><input type="radio" name="agree" value="no">', "consent")
+    page(folder, "<p>{{ completion_code }}</p>", "debrief")
+    (line,) = [line for line in looked(folder) if "offers" in line]
+    assert line.endswith("project.ends.declined: consent offers no No for agree; it has yes, no")
+
+
 def test_the_page_of_an_end_must_be_there(folder: Path) -> None:
     config = "project:\n  id: p\n  steps: [consent, debrief]\n  ends:\n    late: {minutes: 9, page: sory}\n"
     (folder / "config.yml").write_text(config, encoding="utf-8")
