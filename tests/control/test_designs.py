@@ -268,6 +268,24 @@ def test_an_end_that_asks_for_the_condition_draws_it(tmp_path: Path, platform: F
     assert study.stored("alice", "assignment")["condition"]["partner"] in ("helpful", "lazy")
 
 
+def test_a_page_shuffles_a_list_in_an_order_of_each_persons_own(tmp_path: Path, platform: FakePlatform) -> None:
+    page = (
+        "{% set left = shuffle(['a', 'b', 'c', 'd']) %}<p>{{ left | join }} {{ shuffle(['a', 'b', 'c', 'd']) | join }}</p>"
+        "<input type='hidden' name='order' value='{{ left | join }}'><button>Go on</button>"
+    )
+    config = "project:\n  id: lists\n  steps: [consent, debrief]\n"
+    study = DesignedStudy(write(tmp_path / "lists", config, {"consent": page, "debrief": "<h1>Thanks</h1>"}), platform)
+    seen = set()
+    for number in range(20):
+        visitor = study.visitor(f"p{number}")
+        orders = re.search(r"<p>(\w{4}) (\w{4})</p>", visitor.get())
+        assert orders
+        assert orders[0] in visitor.get(), "the same each time"
+        seen.add(orders.groups())
+    assert len(seen) > 10
+    assert any(first != second for first, second in seen), "each list of a page has an order of its own"
+
+
 @pytest.mark.parametrize("on_aws", [True, False])
 def test_other_factors_are_refused_on_aws_once_people_are_assigned(
     tmp_path: Path, platform: FakePlatform, on_aws: bool

@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -66,6 +67,9 @@ def types(running: RunningInstallation, capsys: Any, command: str, answer: str =
         ran = running.run(capsys, *arguments(command), *more)
     assert ran.code == Exit.DONE, ran.err + ran.out
     said = ran.err.replace("Begin? [y/N] ", f"Begin? [y/N] {answer}\n") + ran.out  # a terminal echoes what is typed
+    # This installation has a domain, the page's has none.
+    said = said.replace(f"https://study.{running.root_domain}", "https://x.execute-api.ca-central-1.amazonaws.com")
+    said = re.sub(r"(?m)^Certificate: .*\n", "", said)
     assert first_hour.differs(first_hour.shown()[command], said, running.root_domain) == "", said
 
 

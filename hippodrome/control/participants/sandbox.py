@@ -6,8 +6,9 @@ expression does is up to its author (docs/security.md).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, lru_cache
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -90,6 +91,20 @@ def render(text: str, values: Mapping[str, Any]) -> str:
     except Exception as error:  # a template can fail in any way
         raise FragmentError(f"{type(error).__name__}: {error}", _line(error)) from error
     return "".join(parts)
+
+
+def shuffler(seed: str) -> Callable[[Iterable[Any]], list[Any]]:
+    """Return the function `shuffle` of one page: it gives the same orders whenever a page with this seed is made."""
+    calls = 0
+
+    def shuffle(values: Iterable[Any]) -> list[Any]:
+        nonlocal calls
+        calls += 1
+        shuffled = list(values)
+        Random(f"{seed}/{calls}").shuffle(shuffled)  # noqa: S311 - an order is no secret
+        return shuffled
+
+    return shuffle
 
 
 def _counted_range() -> Callable[..., range]:

@@ -118,7 +118,7 @@ def command(
         outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
             applying.report(outcome, settings, False)
-        if not no_certificate and outcome.outputs.get("RootDomain"):
+        if not no_certificate and (settings.domain or outcome.outputs.get("RootDomain")):
             _certify(account, stack, found)
     else:
         screen.info(f"The installation {stack} stays as it is: these credentials are a researcher's.")

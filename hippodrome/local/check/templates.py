@@ -19,7 +19,18 @@ from hippodrome.local.check.wording import short
 from hippodrome.protocol.answer import UNMATCHED
 from hippodrome.protocol.similar import did_you_mean
 
-VALUES = ("answers", "completion_code", "condition", "group", "order", "participant", "project", "run", "wrong")
+VALUES = (
+    "answers",
+    "completion_code",
+    "condition",
+    "group",
+    "order",
+    "participant",
+    "project",
+    "run",
+    "shuffle",
+    "wrong",
+)
 """The values that a page may use (docs/pages.md)."""
 
 
@@ -162,6 +173,7 @@ def _values(config: Config | None, group: int | None) -> dict[str, Any]:
         "completion_code": "ABCDEF",
         "answers": {},
         "wrong": [],
+        "shuffle": sandbox.shuffler("check"),
         **_levels(config),
     }
 

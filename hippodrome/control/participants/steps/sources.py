@@ -14,7 +14,7 @@ from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.place import values_of
 from hippodrome.control.model.texts import Texts
 from hippodrome.control.participants.page_error import CONTENT_NOT_FOUND, PageError
-from hippodrome.control.participants.sandbox import FragmentError, records_mentioned
+from hippodrome.control.participants.sandbox import FragmentError, records_mentioned, shuffler
 from hippodrome.control.participants.steps.services import StepServices
 from hippodrome.control.participants.steps.visit import Visit
 
@@ -70,6 +70,7 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
         "group": project.group(user_id, page),
         "completion_code": ids.completion_code(project.secret, user_id),
         "wrong": list(visit.wrong),
+        "shuffle": shuffler(f"{project.salt}/{user_id}/{page.key}"),
         **values_of(project, standing.assignment, visit.step),
     }
     if "participant" in mentioned:

@@ -37,6 +37,7 @@ from hippodrome.deployment.study.image.registry import (
     digest_of,
     place_of,
 )
+from hippodrome.protocol import environment
 
 KEPT_DAYS = 60  # days for which the cache keeps what is not used
 _MADE = "1970-01-01T00:00:00Z"  # the same image at any time
@@ -46,7 +47,7 @@ ENV = {
     "PYTHONSAFEPATH": "1",
     "PYTHONPATH": "/hippodrome",
     "PYTHONUSERBASE": f"/{packages.BASE}",
-    "AGENT_DIR": "/project",
+    environment.AGENT_DIR: "/project",
     "HOME": SCRATCH,
     "TMPDIR": SCRATCH,
     # /etc/passwd is the base's, without a line for the user

@@ -22,6 +22,7 @@ from hippodrome.deployment.code import bytecode
 from hippodrome.deployment.study.image.bundle import Bundle
 from hippodrome.deployment.study.image.follow import BuildLog
 from hippodrome.deployment.study.image.packages import PYTHON
+from hippodrome.protocol import environment
 
 SECONDS = 60
 _NOT_TRIED = "The agent was not tried with the image's packages: that needs Python {python} on Linux on x86-64."
@@ -41,25 +42,25 @@ def agent(bundle: Bundle, site_packages: Sequence[Path]) -> None:
         for name in ("context", "scratch"):
             (folder / name).mkdir()
         bundle.write_folder(folder / "context")
-        environment = folder / "venv"
+        venv = folder / "venv"
         made = subprocess.run(
-            [python, "-I", "-m", "venv", "--without-pip", "--symlinks", environment], capture_output=True, check=False
+            [python, "-I", "-m", "venv", "--without-pip", "--symlinks", venv], capture_output=True, check=False
         )
         if made.returncode:  # such as Debian's Python without its package for that
             screen.warning(_NOT_TRIED.format(python=f"{PYTHON} with its module venv"))
             return
         lines = [f"import site; site.addsitedir({str(place)!r})\n" for place in site_packages]
-        (environment / f"lib/python{PYTHON}/site-packages/image.pth").write_text("".join(lines))
+        (venv / f"lib/python{PYTHON}/site-packages/image.pth").write_text("".join(lines))
         log = BuildLog()
         done = subprocess.run(
-            [environment / "bin/python", "-m", "hippodrome.trial.check", "check.json", str(SECONDS)],
+            [venv / "bin/python", "-m", "hippodrome.trial.check", "check.json", str(SECONDS)],
             cwd=folder / "context",
             env={
                 "PATH": os.defpath,
                 "PYTHONPATH": str(folder / "context"),
                 "PYTHONDONTWRITEBYTECODE": "1",
                 "PYTHONSAFEPATH": "1",
-                "AGENT_DIR": str(folder / "context/project"),
+                environment.AGENT_DIR: str(folder / "context/project"),
                 "HOME": str(folder / "scratch"),
                 "TMPDIR": str(folder / "scratch"),
             },
