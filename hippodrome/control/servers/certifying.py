@@ -17,7 +17,6 @@ The certificate is handed out once `task_changed` has seen the task's address, a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import Protocol
 
@@ -35,10 +34,9 @@ from hippodrome.control.certificates.rules import (
 from hippodrome.control.http import Refusal, Request, Response
 from hippodrome.control.log import logger
 from hippodrome.control.model.messages import DnsChanged, ServerAttempt, to_message
-from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.ports import Platform
-from hippodrome.control.servers.credentials import record_of
+from hippodrome.control.servers.credentials import answer_of, read_request, record_of
 from hippodrome.control.storage.compare_and_swap import SharedDocuments
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
@@ -94,7 +92,9 @@ class Certifying:
         AWS calls: one read of the server's record; three for a new order; one message once the certificate is issued.
         """
         try:
-            wanted = _read(request)
+            wanted = read_request(
+                request, CertificateRequest, MAX_BODY, "server and credential, or with order and csr too"
+            )
             record = record_of(wanted.server, wanted.credential, self._repository, self._secrets)
             if record.dns or not record.owns(wanted.server) or record.state not in {*_WAITING, *_ISSUED}:
                 raise Refusal(409, "This server needs no certificate now.")
@@ -102,12 +102,12 @@ class Certifying:
                 raise Refusal(409, "The request does not come from the address of the server's task.")
             answer = self._advance(record, wanted, request.source) if wanted.order else self._place(request.source)
         except Refusal as refusal:
-            return _json(refusal.status, {"message": refusal.text})
+            return answer_of(refusal.status, {"message": refusal.text})
         except OrderFailed as failed:
             about = {"server": wanted.server, "why": failed.reason.value, "text": str(failed)}
             logger.warning("a certificate was not issued", extra=about)
             return self._failed(failed)
-        return _json(200, answer)
+        return answer_of(200, answer)
 
     def _place(self, address: str) -> dict[str, str]:
         now = self._platform.now()
@@ -142,33 +142,16 @@ class Certifying:
         if failed.reason is FailureReason.UNREACHABLE or limit is Limit.REQUESTS:
             self._authority = None  # perhaps its connection is broken
             # Not 5xx, of which the alarm `site-errors` says that participants saw an error.
-            return _json(429, {"message": "The certificate authority does not answer now."})
+            return answer_of(429, {"message": "The certificate authority does not answer now."})
         if limit is None:
-            return _json(200, {"failed": failed.reason.value})
+            return answer_of(200, {"failed": failed.reason.value})
         if limit is Limit.ACCOUNT:
             until = failed.until
             self._shared.change(
                 ADDRESS_ORDERS, AddressOrders, lambda orders: msgspec.structs.replace(orders, until=until)
             )
-        return _json(200, {"refused": f"the limit of this {limit.value}"})
+        return answer_of(200, {"refused": f"the limit of this {limit.value}"})
 
     def _client(self) -> Authority:
         self._authority = self._authority or self._open_authority()
         return self._authority
-
-
-def _json(status: int, data: dict[str, str]) -> Response:
-    """A JSON response, without CORS headers: no page of another origin needs it."""
-    return Response(status, json.dumps(data), {"Content-Type": "application/json"})
-
-
-def _read(request: Request) -> CertificateRequest:
-    """Parse the body, which may be hostile. Raises `Refusal`."""
-    if request.method != "POST":
-        raise Refusal(405, "Use POST.")
-    if request.body is None or len(request.body) > MAX_BODY:
-        raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
-    try:
-        return from_json(request.body, CertificateRequest)
-    except ValueError:
-        raise Refusal(400, "The body must be JSON with server and credential, or with order and csr too.") from None

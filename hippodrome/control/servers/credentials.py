@@ -1,12 +1,38 @@
-"""A server's credential: it proves to a function that a request comes from this server's task."""
+"""Requests of servers: how functions read and answer them, and the credential that proves which server asks."""
 
 from __future__ import annotations
 
-from hippodrome.control.http import Refusal
+import json
+from typing import Any, TypeVar
+
+from hippodrome.control.http import Refusal, Request, Response
 from hippodrome.control.model import ids, server
+from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Server
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
+
+T = TypeVar("T")
+
+
+def read_request(request: Request, kind: type[T], most: int, fields: str) -> T:
+    """Parse the body of a POST, which may be hostile. Raises `Refusal`.
+
+    `most` is the longest body in bytes; `fields` names what it must have.
+    """
+    if request.method != "POST":
+        raise Refusal(405, "Use POST.")
+    if request.body is None or len(request.body) > most:
+        raise Refusal(413, f"The body must be JSON of {most} bytes at most.")
+    try:
+        return from_json(request.body, kind)
+    except ValueError:
+        raise Refusal(400, f"The body must be JSON with {fields}.") from None
+
+
+def answer_of(status: int, data: Any) -> Response:
+    """Return a JSON response, without CORS headers: no page of another origin needs it."""
+    return Response(status, json.dumps(data), {"Content-Type": "application/json"})
 
 
 def credential_nonce(record: Server, attempt: int) -> str | None:

@@ -18,13 +18,12 @@ so that an answer given before the stop message is not lost.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import Enum
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import msgspec
 
@@ -32,10 +31,9 @@ from hippodrome.control.certificates.rules import location
 from hippodrome.control.http import Refusal, Request, Response
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, server
-from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.ports import Documents, Settings
-from hippodrome.control.servers.credentials import record_of, refused
+from hippodrome.control.servers.credentials import answer_of, read_request, record_of, refused
 from hippodrome.control.servers.sessions import members_of
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
@@ -265,9 +263,9 @@ class Signing:
             access = self._authenticate(asked)
             signed = self._sign(access, asked.requests)
         except Refusal as refusal:
-            return _json(refusal.status, {"message": refusal.text})
+            return answer_of(refusal.status, {"message": refusal.text})
         requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
-        return _json(200, {"seconds": VALID_SECONDS, "requests": requests})
+        return answer_of(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, asked: SigningRequest) -> ServerAccess:
         """The access of the server with this credential. Raises the same `Refusal` for any mistake."""
@@ -316,21 +314,9 @@ class Signing:
         ]
 
 
-def _json(status: int, data: Any) -> Response:
-    """A JSON response, without CORS headers: no page of another origin needs it."""
-    return Response(status, json.dumps(data), {"Content-Type": "application/json"})
-
-
 def _read(request: Request) -> SigningRequest:
     """Parse the body, which may be hostile. Raises `Refusal`."""
-    if request.method != "POST":
-        raise Refusal(405, "Use POST.")
-    if request.body is None or len(request.body) > MAX_BODY:
-        raise Refusal(413, f"The body must be JSON of {MAX_BODY} bytes at most.")
-    try:
-        asked = from_json(request.body, SigningRequest)
-    except ValueError:
-        raise Refusal(400, "The body must be JSON with server, credential and requests.") from None
+    asked = read_request(request, SigningRequest, MAX_BODY, "server, credential and requests")
     if not 0 < len(asked.requests) <= MAX_REQUESTS:
         raise Refusal(400, f"Ask for 1 to {MAX_REQUESTS} requests.")
     return asked
