@@ -114,7 +114,8 @@ def addresses() -> Iterator[Row]:
         waits = {}
         for conditions in (Conditions(authority=AUTHORITY), Conditions()):
             world, came = crowd(people, within, conditions)
-            yield from () if not any(world.left().values()) else [through(name, world, came)]
+            if any(world.left().values()):
+                yield through(name, world, came)
             waits[conditions.authority] = [person.visit.ready - person.visit.asked for person in came]
         with_addresses, with_names = waits[AUTHORITY], waits[None]
         yield row(

@@ -180,9 +180,9 @@ def _color(control: Control, random: Random) -> str:
 
 def _number(control: Control, random: Random) -> str:
     slider = control.kind == "range"
-    low, high = _decimal(control.attributes.get("min")), _decimal(control.attributes.get("max"))
-    base = low if low is not None else _decimal(control.attributes.get("value")) or Decimal(0)
-    step = _decimal(control.attributes.get("step"))
+    low, high = decimal_of(control.attributes.get("min")), decimal_of(control.attributes.get("max"))
+    base = low if low is not None else decimal_of(control.attributes.get("value")) or Decimal(0)
+    step = decimal_of(control.attributes.get("step"))
     if step is None or step <= 0:
         step = Decimal("0.25") if control.attributes.get("step", "").lower() == "any" else Decimal(1)
     if slider:
@@ -209,7 +209,7 @@ def _moment_text(control: Control, random: Random) -> str:
     kind = control.kind
     unit = _SECONDS[kind]
     low, high = _moment(kind, control.attributes.get("min")), _moment(kind, control.attributes.get("max"))
-    step = _decimal(control.attributes.get("step"))
+    step = decimal_of(control.attributes.get("step"))
     length = unit * (step if step is not None and step > 0 else Decimal(60 if unit == 1 else 1))
     if kind == "time":
         low = Decimal(0) if low is None else low
@@ -255,7 +255,8 @@ def _to_text(kind: str, count: int) -> str:
     return clock if kind == "time" else f"{moment.date().isoformat()}T{clock}"
 
 
-def _decimal(text: str | None) -> Decimal | None:
+def decimal_of(text: str | None) -> Decimal | None:
+    """Return the finite number in this text; None if it holds none."""
     try:
         number = Decimal(text or "")
     except InvalidOperation:

@@ -11,11 +11,11 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from random import Random
 from typing import Any
 
-from hippodrome.bots.form_filling import Pairs
+from hippodrome.bots.form_filling import Pairs, decimal_of
 from hippodrome.bots.forms import PRESSED, Control, Form
 from hippodrome.control.model import rules
 from hippodrome.control.model.design import Block, End, Factor, Levels, Step, cells, run_key
@@ -234,9 +234,9 @@ def with_values(form: Form, pairs: Pairs, choice: Mapping[str, str]) -> Pairs:
 
 
 def _numbers(control: Control, named: Sequence[Any]) -> Iterator[str]:
-    low, high, step = (_decimal(control.attributes.get(name)) for name in ("min", "max", "step"))
+    low, high, step = (decimal_of(control.attributes.get(name)) for name in ("min", "max", "step"))
     step = step if step is not None and step > 0 else Decimal(1)
-    near = [number for value in named for number in map(_decimal, map(_text, _around(value))) if number is not None]
+    near = [number for value in named for number in map(decimal_of, map(_text, _around(value))) if number is not None]
     for number in (low, high, *near):
         if number is None or (low is not None and number < low) or (high is not None and number > high):
             continue
@@ -246,7 +246,7 @@ def _numbers(control: Control, named: Sequence[Any]) -> Iterator[str]:
 
 def _around(value: Any) -> list[Any]:
     """The value, and for a number one less and one more: the rule may compare by <, <=, > or >=."""
-    number = _decimal(_text(value))
+    number = decimal_of(_text(value))
     if number is None or isinstance(value, bool):
         return [value]
     return [value, *(_text(float(number) + by) for by in (-1, 1))]
@@ -254,11 +254,3 @@ def _around(value: Any) -> list[Any]:
 
 def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _decimal(text: str | None) -> Decimal | None:
-    try:
-        number = Decimal(text or "")
-    except InvalidOperation:
-        return None
-    return number if number.is_finite() else None

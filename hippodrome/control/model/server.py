@@ -21,7 +21,7 @@ import msgspec
 from hippodrome.control.model import ids, sessions, warm_pool
 from hippodrome.control.model.project import DEFAULT_PORT, Project
 from hippodrome.control.model.records import Record
-from hippodrome.control.ports import Address, DnsRecord, Settings
+from hippodrome.control.ports import Address, Dns, DnsRecord, Settings
 from hippodrome.protocol.session import is_session_id
 
 RECORDS = "_servers/"  # the folder of all servers' records
@@ -168,6 +168,10 @@ class Server(Record, frozen=True):
     def dns_record(self) -> DnsRecord | None:
         """The DNS record that it owns, with exactly the stored values; None if it has no address or no name."""
         return DnsRecord(self.dns, self.host) if self.dns and self.host else None
+
+    def browser_host(self, dns: Dns) -> str | None:
+        """Return the host that browsers connect to: by its name, or its address if it has no name; None if neither."""
+        return dns.browser_host(self.dns_record) if self.dns_record else self.host
 
     @property
     def has_default_name(self) -> bool:

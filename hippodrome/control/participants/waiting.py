@@ -65,8 +65,7 @@ class ServerStates:
                 state["state"] = ServerState.QUEUED  # `GameStep` has this server stopped, and another will start
             elif record.state is ServerState.READY and record.host:
                 self._remember(record)
-                host = dns.browser_host(record.dns_record) if record.dns_record else record.host
-                state["url"] = f"{self._settings.game_scheme}://{host}:{record.port}/"
+                state["url"] = f"{self._settings.game_scheme}://{record.browser_host(dns)}:{record.port}/"
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
         state["typical"] = round(sorted(self._start_times)[len(self._start_times) // 2]) if self._start_times else None

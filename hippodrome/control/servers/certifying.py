@@ -125,7 +125,7 @@ class Certifying:
         except PermissionError:
             raise Refusal(403, "That order is for another address.") from None
         except ValueError:
-            raise Refusal(400, "That is no certificate request.") from None
+            raise Refusal(400, "That is no order's address.") from None
         if not chain:
             return {}
         if record.state is ServerState.NAMING:

@@ -142,7 +142,7 @@ class Rehearsal:
         record = self._record
         if self._reach is None or record is None or record.host is None:
             return []
-        host = self._platform.dns.browser_host(record.dns_record) if record.dns_record else record.host
+        host = record.browser_host(self._platform.dns)
         self._progress(f"connecting to {host}")
         try:
             self._reach(f"https://{host}:{record.port}/")

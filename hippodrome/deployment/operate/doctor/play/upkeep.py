@@ -128,15 +128,15 @@ def sweep(scene: RehearsalContext, closed: Server | None) -> None:
     later = platform.now() + timedelta(days=1)
     stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)
     platform.timers.set(closed.name, later, to_message(stop))
-    made = ["a timer"]
+    leftovers = ["a timer"]
     if closed.dns:
         platform.dns.change(add=[DnsRecord(closed.dns, NOWHERE)])
-        made.append("a name")
+        leftovers.append("a name")
     scene.wait(
-        lambda: True if len(left(scene, closed.user_id)) == len(made) else None,
+        lambda: True if len(left(scene, closed.user_id)) == len(leftovers) else None,
         "waiting until the leftovers can be seen",
         SEEN,
-        CheckFailed(f"{' and '.join(made).capitalize()} were made, and AWS does not list them.", "Run it again."),
+        CheckFailed(f"{' and '.join(leftovers).capitalize()} were made, and AWS does not list them.", "Run it again."),
     )
     scene.progress("running the sweep")
     answer = scene.context.account.client("lambda").invoke(
@@ -154,7 +154,7 @@ def sweep(scene: RehearsalContext, closed: Server | None) -> None:
             "The sweep has left something of a closed server.", "See `hippodrome logs --all --function sweep`."
         ),
     )
-    scene.transcript.good("sweep", f"It removed {' and '.join(made)} that a closed server had left.")
+    scene.transcript.good("sweep", f"It removed {' and '.join(leftovers)} that a closed server had left.")
 
 
 def _type_of(body: bytes) -> str:
