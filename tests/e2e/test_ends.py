@@ -22,8 +22,8 @@ project:
     veryYoung: answers.about.age < 14
     young: answers.about.age < 18
     child: answers.about.age < 12
-    odd: answers.say.more == "much" and condition.advice == "on"
     never: answers.say.more == "nothing"
+    odd: answers.say.more == "much" and condition.advice == "on"
     late: {minutes: 45}
 """
 MORE = '<select name="more" required><option value="">-<option>much<option>little</select><button>Go</button>'
@@ -61,7 +61,7 @@ def test_each_cell_and_end_is_reached_and_the_others_are_named_with_their_lines(
     assert "config.yml:13: project.ends.child: no bot could reach this end. Its rule is answers.about.age < 12." in text
     assert "veryYoung stands before it in the file, and counts first." in text
     assert (
-        'config.yml:15: project.ends.never: no bot could reach this end. Its rule is answers.say.more == "nothing"'
+        'config.yml:14: project.ends.never: no bot could reach this end. Its rule is answers.say.more == "nothing"'
         in text
     )
     assert "No value that their pages offer makes it true." in text

@@ -200,8 +200,9 @@ def _why(ends: Ends, end: End) -> str:
     if _asks(end, "order") or _asks(end, "run"):
         return f"It asks about an order, which is drawn: try again. {_where(sent)}"
     names = [other.name for other in ends.design.ends]
-    earlier = [name for name in names[: names.index(end.name)] if any(report.end == name for report in sent)]
-    if earlier:
+    before = names[: names.index(end.name)]
+    earlier = [name for name in before if any(report.end == name for report in sent)]
+    if earlier and all(report.end in before for report in sent):  # some may come there by the cell that is drawn
         return f"{_where(sent)} {' and '.join(earlier)} stands before it in the file, and counts first."
     return f"{_where(sent)} No value that their pages offer makes it true."
 
