@@ -25,9 +25,8 @@ Time and tasks
     `clock`           the clock of all simulations: the time, and the calls that are due; code may wait on `simulation/clock.py`
     `tasks`           a Fargate task in memory: its states, and the event of each. (In `fake_platform` a task is only its request)
 
-Faults, one module for each level at which they are injected
+Faults
     `port_faults`     at a call of a port: the call is refused, loses its reply, or the function crashes before or after it
-    `os_faults`       at the system calls of one machine
     `power_cut`       a disk that loses what was not synced
 
 How much and how fast

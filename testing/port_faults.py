@@ -1,7 +1,4 @@
-"""Faults at one call of a port, on the simulated platforms: the call is refused, loses its reply, or is the last one.
-
-`testing/os_faults.py` injects faults at system calls.
-"""
+"""Faults at one call of a port, on the simulated platforms: the call is refused, loses its reply, or is the last one."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import resource
 import shutil
 import signal
@@ -12,7 +11,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -25,10 +23,9 @@ import pytest
 from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.rehearsal.study_process import servers_of
 from hippodrome.trial.recordings import recording
-from testing import exploration
 from testing.waiting import until
 from tests.local.conftest import ROOT, Local
-from tests.local.test_run import _gone, _walk_whatever_happens
+from tests.local.test_run import _gone
 from tests.local.walk import Walker, at_the_game
 
 Make = Callable[..., Local]
@@ -93,7 +90,7 @@ def goes_on(here: Local, walker: Walker) -> None:
 
 @pytest.mark.skipif(
     OTHER is None,
-    reason="there is no other file system here; test_faults.py has the same with links that are refused",
+    reason="there is no other file system here",
 )
 def test_a_study_goes_on_with_its_state_on_another_file_system(local: Make) -> None:
     here = local(frames=240, holds=120)
@@ -186,59 +183,3 @@ def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: M
     assert made.returncode == 1
     assert f"The study cannot run with the data in {here.folder}/data: File too large." in made.stdout
     assert "Traceback" not in made.stdout + made.stderr
-
-
-@pytest.mark.hunt
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("seed", range(2 if exploration.TIMES < 2 else 8))
-def test_a_study_survives_random_refusals_and_kills(local: Make, seed: int) -> None:
-    """Four participants take part while calls are refused and the process is killed; at the end nothing is missing."""
-    here = local(frames=120)
-    dice = random.Random(seed)
-    port = _free_port()
-    people = [f"P{n}" for n in range(4)]
-    url = f"http://127.0.0.1:{port}"
-    walks = [threading.Thread(target=_walk_whatever_happens, args=[url, user], daemon=True) for user in people]
-    for walk in walks:
-        walk.start()
-    for number in range(4):
-        refused = here.text().count("refused: ") if number else 0
-        refused_by_chance(here, port, seed * 100 + number)
-        time.sleep(dice.uniform(2, 8))
-        until(lambda: here.text().count("refused: ") > refused, 60)  # noqa: B023
-        if dice.random() < 0.5:
-            for process in servers_of(here.data)[:1]:
-                os.kill(process.pid, signal.SIGKILL)
-        here.kill()
-    here.run("--port", str(port))
-    for walk in walks:
-        walk.join(120)
-        assert not walk.is_alive(), here.text()
-    _gone(here, 40)
-    assert here.end() == 0
-    for user in people:
-        answers = here.data / "quick" / "users" / user / "answers"
-        assert json.loads((answers / "1.json").read_text())["answers"] == {"word": f"hello {user}"}
-        assert json.loads((answers / "3.json").read_text())["answers"] == {"word": f"bye {user}"}
-        assert (answers / "2.json").exists()
-    assert not list((here.state / "spool").rglob("*.part"))
-    assert not list((here.state / "dead").rglob("*.json"))
-    assert {json.loads(path.read_text())["state"] for path in (here.data / "_servers").iterdir()} == {"closed"}
-
-
-def refused_by_chance(here: Local, port: int, seed: int) -> None:
-    """Run the study with calls that fail at random."""
-    with here.output.open("ab") as output:
-        here.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.local.local_refused_by_chance", str(here.folder), "--port", str(port)],
-            cwd=here.place,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "IDLE_SECONDS": "60", "SEED": str(seed), "CHANCE": "0.002"},
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return int(taken.getsockname()[1])
