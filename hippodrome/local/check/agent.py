@@ -36,14 +36,6 @@ _STACK_SECONDS = 10.0  # seconds more, in which the agent's process must have wr
 _SESSION = f"s.{'0' * 20}"
 
 
-class InterruptedCall(KeyboardInterrupt):
-    """The user has interrupted the agent in a call, which `problem` names with its line."""
-
-    def __init__(self, problem: Diagnostic) -> None:
-        super().__init__()
-        self.problem = problem
-
-
 def try_agent(
     folder: Path,
     config: Config,
@@ -54,7 +46,7 @@ def try_agent(
     """Let the agent play in each group (Hippodrome's agent, if the project has none), and return its problems.
 
     `say` gets a line for each group: how far the agent played. After a mistake in one group the others are not tried.
-    `say_long` gets a line for each call that takes long. Raises InterruptedCall for a KeyboardInterrupt in a call.
+    `say_long` gets a line for each call that takes long.
     """
     folder = folder.resolve()
     found: list[Diagnostic] = []
@@ -78,13 +70,7 @@ def _try(
     environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
     code = layout.agent_folder(folder).resolve()
     report_now = partial(AgentReport, folder, config, place, seconds, group)
-    try:
-        status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
-    except KeyboardInterrupt:
-        problem = report_now().interrupted()
-        if problem is None:
-            raise
-        raise InterruptedCall(problem) from None
+    status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
     return report_now(), status
 
 

@@ -20,7 +20,6 @@ from hippodrome.local.check.agent_progress import AgentProgress
 from hippodrome.local.check.deadline import Deadline
 from hippodrome.local.check.game import CheckedGame
 from hippodrome.local.check.one_player import OnePlayer
-from hippodrome.local.check.outside import Outside
 from hippodrome.protocol import environment as variables
 from hippodrome.protocol import handover
 from hippodrome.protocol.handover import Handover
@@ -69,7 +68,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     """Let the agent play, and write to the report how far it got."""
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
-    progress = AgentProgress(report, folder, Outside(config.scene), _EarlyEnviron.lines, deadline)
+    progress = AgentProgress(report, folder, _EarlyEnviron.lines, deadline)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     given = _handover()
     group = given.group if given else _group()

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from hippodrome.local.check.deadline import Deadline
-from hippodrome.local.check.outside import Outside
 from hippodrome.local.check.pace import PLAY_STEPS, Pace
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recorded_values import Values
@@ -35,7 +34,6 @@ class AgentProgress:
         self,
         report: Path,
         folder: Path,
-        outside: Outside,
         early: Sequence[tuple[str, str, int]] = (),
         deadline: Deadline | None = None,
     ) -> None:
@@ -44,7 +42,7 @@ class AgentProgress:
         `deadline` limits each call.
         """
         self._deadline = deadline
-        self._report, self._folder, self._outside = report, folder, outside
+        self._report, self._folder = report, folder
         self._early = early
         self._file: io.FileIO | None = None
         self.episodes = self.steps = 0
@@ -79,8 +77,6 @@ class AgentProgress:
         except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure too
             self._write(call=name, error=_described(error, self._folder))
             return False
-        if name == "render":
-            self._outside.see(self.result)
         return True
 
     def callback_failed(self, name: str, error: BaseException) -> None:
@@ -113,7 +109,6 @@ class AgentProgress:
 
     def over(self) -> None:
         """Report that everything has been tried."""
-        self.known["outside"] = self._outside.found()
         self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._loaded_before))
 
     def _write(self, **fields: Any) -> None:

@@ -15,7 +15,6 @@ from hippodrome.control.config import Config, Diagnostic, agent_imports, layout,
 from hippodrome.control.config.diagnostics import Remark
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.config.layout import AGENT
-from hippodrome.local.check import waiting
 from hippodrome.local.check.agent_file import label_of, line_of
 from hippodrome.local.check.pace import PLAY_STEPS, Pace
 from hippodrome.local.check.remedies import remedy
@@ -28,7 +27,6 @@ from hippodrome.trial.core.messages import FEEDBACK
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
 LONG_ENOUGH = 2.0  # seconds of playing that suffice to judge the pace
-INTERRUPTED = 1.0  # seconds that a call must have taken to be named when it is interrupted
 ENDLESS = 120.0  # seconds of a participant's play, or PLAY_STEPS, without an end of an episode that get a remark
 
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
@@ -51,7 +49,6 @@ class AgentReport:
     def __init__(self, folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> None:
         self._folder, self._config, self._place, self._seconds = folder, config, place, seconds
         self._group = group
-        self._waited = waiting.call_seconds(place / "report")
         self._code = layout.agent_folder(folder).resolve()
         self._label = label_of(folder)
         try:
@@ -73,7 +70,6 @@ class AgentReport:
             *self._slow_policies(),
             *self._forgetful(),
             *self._undrawn(),
-            *self._outside(),
             *self._too_large(),
             *self._only_text(),
             *self._endless(),
@@ -101,15 +97,6 @@ class AgentReport:
         """Return a line that names the call that has not come back yet."""
         call = self._call()
         return f"still {call} …" if self._report.get("call") == "policies" else f"still in {call} …"
-
-    def interrupted(self) -> Diagnostic | None:
-        """Return the call that the user has interrupted; None if it had begun just before."""
-        if not self._report or self._waited < INTERRUPTED:
-            return None
-        hung = self._hung(self._stack())
-        return self._at(
-            hung, f"{self._call()} had not come back after {self._waited:.0f} s{self._where()}: interrupted"
-        )
 
     def _where(self) -> str:
         """The place in the game, in parentheses; empty before the second step of the first group."""
@@ -181,19 +168,6 @@ class AgentReport:
             else:
                 found.append(self._in_config(("trial", "scene"), short(sentence), remark=True))
         return found
-
-    def _outside(self) -> list[Diagnostic]:
-        """A remark on objects that are never in the picture, as their places are pixels; for the first group only."""
-        places = {} if self._group else self._report.get("outside", {})
-        if not places:
-            return []
-        name, (x, y) = next(iter(places.items()))
-        others = {1: "", 2: ", nor is 1 other"}.get(len(places), f", nor are {len(places) - 1} others")
-        message = (
-            f"render(): the object {name!r} is never in the picture{others}: its place is ({x:g}, {y:g}), and 1 is the "
-            "picture's right or lower edge; did you mean pixels? Write coordinates: pixels into trial.scene"
-        )
-        return [self._at(self._place_of("render"), message, remark=True)]
 
     def _too_large(self) -> list[Diagnostic]:
         """A remark on a value that is too large for the recording."""

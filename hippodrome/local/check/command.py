@@ -51,11 +51,7 @@ def command(
     if playable and config:
         sys.stdout.write(f"trying {label or config.trial.game} …\n")
         sys.stdout.flush()
-        try:
-            tried = agent.try_agent(folder, config, seconds, _say, _say if sys.stdout.isatty() else lambda line: None)
-        except agent.InterruptedCall as interrupted:
-            _print([interrupted.problem])
-            raise typer.Exit(130) from None
+        tried = agent.try_agent(folder, config, seconds, _say, _say if sys.stdout.isatty() else lambda line: None)
         _print(tried)
         found += tried
     sys.stdout.write(f"{_summary(found, config)}\n")

@@ -7,7 +7,6 @@ import math
 import time
 from typing import IO
 
-from hippodrome.local.check.waiting import TELLS
 from hippodrome.trial.agent import match
 
 
@@ -18,7 +17,6 @@ class Deadline:
         """`seconds` are for all calls together, `call_seconds` for each that a server limits, too."""
         self._stack, self._at = stack, time.monotonic() + seconds
         self._limits = {"match": match.SECONDS, **dict.fromkeys(("reset", "step", "render"), call_seconds)}
-        faulthandler.register(TELLS, file=stack)
         self._end_after(seconds)
 
     def begin(self, call: str) -> float | None:

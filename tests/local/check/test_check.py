@@ -10,7 +10,6 @@ import pytest
 from hippodrome.local.backend.platform import LocalPlatform
 from hippodrome.local.check import agent_progress
 from hippodrome.local.check.agent_report import last_line
-from hippodrome.local.check.outside import Outside
 from hippodrome.local.publish import publish
 from hippodrome.local.watch import Watch
 from tests.local.check.checking import agent, config, looked, page, run, tried
@@ -147,7 +146,7 @@ def test_the_progress_of_an_agent_is_read_from_the_last_whole_line(
 ) -> None:
     monkeypatch.setattr(agent_progress, "REPORT_BYTES", 1_000)
     report = tmp_path / "report"
-    progress = agent_progress.AgentProgress(report, tmp_path, Outside(None))
+    progress = agent_progress.AgentProgress(report, tmp_path)
     sizes = []
     for step in range(50):
         progress.steps = step

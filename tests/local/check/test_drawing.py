@@ -109,34 +109,6 @@ def test_too_many_objects_are_a_mistake(folder: Path) -> None:
     assert mistake == (f"agent.py:{line_of_render(folder)}: render() returned 3000 objects; a scene has at most 2000")
 
 
-def test_places_in_pixels_are_remarked_where_coordinates_are_relative(folder: Path) -> None:
-    changed(folder, '"x": self.x, "y": self.y,', '"x": 600 * self.x, "y": 400 * self.y,')
-    (remark,) = tried(folder)
-    assert remark == (
-        f"agent.py:{line_of_render(folder)}: remark: render(): the object 'ball' is never in the picture: its place is "
-        "(180, 0), and 1 is the picture's right or lower edge; did you mean pixels? Write coordinates: pixels into "
-        "trial.scene"
-    )
-    config = folder / "config.yml"
-    config.write_text(config.read_text().replace("    width: 600\n", "    width: 600\n    coordinates: pixels\n"))
-    assert tried(folder) == []
-
-
-def test_several_objects_with_places_in_pixels_are_one_remark(folder: Path) -> None:
-    changed(folder, '"x": self.x, "y": self.y,', '"x": 600 * self.x, "y": 400 * self.y,')
-    changed(folder, "(self.paddle - 0.1, 0.94), (self.paddle + 0.1, 0.94)", "(240, 370), (360, 370)")
-    (remark,) = tried(folder)
-    assert "'ball' is never in the picture, nor is 1 other: its place is (180, 0)" in remark
-
-
-@pytest.mark.parametrize(
-    "place", ['"x": -0.5, "y": 0.5,', '"x": 2, "y": 2,', '"x": 3 * self.x, "y": 30 - 300 * self.x,']
-)
-def test_an_object_beside_the_picture_gets_no_remark(folder: Path, place: str) -> None:
-    changed(folder, '"x": self.x, "y": self.y,', place)
-    assert tried(folder) == []
-
-
 def test_an_info_that_is_too_large_for_the_recording_is_remarked(folder: Path) -> None:
     shorten(folder)
     changed(folder, "False, {}", 'False, {"seen": "x" * 2_000_000}')
