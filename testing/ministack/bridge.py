@@ -9,6 +9,7 @@ authorities. These bridges take the place of the Internet and of parts of AWS th
 - Gap: the site's domain name leads nowhere. Bridge: requests go to the emulator's gateway, with the domain name as Host
   header.
 - Gap: the emulator has no quotas. Bridge: those of a new account: 6 vCPUs of Fargate, 10 executions of Lambda, 5 VPCs.
+- Gap: the emulator does not know VPC Block Public Access. Bridge: it is off.
 - Gap: the emulator has no scan findings of ECR images. Bridge: a complete scan without findings.
 - `images.py` puts images into the emulator's ECR.
 """
@@ -97,7 +98,12 @@ def account() -> None:
         answer = {"imageScanStatus": {"status": "COMPLETE"}, "imageScanFindings": {"findingSeverityCounts": {}}}
         return AWSResponse(params["url"], 200, {}, None), {**answer, "ResponseMetadata": {"HTTPStatusCode": 200}}
 
+    def networks(params: Any, **_: Any) -> Any:
+        answer = {"VpcBlockPublicAccessOptions": {"InternetGatewayBlockMode": "off"}}
+        return AWSResponse(params["url"], 200, {}, None), {**answer, "ResponseMetadata": {"HTTPStatusCode": 200}}
+
     botocore.handlers.BUILTIN_HANDLERS += [
+        ("before-call.ec2.DescribeVpcBlockPublicAccessOptions", networks),
         ("after-call.lambda.GetAccountSettings", settings),
         ("before-call.ecr.DescribeImageScanFindings", findings),
     ]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from botocore.awsrequest import AWSResponse
 from moto import mock_aws
 from moto.iam.access_control import PermissionResult
 from moto.s3.models import FakeBucket
@@ -81,6 +82,8 @@ class Limits:
     def __init__(self) -> None:
         self.executions = 1000
         self.quotas = {quotas.SPOT: 100.0, quotas.ON_DEMAND: 100.0, quotas.VPCS: 5.0}
+        self.public_access: dict[str, Any] = {"InternetGatewayBlockMode": "off"}  # VPC Block Public Access
+        self.exclusions: list[dict[str, str]] = []
         self.denied: set[str] = set()  # operations that these credentials may not call
 
     def get_account_settings(self) -> Any:
@@ -95,6 +98,16 @@ class Limits:
         return {"Quota": {"Value": self.quotas[known]}}
 
     get_aws_default_service_quota = get_service_quota
+
+    def block_public_access(self, model: Any, params: Any, **_: Any) -> tuple[AWSResponse, dict[str, Any]]:
+        """Answer EC2's calls DescribeVpcBlockPublicAccess…; moto has neither."""
+        denied, status = model.name in self.denied, 403 if model.name in self.denied else 200
+        answer: dict[str, Any] = (
+            {"Error": {"Code": "UnauthorizedOperation", "Message": "not authorized"}}
+            if denied
+            else {"VpcBlockPublicAccessOptions": self.public_access, "VpcBlockPublicAccessExclusions": self.exclusions}
+        )
+        return AWSResponse(params["url"], status, {}, None), {**answer, "ResponseMetadata": {"HTTPStatusCode": status}}
 
     def _ask(self, operation: str) -> None:
         if operation in self.denied:
@@ -181,4 +194,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
         # Gap: moto ignores the conditions of bucket policies, so the one against plain HTTP would refuse every request.
         monkeypatch.setattr(FakeBucket, "get_permission", lambda *_: PermissionResult.NEUTRAL)
+        ec2 = world.account.client("ec2").meta.events
+        for name in ("Options", "Exclusions"):
+            ec2.register(f"before-call.ec2.DescribeVpcBlockPublicAccess{name}", world.limits.block_public_access, name)
         yield world
+        for name in ("Options", "Exclusions"):
+            ec2.unregister(f"before-call.ec2.DescribeVpcBlockPublicAccess{name}", unique_id=name)

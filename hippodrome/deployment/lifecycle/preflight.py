@@ -17,7 +17,7 @@ from hippodrome.console.formatting import count
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
 from hippodrome.control.certificates.rules import names_of
-from hippodrome.deployment.aws import caa, concurrency, quotas, regions
+from hippodrome.deployment.aws import caa, concurrency, public_access, quotas, regions
 from hippodrome.deployment.aws.account import Account, other_installations, servers_domain, site_host
 from hippodrome.deployment.aws.hosted_zone import delegation, exists, leading_away, read_zone, record_in
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, look, show
@@ -74,6 +74,8 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
         checks["servers"] = _servers_that_run
     if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
         checks["network"] = _subnets
+    if prepared.existing is None or (before.get("VpcId") or "") != after["VpcId"]:
+        checks["Internet"] = _internet
     if prepared.existing is None:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
         found = examine(AccountCheck(prepared.account, study), _OF_ACCOUNT)
@@ -320,6 +322,14 @@ def _endpoint(prepared: Prepared, vpc: str) -> Iterator[Finding]:
                 "functions, to store data and to get certificates.",
                 "Switch its private DNS off, or name another VPC: --vpc and --subnets.",
             )
+
+
+def _internet(prepared: Prepared) -> Iterator[Finding]:
+    """Check that the account's settings let servers reach the Internet, and browsers reach them."""
+    after = prepared.parameters
+    subnets = after["SubnetIds"].split(",") if after["VpcId"] else []
+    if problem := public_access.blocked(prepared.account, after["VpcId"], subnets):
+        yield of_problem("Internet", problem)
 
 
 def _vpcs(prepared: Prepared) -> Iterator[Finding]:

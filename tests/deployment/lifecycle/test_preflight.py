@@ -152,12 +152,19 @@ def test_problems_can_be_overruled(world: World, capsys: Capsys) -> None:
     assert "✗ domain" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("operation", "check"), [("GetAccountSettings", "Lambda"), ("GetServiceQuota", "Fargate")])
+@pytest.mark.parametrize(
+    ("operation", "check"),
+    [
+        ("GetAccountSettings", "Lambda"),
+        ("GetServiceQuota", "Fargate"),
+        ("DescribeVpcBlockPublicAccessOptions", "Internet"),
+    ],
+)
 def test_a_check_without_permission_is_a_remark(world: World, capsys: Capsys, operation: str, check: str) -> None:
     world.limits.denied.add(operation)
     assert apply(world.account, "hippodrome", FIRST).created
     said = capsys.readouterr().err
-    assert f"! {check}: could not be checked: These credentials may not get " in said
+    assert f"! {check}: could not be checked: These credentials may not " in said
 
 
 def test_of_an_existing_installation_only_changes_are_checked(world: World) -> None:
@@ -442,6 +449,51 @@ def test_subnets_are_checked(world: World) -> None:
         (Mark.LOOK, False),
         (Mark.BAD, True),
     ]
+
+
+@pytest.mark.parametrize("mode", ["block-ingress", "block-bidirectional"])
+def test_an_account_that_closes_its_networks_to_the_internet_gets_no_installation(world: World, mode: str) -> None:
+    world.limits.public_access = {"InternetGatewayBlockMode": mode, "ManagedBy": "account"}
+    found = only(findings(world))
+    assert (found.mark, found.check) == (Mark.BAD, "Internet")
+    assert "servers cannot load their image, and no browser can reach them" in found.text
+    assert "exempt a VPC there and name it" in found.advice
+    assert found.advice.endswith(f"--internet-gateway-block-mode off --region {world.account.region}")
+    world.limits.public_access["ManagedBy"] = "declarative-policy"
+    assert only(findings(world)).advice.startswith("Your organization has set it: ask its administrators")
+
+
+def test_a_network_that_is_exempt_from_the_block_is_good(world: World) -> None:
+    world.limits.public_access = {"InternetGatewayBlockMode": "block-bidirectional"}
+    ec2 = world.account.client("ec2")
+    vpc = ec2.create_vpc(CidrBlock="10.1.0.0/16")["Vpc"]["VpcId"]
+    subnets = [
+        ec2.create_subnet(VpcId=vpc, CidrBlock=f"10.1.{n}.0/24", AvailabilityZone=f"ca-central-1{zone}")["Subnet"]
+        for n, zone in enumerate("ab")
+    ]
+    names = [subnet["SubnetId"] for subnet in subnets]
+
+    def closed(mode: str = "allow-bidirectional", state: str = "create-complete", *exempt: str) -> bool:
+        world.limits.exclusions = [
+            {
+                "ResourceArn": f"arn:aws:ec2:ca-central-1:123456789012:{name.partition('-')[0]}/{name}",
+                "InternetGatewayExclusionMode": mode,
+                "State": state,
+            }
+            for name in exempt
+        ]
+        found = findings(world, StackSettings(domain=DOMAIN, vpc=vpc, subnets=",".join(names)))
+        assert [one.check for one in found] in ([], ["Internet"])
+        assert not found or f"exempt {vpc}: " in found[0].advice
+        return bool(found)
+
+    there, done = "allow-bidirectional", "create-complete"
+    assert closed(there, done)
+    assert not closed(there, done, vpc)
+    assert not closed(there, done, *names)
+    assert closed(there, done, names[0])
+    assert closed("allow-egress", done, vpc)
+    assert closed(there, "delete-complete", vpc)
 
 
 def test_remains_of_an_unfinished_destroy_are_a_problem(world: World) -> None:

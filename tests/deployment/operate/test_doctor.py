@@ -54,6 +54,7 @@ def world(installed: Installed) -> Installed:
     installed.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=60))
     for _ in range(20):
         quotas(installed)
+        block_public_access(installed)
         installed.answer("s3:GetBucketPolicy", {"Policy": json.dumps({"Statement": [TLS_ONLY]})})
     sns = installed.client("sns")
     sns.subscribe(TopicArn=installed.alarm_topic, Protocol="email", Endpoint="admin@example.org")
@@ -66,6 +67,15 @@ def quotas(world: Installed, spot: float = 100, on_demand: float = 100, function
         world.answer("service-quotas:GetServiceQuota", {"Quota": {"Value": value}})
     limit = {"ConcurrentExecutions": functions, "UnreservedConcurrentExecutions": functions}
     world.answer("lambda:GetAccountSettings", {"AccountLimit": limit})
+
+
+def block_public_access(world: Installed, mode: str = "off") -> None:
+    """Let AWS answer with this mode of VPC Block Public Access, and without exclusions. Gap: moto has neither call."""
+    world.answer(
+        "ec2:DescribeVpcBlockPublicAccessOptions", {"VpcBlockPublicAccessOptions": {"InternetGatewayBlockMode": mode}}
+    )
+    if mode != "off":
+        world.answer("ec2:DescribeVpcBlockPublicAccessExclusions", {"VpcBlockPublicAccessExclusions": []})
 
 
 def image(world: Installed, tag: str = "maze-0123456789ab") -> str:
@@ -135,6 +145,7 @@ def test_doctor_finds_nothing_bad_in_a_healthy_installation(world: Installed, ca
         "✓ region: us-east-1.",
         "✓ stack: hippodrome is in CREATE_COMPLETE.",
         "✓ hosted zone: example.org",
+        "✓ Internet: The account does not block it for the servers' network.",
         "✓ certificate: *.servers.example.org: 60 days left.",
         "✓ Fargate quota, Spot: 100 vCPU: 100 servers of 1 vCPU at once; 20 are wanted.",
         "✓ Lambda quota: 1,000 executions",
@@ -324,6 +335,14 @@ def test_a_missing_certificate_is_bad(world: Installed, account: Account) -> Non
 
 def fresh(installed: Installed) -> None:
     installed._answers.clear()
+
+
+def test_an_account_that_closes_the_servers_network_to_the_internet_is_bad(world: Installed, account: Account) -> None:
+    fresh(world)
+    block_public_access(world, "block-bidirectional")
+    found = only(addresses.internet(context(account)))
+    assert (found.mark, "servers cannot load their image" in found.text) == (Mark.BAD, True)
+    assert "aws ec2 modify-vpc-block-public-access-options" in found.advice
 
 
 def test_quotas_that_are_too_small_come_with_the_command_to_raise_them(world: Installed, account: Account) -> None:

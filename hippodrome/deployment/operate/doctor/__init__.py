@@ -31,6 +31,7 @@ CHECKS: dict[str, Check] = {
     "hosted zone": addresses.zone,
     "site certificate": addresses.site_certificate,
     "site": addresses.site,
+    "Internet": addresses.internet,
     "certificate": addresses.certificate,
     "Fargate quotas": capacity.fargate,
     "Lambda quota": capacity.functions,

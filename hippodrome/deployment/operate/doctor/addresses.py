@@ -19,6 +19,7 @@ from hippodrome.control.certificates.rules import (
     names_of,
 )
 from hippodrome.control.storage.compare_and_swap import SharedDocuments
+from hippodrome.deployment.aws import public_access
 from hippodrome.deployment.aws.hosted_zone import read_zone
 from hippodrome.deployment.core.finding import Finding, bad, good, look
 from hippodrome.deployment.operate import snapshot
@@ -106,6 +107,16 @@ def site(context: CheckContext) -> Iterator[Finding]:
         yield bad("site", f"{address} answers {status}.", "See `hippodrome logs --all --function next_step --errors`.")
     else:
         yield good("site", f"{address} answers.")
+
+
+def internet(context: CheckContext) -> Iterator[Finding]:
+    """Check whether a setting of the account closes the servers' network to the Internet."""
+    stack = Stack(context.account, context.installation.stack)
+    vpc = context.installation.parameters.get("VpcId") or "".join(stack.ids_of("AWS::EC2::VPC"))
+    if problem := public_access.blocked(context.account, vpc, context.installation["Subnets"].split(",")):
+        yield bad("Internet", str(problem), problem.advice)
+    else:
+        yield good("Internet", "The account does not block it for the servers' network.")
 
 
 def fetch(address: str) -> int:
