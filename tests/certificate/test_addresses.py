@@ -29,7 +29,9 @@ from hippodrome.control.certificates.rules import (
     ACCOUNT,
     ADDRESS_ORDERS,
     MAX_ORDERS,
+    MAX_ORDERS_OF_SERVER,
     AddressOrders,
+    CountedOrder,
     FailureReason,
     OrderFailed,
 )
@@ -49,6 +51,7 @@ from tests.certificate.pebble import Pebble
 
 ROOT = Path(__file__).resolve().parents[2]
 HOST = "127.0.0.1"
+WARM = "~" + "0" * 20  # the id of a warm server
 AGENT = """
 import pathlib
 class Agent:
@@ -84,12 +87,14 @@ class Installation(FakePlatform):
         directory = self.pebble.directory
         return AddressAuthority(directory, account_key(self.documents, directory), self.pebble.trusted)
 
-    def server(self, state: ServerState = ServerState.NAMING, host: str = HOST) -> Server:
+    def server(self, state: ServerState = ServerState.NAMING, host: str = HOST, user_id: str = "alice") -> Server:
         """Store the record of a server whose task runs at this address."""
         record = servers.new_attempt(
-            study(id="maze"), "alice", 1, nonce="nonce", settings=self.settings, now=self.now()
+            study(id="maze"), user_id, 1, nonce="nonce", settings=self.settings, now=self.now()
         )
-        record = msgspec.structs.replace(record, state=state, host=host, task="task")
+        return self.keep(msgspec.structs.replace(record, state=state, host=host, task="task"))
+
+    def keep(self, record: Server) -> Server:
         self.documents.put(servers.key(record.label), to_json(record))
         return record
 
@@ -209,6 +214,39 @@ def test_a_server_waits_for_its_certificate_until_its_task_was_seen(installation
     assert issued
     assert sum("answer" in sent for _, sent in installation.received) == 1  # each answer is another validation
     assert installation.ready
+
+
+def test_a_server_whose_running_event_was_lost_gets_its_certificate_when_the_sweep_sends_it(
+    installation, pebble, monkeypatch
+) -> None:
+    monkeypatch.setattr(own_certificate, "ORDER_SECONDS", 6.0)
+    record = installation.server(ServerState.STARTING, host="")
+    order = Order(installation.url, record.name, installation.credential(record), pebble.http_port)
+    issued = []
+    thread = threading.Thread(target=lambda: issued.append(order.certificate()))
+    thread.start()
+    thread.join(9)
+    assert thread.is_alive()
+    installation.server(ServerState.NAMING)
+    thread.join(30)
+    assert issued
+    assert installation.orders == 1
+
+
+def test_a_warm_server_whose_last_answer_was_lost_gets_its_certificate_after_it_was_assigned(
+    installation, pebble
+) -> None:
+    warm = installation.server(user_id=WARM)
+    asked = {"order": installation.ask(warm)[1]["order"], "csr": ""}
+    record = installation.server(ServerState.STARTING, user_id="alice")
+    record = servers.reserving(record, warm)
+    installation.keep(record)
+    installation.keep(servers.handed_over(warm, record.label, installation.now()))
+    assert installation.ask(warm, **asked) == (200, {})  # the authority works
+    installation.keep(servers.assigned(record, warm, installation.now()))
+    assert installation.ask(warm, **asked) == (200, {})
+    installation.keep(servers.close(record, servers.Reason.STOPPED, installation.now()))
+    assert installation.ask(warm, **asked)[0] == 409
 
 
 def test_after_three_failed_orders_the_trial_ends_with_an_exit_code_of_its_own(installation, trial) -> None:
@@ -352,7 +390,7 @@ def test_a_wrong_credential_and_a_server_that_has_a_name_or_has_ended_get_nothin
 
 def test_no_order_is_placed_beyond_the_limit_until_three_hours_have_passed(installation) -> None:
     record, now = installation.server(), installation.now()
-    placed = AddressOrders(tuple(now - timedelta(minutes=1) for _ in range(MAX_ORDERS)))
+    placed = AddressOrders(tuple(CountedOrder(now - timedelta(minutes=1), f"s{n}-1") for n in range(MAX_ORDERS)))
     installation.documents.put(ADDRESS_ORDERS, to_json(placed))
     assert installation.ask(record) == (200, {"refused": "the limit of certificates is reached"})
     order = Order(installation.url, record.name, installation.credential(record))
@@ -361,6 +399,16 @@ def test_no_order_is_placed_beyond_the_limit_until_three_hours_have_passed(insta
     installation.wait(hours=3)
     assert "order" in installation.ask(record)[1]
     assert installation.orders == 1
+
+
+def test_one_server_cannot_use_up_the_orders_of_all(installation) -> None:
+    record = installation.server()
+    answers = [installation.ask(record)[1] for _ in range(MAX_ORDERS_OF_SERVER + 1)]
+    assert ["order" in answer for answer in answers] == [True] * MAX_ORDERS_OF_SERVER + [False]
+    assert answers[-1] == {"refused": "the limit of this server"}
+    assert installation.orders == MAX_ORDERS_OF_SERVER
+    another = installation.server(user_id="bob")
+    assert "order" in installation.ask(another)[1]
 
 
 def test_the_account_is_opened_once(installation, pebble) -> None:

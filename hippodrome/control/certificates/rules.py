@@ -51,6 +51,7 @@ HOUR = timedelta(hours=1)
 MAX_VALIDATIONS_PER_HOUR = 4  # one less than Let's Encrypt allows
 ORDERS_WINDOW = timedelta(hours=3)
 MAX_ORDERS = 300  # for addresses, in that time (Let's Encrypt's "New Orders per Account")
+MAX_ORDERS_OF_SERVER = 5  # a server makes three tries; the answers to some may be lost
 MAX_ORDERS_AT_START = 250  # no server is started after so many: those under way still order, some of them twice
 MAX_FAILURES = 10  # failed orders that are stored
 MAX_TEXT = 1000  # characters of a CA's message that are stored
@@ -151,26 +152,34 @@ class CertificateRecord(Record, frozen=True):
     challenges: tuple[str, ...] = ()  # values that the TXT record may still have
 
 
+class CountedOrder(NamedTuple):
+    """An order of a certificate for an address: when it was placed, and the server's name."""
+
+    at: UtcDatetime
+    server: str
+
+
 class AddressOrders(Record, frozen=True):
-    """`SSL/addresses.json`: when certificates for servers' addresses were ordered lately, oldest first.
+    """`SSL/addresses.json`: the orders of certificates for servers' addresses lately, oldest first.
 
     `until`: the CA takes no order before this time.
     """
 
-    placed: tuple[UtcDatetime, ...] = ()
+    placed: tuple[CountedOrder, ...] = ()
     until: UtcDatetime | None = None
 
-    def count(self, now: datetime) -> int:
-        """Return how many orders count against the CA's limit now."""
-        return sum(now - at < ORDERS_WINDOW for at in self.placed)
+    def count(self, now: datetime, server: str = "") -> int:
+        """Return how many orders count against the CA's limit now: all, or this server's."""
+        return sum(now - order.at < ORDERS_WINDOW and server in ("", order.server) for order in self.placed)
 
     def allows(self, now: datetime, most: int) -> bool:
         """Return whether another order may be placed, if `most` may count."""
         return self.count(now) < most and (self.until is None or now >= self.until)
 
-    def with_order(self, now: datetime) -> AddressOrders:
+    def with_order(self, now: datetime, server: str) -> AddressOrders:
         """Return the record with one more order; orders that do not count any more leave it."""
-        return AddressOrders((*(at for at in self.placed if now - at < ORDERS_WINDOW), now), self.until)
+        kept = (order for order in self.placed if now - order.at < ORDERS_WINDOW)
+        return AddressOrders((*kept, CountedOrder(now, server)), self.until)
 
 
 @dataclass(frozen=True)

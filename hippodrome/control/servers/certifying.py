@@ -6,10 +6,11 @@ The server shows its credential, first to place an order, then again and again u
     {"address": "203.0.113.7", "order": "https://…", "token": "…", "proof": "…"}
 
     {"server": "s…-1", "credential": "…", "order": "https://…", "csr": "-----BEGIN CERTIFICATE …", "answer": true}
-    {} or {"certificate": "-----BEGIN CERTIFICATE-----…"}
+    {} or {"unseen": true} or {"certificate": "-----BEGIN CERTIFICATE-----…"}
 
-The first of these has `answer`: the server shows the proof now. Instead, `{"failed": "…"}` says that another order is
-needed, and `{"refused": "…"}` that none may be placed for this address now. Status 429: ask again.
+The first of these has `answer`: the server shows the proof now. `unseen`: `task_changed` has not seen the task yet, for
+which the order waits, however long. Instead, `{"failed": "…"}` says that another order is needed, and
+`{"refused": "…"}` that none may be placed for this address now. Status 429: ask again.
 
 The address is the one that the request comes from, so no server gets a certificate for an address that is not its own.
 The certificate is handed out once `task_changed` has seen the task's address, and makes the server `ready`.
@@ -25,6 +26,7 @@ import msgspec
 from hippodrome.control.certificates.rules import (
     ADDRESS_ORDERS,
     MAX_ORDERS,
+    MAX_ORDERS_OF_SERVER,
     AddressOrders,
     FailureReason,
     Limit,
@@ -42,8 +44,7 @@ from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
 
 MAX_BODY = 16 * 1024  # bytes
-_WAITING = (ServerState.STARTING, ServerState.NAMING)
-_ISSUED = (ServerState.NAMING, ServerState.READY)  # READY: it asks again, because an answer was lost
+_WAITING = (ServerState.STARTING, ServerState.NAMING, ServerState.READY)  # READY: it asks again if an answer was lost
 
 
 class PlacedOrder(Protocol):
@@ -89,18 +90,24 @@ class Certifying:
     def respond(self, request: Request) -> Response:
         """Place an order, or take its next step.
 
-        AWS calls: one read of the server's record; three for a new order; one message once the certificate is issued.
+        AWS calls: one read of the server's record; one more if it is a warm server that was assigned; three for a new
+        order; one message once the certificate is issued.
         """
         try:
             wanted = read_request(
                 request, CertificateRequest, MAX_BODY, "server and credential, or with order and csr too"
             )
             record = record_of(wanted.server, wanted.credential, self._repository, self._secrets)
-            if record.dns or not record.owns(wanted.server) or record.state not in {*_WAITING, *_ISSUED}:
+            if record.assigned_to and (owner := self._repository.server(record.assigned_to)):
+                record = owner.server
+            if record.dns or not record.owns(wanted.server) or record.state not in _WAITING:
                 raise Refusal(409, "This server needs no certificate now.")
             if record.host and record.host != request.source:
                 raise Refusal(409, "The request does not come from the address of the server's task.")
-            answer = self._advance(record, wanted, request.source) if wanted.order else self._place(request.source)
+            if wanted.order:
+                answer = self._advance(record, wanted, request.source)
+            else:
+                answer = self._place(wanted.server, request.source)
         except Refusal as refusal:
             return answer_of(refusal.status, {"message": refusal.text})
         except OrderFailed as failed:
@@ -109,25 +116,27 @@ class Certifying:
             return self._failed(failed)
         return answer_of(200, answer)
 
-    def _place(self, address: str) -> dict[str, str]:
-        now = self._platform.now()
-        if not self._shared.read(ADDRESS_ORDERS, AddressOrders).allows(now, MAX_ORDERS):
+    def _place(self, server: str, address: str) -> dict[str, str | bool]:
+        now, orders = self._platform.now(), self._shared.read(ADDRESS_ORDERS, AddressOrders)
+        if not orders.allows(now, MAX_ORDERS):
             return {"refused": "the limit of certificates is reached"}
+        if orders.count(now, server) >= MAX_ORDERS_OF_SERVER:  # else one server could keep all others from starting
+            return {"refused": "the limit of this server"}
         order = self._client().order(address)
         # Not before: while the CA is away, servers ask each second, which would use up three hours' orders in vain.
-        self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: orders.with_order(now))
+        self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: orders.with_order(now, server))
         return {"address": address, "order": order.url, "token": order.token, "proof": order.proof}
 
-    def _advance(self, record: Server, wanted: CertificateRequest, address: str) -> dict[str, str]:
-        may_issue = record.state in _ISSUED and record.host == address
+    def _advance(self, record: Server, wanted: CertificateRequest, address: str) -> dict[str, str | bool]:
+        seen = record.host == address
         try:
-            chain = self._client().advance(wanted.order, address, wanted.csr, answer=wanted.answer, may_issue=may_issue)
+            chain = self._client().advance(wanted.order, address, wanted.csr, answer=wanted.answer, may_issue=seen)
         except PermissionError:
             raise Refusal(403, "That order is for another address.") from None
         except ValueError:
             raise Refusal(400, "That is no order's address.") from None
         if not chain:
-            return {}
+            return {} if seen else {"unseen": True}
         if record.state is ServerState.NAMING:
             issued = DnsChanged("", [ServerAttempt(record.label, record.attempt)])
             self._platform.bus.send_delayed(to_message(issued), 0)

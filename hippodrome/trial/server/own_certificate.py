@@ -30,7 +30,7 @@ from hippodrome.protocol import environment
 log = logging.getLogger("trial")
 
 ORDERS = 3  # tries
-ORDER_SECONDS = 60.0  # for one order; Let's Encrypt usually takes less than ten
+ORDER_SECONDS = 60.0  # for one order, once the task was seen; Let's Encrypt usually takes less than ten
 PAUSES = (1.0, 2.0)  # seconds between questions: the first, and the longest; each is a quarter longer than the last
 BETWEEN_ORDERS = 5.0  # seconds
 BUSY = 2.0  # seconds until the same question is sent again if it was not answered
@@ -102,12 +102,13 @@ class Order:
             pause, longest = PAUSES
             wanted = {"order": order["order"], "csr": request.read_text()}
             answer = self._ask(deadline, **wanted, answer=True)
-            while answer == {}:
+            while answer is not None and "certificate" not in answer:
+                if "unseen" in answer:  # if ECS's event was lost, it takes minutes until the sweep sends it again
+                    deadline = time.monotonic() + ORDER_SECONDS
                 time.sleep(pause)
                 pause = min(longest, pause * 1.25)
                 answer = self._ask(deadline, **wanted)
-            chain = answer.get("certificate") if answer else None
-            return CertificateAndKey(chain.encode(), key.read_bytes()) if chain else None
+            return CertificateAndKey(answer["certificate"].encode(), key.read_bytes()) if answer else None
 
     def _ask(self, deadline: float, **more: str | bool) -> dict[str, str] | None:
         """Ask the function; None if the order has failed or takes too long. Raises NoCertificate if it says no."""

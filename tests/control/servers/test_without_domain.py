@@ -8,7 +8,7 @@ from datetime import timedelta
 import msgspec
 import pytest
 
-from hippodrome.control.certificates.rules import ADDRESS_ORDERS, MAX_ORDERS_AT_START, AddressOrders
+from hippodrome.control.certificates.rules import ADDRESS_ORDERS, MAX_ORDERS_AT_START, AddressOrders, CountedOrder
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import DnsChanged, ServerAttempt, StartServer, StopServer, TaskChanged
@@ -91,7 +91,7 @@ def test_a_server_that_ends_leaves_nothing(platform, servers) -> None:
 
 
 def test_no_server_starts_when_too_many_certificates_were_ordered(platform) -> None:
-    placed = tuple(platform.now() for _ in range(MAX_ORDERS_AT_START))
+    placed = tuple(CountedOrder(platform.now(), f"s{n}-1") for n in range(MAX_ORDERS_AT_START))
     platform.documents.put(ADDRESS_ORDERS, to_json(AddressOrders(placed)))
     servers = Servers(platform)
     servers.start(StartServer("maze", "alice"))
