@@ -81,9 +81,9 @@ _WAITING = {
     "waiting": "Waiting for {time}.",
     "usually": "Usually it takes about {time}.",
     "takesLonger": "This takes longer than usual. Please stay on this page.",
-    "clockBehind": (
-        "Your device's clock is {minutes} minutes behind, so it cannot connect yet. Please set it right, or wait: we "
-        "keep trying."
+    "clockWrong": (
+        "Your device's clock is wrong, so it cannot connect: it should show {time}. Please set it right; we keep "
+        "trying."
     ),
     "noConnection": (
         "No connection – trying again… Your answers are kept. Please stay on this page: it continues by itself. "

@@ -150,7 +150,7 @@ class Certifying:
         limit = limit_in(str(failed)) if failed.reason is FailureReason.RATE_LIMITED else None
         if failed.reason is FailureReason.UNREACHABLE or limit is Limit.REQUESTS:
             self._authority = None  # perhaps its connection is broken
-            # Not 5xx, of which the alarm `site-errors` says that participants saw an error.
+            # Not 5xx: the authority's troubles are no errors of ours, which the alarm `site-errors` tells.
             return answer_of(429, {"message": "The certificate authority does not answer now."})
         if limit is None:
             return answer_of(200, {"failed": failed.reason.value})

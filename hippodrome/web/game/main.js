@@ -19,6 +19,8 @@ import { beat, isOver, noteRestart, pollDelay, restartedFor, showWaiting } from 
 const HANGS = TEXT.hangs;
 const SILENT = 2_200; // ms without a message, although the server was asked
 const LONG = 20_000; // ms without a message while the game is loaded
+const LATE = 90; // seconds by which a clock is behind, so that it is said why the page cannot connect
+const EARLY = 5 * 86_400; // seconds by which it is ahead: certificates of addresses are valid for 160 hours
 const RELOAD_AFTER = 240_000; // ms of waiting: the request for a server may be lost, and a reload repeats it
 
 const title = document.title;
@@ -96,10 +98,13 @@ function playHere() {
   });
 }
 
-// A browser refuses a certificate that is younger than its clock is late. Names have an old one, addresses a new one.
+// By a clock that is late, a certificate that is some seconds old is not valid yet; by one that is a week early, no more.
+// Names have an old certificate, which is valid for months.
 function clockHint() {
-  const minutes = Math.round(secondsBehind() / 60);
-  return "server" in data && minutes > 1 ? TEXT.clockBehind(minutes.toLocaleString(TEXT.language)) : "";
+  const seconds = secondsBehind();
+  if (!("server" in data) || (seconds < LATE && seconds > -EARLY)) return "";
+  const time = new Date(Date.now() + seconds * 1_000);
+  return TEXT.clockWrong(time.toLocaleString(TEXT.language, { dateStyle: "long", timeStyle: "short" }));
 }
 
 function checkForHang() {
