@@ -14,7 +14,7 @@ const css = `
   .wide .controls { grid-area: 2 / 1 / 3 / 4; justify-content: end; width: auto; max-width: none; pointer-events: none; }
   .wide .controls .pad { max-width: none; grid-template-columns: var(--thumb) var(--thumb) 1fr 7.2rem; }
   .wide .controls button { pointer-events: auto; }
-  .wide .board > .overlay { grid-area: jump; zoom: .8; }
+  .wide .hands > .overlay { grid-area: jump; zoom: .8; }
   .wide .overlay button { min-width: 0; }
   .wide .controls > :not(.pad) { align-self: end; width: 7.2rem; }
 }`;
