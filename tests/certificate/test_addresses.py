@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import http.server
 import json
 import os
 import socket
@@ -14,17 +13,14 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import msgspec
 import pytest
 from cryptography import x509
 
-from hippodrome.control.certificates.accounts import account_key
-from hippodrome.control.certificates.addresses import AddressAuthority
 from hippodrome.control.certificates.rules import (
     ACCOUNT,
     ADDRESS_ORDERS,
@@ -35,22 +31,18 @@ from hippodrome.control.certificates.rules import (
     FailureReason,
     OrderFailed,
 )
-from hippodrome.control.http import Request
 from hippodrome.control.model import server as servers
-from hippodrome.control.model.messages import DnsChanged, ServerAttempt, parse_dns_changed
-from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.messages import DnsChanged, ServerAttempt
+from hippodrome.control.model.records import to_json
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.servers.certifying import Certifying
-from hippodrome.control.storage.secret import SecretCache
 from hippodrome.protocol import exits
 from hippodrome.trial.server import own_certificate
 from hippodrome.trial.server.own_certificate import NoCertificate, Order
-from testing.fake_platform import FakePlatform
-from testing.studies import study
+from tests.certificate.addresses import HOST, Installation, served
 from tests.certificate.pebble import Pebble
 
 ROOT = Path(__file__).resolve().parents[2]
-HOST = "127.0.0.1"
 WARM = "~" + "0" * 20  # the id of a warm server
 AGENT = """
 import pathlib
@@ -71,52 +63,6 @@ sys.exit(main())
 """
 
 
-class Installation(FakePlatform):
-    """An installation without a domain, whose function `certify_server` is served at `url`."""
-
-    def __init__(self, pebble: Pebble) -> None:
-        super().__init__()
-        self.settings = replace(self.settings, root_domain="", servers_host="", game_sources="")
-        self.pebble, self.url = pebble, ""
-        self.received: list[tuple[str, dict[str, Any]]] = []  # the source and the body of each request of a trial
-        self.secrets = SecretCache(self.documents)
-        self.secrets.get_or_create()
-        self.certifying = Certifying(self, self.open_authority)
-
-    def open_authority(self) -> AddressAuthority:
-        directory = self.pebble.directory
-        return AddressAuthority(directory, account_key(self.documents, directory), self.pebble.trusted)
-
-    def server(self, state: ServerState = ServerState.NAMING, host: str = HOST, user_id: str = "alice") -> Server:
-        """Store the record of a server whose task runs at this address."""
-        record = servers.new_attempt(
-            study(id="maze"), user_id, 1, nonce="nonce", settings=self.settings, now=self.now()
-        )
-        return self.keep(msgspec.structs.replace(record, state=state, host=host, task="task"))
-
-    def keep(self, record: Server) -> Server:
-        self.documents.put(servers.key(record.label), to_json(record))
-        return record
-
-    def credential(self, record: Server) -> str:
-        return self.secrets.get_or_create().credential(record.name, record.nonce)
-
-    def ask(self, record: Server, source: str = HOST, **more: str | bool) -> tuple[int, dict[str, Any]]:
-        body = json.dumps({"server": record.name, "credential": self.credential(record), **more}).encode()
-        answer = self.certifying.respond(Request("POST", "/certificate", (), {}, body, source))
-        return answer.status, json.loads(answer.body)
-
-    @property
-    def ready(self) -> list[DnsChanged]:
-        """The messages that make servers ready."""
-        return [message for _, sent in self.bus.delayed if (message := parse_dns_changed(sent))]
-
-    @property
-    def orders(self) -> int:
-        found = self.documents.get(ADDRESS_ORDERS)
-        return len(from_json(found.body, AddressOrders).placed) if found else 0
-
-
 def free_port() -> int:
     with socket.create_server((HOST, 0)) as listening:
         port: int = listening.getsockname()[1]
@@ -125,27 +71,8 @@ def free_port() -> int:
 
 @pytest.fixture
 def installation(pebble: Pebble) -> Iterator[Installation]:
-    made = Installation(pebble)
-
-    class Function(http.server.BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"]))
-            made.received.append((self.client_address[0], json.loads(body)))
-            answer = made.certifying.respond(Request("POST", self.path, (), {}, body, self.client_address[0]))
-            self.send_response(answer.status)
-            self.end_headers()
-            self.wfile.write(str(answer.body).encode())
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer((HOST, 0), Function) as function:
-        thread = threading.Thread(target=function.serve_forever, args=(0.05,))
-        thread.start()
-        made.url = f"http://{HOST}:{function.server_port}/certificate"
+    with served(pebble) as made:
         yield made
-        function.shutdown()
-        thread.join()
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import ssl
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,7 @@ from hippodrome.deployment.study.image.bundle import make_bundle
 from hippodrome.deployment.study.image.order import Order
 from hippodrome.deployment.study.image.registry import Repository
 from testing import ports
+from tests.certificate import addresses, pebble
 from tests.deployment import sandbox
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -124,13 +126,54 @@ def test_an_assembled_image_plays_as_its_user_with_a_read_only_root(
         assert refused.wait(60) != 0, place
 
 
-def played(root: Path, config: Mapping[str, Any], folder: Path) -> PlayedStep:
-    """Let a bot play the image's game for two seconds, then stop it; the server then ends by itself."""
+def test_an_assembled_image_gets_a_certificate_for_its_address_and_plays_over_tls(
+    images: Images, study: Path, root: Path, tmp_path: Path
+) -> None:
+    """Without a domain: the image's user makes a key, answers the authority, and a client checks the address."""
+    if not pebble.installed():
+        assert not os.environ.get("REQUIRE_PEBBLE"), pebble.MISSING
+        pytest.skip(pebble.MISSING)
+    assembled.build(images.order(study, "the official layout", "certified"))
+    config = sandbox.unpack(images.address, STUDY, "certified", root)
+    with pebble.running(tmp_path) as authority, addresses.served(authority) as installation:
+        record = installation.server()
+        variables = {
+            "SERVER": record.name, "USER_ID": record.user_id, "CREDENTIAL": installation.credential(record),
+            "CERTIFICATE": installation.url, "TLS": "",
+        }  # fmt: skip
+        program = CHALLENGED.replace("PORT", str(authority.http_port))
+        config = {**config, "Cmd": ["python", "-c", program]}
+        play = played(root, config, tmp_path, variables, ssl.create_default_context(cadata=authority.root()))
+        assert installation.ready
+        assert installation.orders == 1
+    assert play.done
+    assert play.frames > 30
+
+
+CHALLENGED = """
+from hippodrome.trial.server import own_certificate
+own_certificate.Order.__init__.__defaults__ = (PORT,)  # where the tests' authority looks, instead of port 80
+from hippodrome.trial.__main__ import main
+raise SystemExit(main())
+"""
+
+
+def played(
+    root: Path,
+    config: Mapping[str, Any],
+    folder: Path,
+    more: Mapping[str, str] | None = None,
+    tls: ssl.SSLContext | None = None,
+) -> PlayedStep:
+    """Let a bot play the image's game for two seconds, then stop it; the server then ends by itself.
+
+    `more` are further variables of the server; with `tls` the bot connects by TLS, and checks its certificate.
+    """
     section = yaml.safe_load((ROOT / "config.yml").read_text())["trial"]
     variables = {
         "PROJECT_ID": "maze", "USER_ID": "P1", "SERVER": "s-1", "TOKEN": "secret", "GAME_STEPS": "3", "GROUP": "",
         "TRIAL": json.dumps(section), "HOST": "127.0.0.1", "PORT": "0", "TLS": "off", "STORE": "/scratch/store",
-        "LINGER_SECONDS": "0.2",
+        "LINGER_SECONDS": "0.2", **(more or {}),
     }  # fmt: skip
     log, errors = folder / "log", folder / "log.err"
     process = sandbox.start(root, config, variables, log)
@@ -140,7 +183,7 @@ def played(root: Path, config: Mapping[str, Any], folder: Path) -> PlayedStep:
             time.sleep(0.05)
         port = json.loads(log.read_text().splitlines()[0])["port"]
         play = PlayedStep("3")
-        asyncio.run(_play(port, play))
+        asyncio.run(_play(port, play, variables, tls))
         assert process.wait(60) == 0, errors.read_text()
     finally:
         process.kill()
@@ -221,11 +264,11 @@ def test_a_base_with_another_python_is_refused(images: Images, study: Path) -> N
         assembled.build(dataclasses.replace(order, bundle=bundle))
 
 
-async def _play(port: int, play: PlayedStep) -> None:
-    report = BotReport("P1")
+async def _play(port: int, play: PlayedStep, variables: Mapping[str, str], tls: ssl.SSLContext | None) -> None:
+    report, user_id = BotReport("P1"), variables["USER_ID"]
     options: dict[str, Any] = {"max_size": None, "subprotocols": [SUBPROTOCOL], "compression": None, "proxy": None}
-    async with connect(f"ws://127.0.0.1:{port}/", **options) as websocket:
+    async with connect(f"{'wss' if tls else 'ws'}://127.0.0.1:{port}/", ssl=tls, **options) as websocket:
         bot = GameConnection(websocket, play, report, Random(1), 2)
         with contextlib.suppress(ConnectionClosed):
-            await bot.run({"userId": "P1", "token": "secret", "step": "3"})
+            await bot.run({"userId": user_id, "token": "secret", "step": "3"})
     assert not report.troubles
