@@ -55,6 +55,7 @@ ROOMS = {
         "pictures",
         "core",
         "recordings",
+        "llm",
         "agent",
         "policies",
         "wire",

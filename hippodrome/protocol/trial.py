@@ -11,6 +11,7 @@ from hippodrome.protocol import key_maps, values
 from hippodrome.protocol import players as player_checks
 from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol.section_keys import Section
+from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.protocol.trial_sections import SceneSection, Ui
 from hippodrome.protocol.values import KeyPath, number_in, show
 
@@ -229,6 +230,13 @@ class TrialSection(Section):
         "[objects.md](objects.md#configyml).",
         "width: 600",
         example="{width: 600, height: 400}",
+    )
+    llm: LlmSection | None = keyed.section(
+        LlmSection,
+        None,
+        "A language model, which talks with participants or answers your agent; see [llm](#llm).",
+        "model: small-model-1",
+        example="{url: https://api.example.org/v1, model: small-model-1}",
     )
     players: dict[str, Any] = keyed.key(
         player_checks.players,
@@ -472,10 +480,10 @@ class TrialSection(Section):
         return keyed.document(self)
 
     def registered(self) -> dict[str, Any]:
-        """Return the section as a registration stores it: as `document`, without SESSION_KEYS that have their default
-        values, since ECS limits the length of a server's variables."""
-        defaults = TrialSection().document()
-        return {key: each for key, each in self.document().items() if key not in SESSION_KEYS or each != defaults[key]}
+        """Return the section as a registration stores it: as `document`, without SESSION_KEYS and `llm` if they have
+        their default values, since ECS limits the length of a server's variables."""
+        defaults, left_out = TrialSection().document(), (*SESSION_KEYS, "llm")
+        return {key: each for key, each in self.document().items() if key not in left_out or each != defaults[key]}
 
 
 SESSION_KEYS = tuple(key.name for key in keyed.keys(TrialSection) if key.together)

@@ -98,6 +98,16 @@ def _substitute(trial: TrialSection) -> Iterator[SectionProblem]:
         yield SectionProblem(("substitute",), sentence, ("afterAbsent", "substitute"))
 
 
+def _model(trial: TrialSection) -> Iterator[SectionProblem]:
+    """A language model needs an address and a name."""
+    if trial.llm is None:
+        return
+    examples = {"url": "url: https://api.example.org/v1", "model": "model: small-model-1"}
+    for key, example in examples.items():
+        if not trial.llm.given(key):
+            yield SectionProblem(("llm", key), f"missing; write {example}", ("llm",))
+
+
 RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _frame_rates,
     _criterion,
@@ -106,4 +116,5 @@ RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _players_that_exist,
     _programs,
     _substitute,
+    _model,
 )

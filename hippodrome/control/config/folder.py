@@ -22,6 +22,7 @@ from hippodrome.control.model.step_order import ordered, visited
 from hippodrome.control.model.step_types import type_of
 from hippodrome.protocol import players
 from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT
+from hippodrome.protocol.trial_llm import MAX_PROMPT_FILE, prompt_file
 from hippodrome.protocol.values import KeyPath, is_blank, path_text
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ def read_project(folder: Path) -> Config:
     steps, file_mistakes = _step_files(folder, checked)
     game_pages, page_mistakes = _game_pages(folder, checked, steps)
     file_mistakes += [*page_mistakes, *_of_end_pages(folder, checked), *_missing_policies(source.layout, checked)]
+    file_mistakes += _missing_prompts(source.layout, checked)
     if checked.valid(STEPS) and not file_mistakes:
         groups = number_of_groups(page.variants for page in (*steps, *game_pages))
         file_mistakes += sessions.mistakes_of_groups(checked, groups)
@@ -116,6 +118,25 @@ def _missing_policies(layout: Layout, checked: Checked) -> Iterator[Mistake]:
         if not (layout.agent_folder / file).is_file():
             hint = players.files_there(layout.agent_folder)
             yield Mistake(("trial", *path), f"there is no file {file} beside agent.py{hint}")
+
+
+def _missing_prompts(layout: Layout, checked: Checked) -> Iterator[Mistake]:
+    """A mistake for each file that `trial.llm.system` names, in any game, and that cannot be a prompt."""
+    first = {} if checked.trial.llm is None else {"llm": {"system": checked.trial.llm.system}}
+    own = [section.trial for step in checked.design.steps for section in step.sections]
+    prompts = [(section.get("llm") or {}).get("system") for section in (first, *own)]
+    for file in dict.fromkeys(file for prompt in prompts if prompt and (file := prompt_file(prompt))):
+        problem = None
+        try:
+            text = (layout.agent_folder / file).read_bytes()
+            if len(text) > MAX_PROMPT_FILE or not text.decode("utf-8").strip():
+                problem = f"{file} must have some text, and at most {MAX_PROMPT_FILE // 1024} kB"
+        except OSError:
+            problem = f"there is no file {file} beside agent.py"
+        except UnicodeDecodeError:
+            problem = f"{file} is not text in UTF-8; save it as such"
+        if problem:
+            yield Mistake(("trial", "llm", "system"), problem)
 
 
 def _loaded_from(source: ConfigSource, steps: list[StepFiles]) -> tuple[str, ...]:

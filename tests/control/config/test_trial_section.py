@@ -75,6 +75,24 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
             "assets": st.sampled_from(["assets", "./images/", "../other"]),
         },
     ),
+    "llm": st.fixed_dictionaries(
+        {},
+        optional={
+            "url": st.sampled_from(
+                ["https://x.example/v1/", "http://x.example", "http://127.0.0.1:1/v1", "x", "https://a:b@x.example"]
+            ),
+            "model": st.sampled_from(["small", "", 3])
+            | st.lists(st.sampled_from(["small", "", "a" * 201]), max_size=2),
+            "system": st.sampled_from(["Be\nkind", "prompts/a.txt", "../a.txt", "/a.md", "", "\x00", "a" * 2001, 3]),
+            "parameters": st.sampled_from([{"temperature": 0.5}, {}, [], "x"]),
+            "maxCalls": NUMBERS,
+            "maxTokens": NUMBERS,
+            "seconds": NUMBERS,
+            "fallback": st.sampled_from(["Sorry", "", "a" * 501]),
+            "record": st.sampled_from(["requests", "hashes", "all"]),
+            "price": st.sampled_from([{"input": 1, "output": 0.5}, {"input": 1}, {"input": -1, "output": 1}, 3]),
+        },
+    ),
     "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
 }
 SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: each | ODD for key, each in KEYS.items()})

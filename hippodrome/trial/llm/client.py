@@ -1,0 +1,154 @@
+"""Asks the language model of `trial.llm` by the loopback address. No other module of the server is needed for it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+from urllib.parse import urlsplit
+
+from hippodrome.trial.llm import events
+from hippodrome.trial.llm.errors import CapReached, ModelError, ModelRefused, ModelUnavailable
+
+_AGAIN = (429, 500, 502, 503, 504)
+_PAUSES = (1.0, 3.0)  # seconds before a second and a third try
+_LONGEST_PAUSE = 10.0  # seconds for which an API may make us wait
+_OWN = "hippodrome"  # the type of the endpoint's own errors, which are not tried again
+_SECONDS = 700.0  # the endpoint ends each call before
+
+
+def ask(text: str, *, system: str | None = None, model: str | None = None, **parameters: Any) -> str:
+    """Ask the model of `trial.llm` and return what it answers. Raises ModelError.
+
+    `system` is what it is told before the question. `model` is the first in `llm.model` unless it is given.
+    `parameters` are further parameters of the request, such as `temperature`.
+    """
+    messages = [{"role": "user", "content": text}]
+    if system:
+        messages.insert(0, {"role": "system", "content": system})
+    return complete(messages, {**({"model": model} if model else {}), **parameters})
+
+
+def complete(messages: Sequence[Mapping[str, Any]], parameters: Mapping[str, Any]) -> str:
+    """Return the model's answer to these messages. Raises ModelError."""
+    answer = _post({"model": parameters.get("model") or _first_model(), "messages": [*messages], **parameters})
+    try:
+        choice = answer["choices"][0]
+        text, why = choice["message"].get("content") or "", choice.get("finish_reason")
+    except (AttributeError, IndexError, KeyError, TypeError):
+        raise ModelUnavailable("the model has answered without a choice") from None
+    return _said(text, why)
+
+
+def stream(messages: Sequence[Mapping[str, Any]], parameters: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the pieces of the model's answer to these messages as they come. Raises ModelError."""
+    body = {"model": parameters.get("model") or _first_model(), "messages": [*messages], **parameters, "stream": True}
+    connection, response = _opened(body)
+    length, why = 0, None
+    try:
+        reader = events.Reader()
+        while piece := response.read1(65_536):
+            for event in reader.feed(piece):
+                data = events.data_of(event)
+                if isinstance(data, Mapping) and data.get("error"):
+                    raise _error_of(502, data)
+                why = events.end_of(data) or why
+                if text := events.text_of_delta(data):
+                    length += len(text)
+                    yield text
+    except (OSError, http.client.HTTPException) as error:
+        raise ModelUnavailable(f"the answer has broken off ({type(error).__name__})") from None
+    finally:
+        connection.close()
+    _said("x" * length, why)
+
+
+def _said(text: str, why: Any) -> str:
+    if why == "content_filter" or not text.strip():
+        raise ModelRefused("the model has declined to answer")
+    return text
+
+
+def _first_model() -> str:
+    status, answer = _sent("GET", "/models", None)
+    if status != 200 or not answer["data"]:
+        raise ModelUnavailable("no game with trial.llm is played; ask in reset, step, reply or a callback")
+    return str(answer["data"][0]["id"])
+
+
+def _post(body: Mapping[str, Any]) -> Any:
+    connection, response = _opened(body)
+    try:
+        return json.loads(response.read())
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        raise ModelUnavailable(f"the answer cannot be read ({type(error).__name__})") from None
+    finally:
+        connection.close()
+
+
+def _opened(body: Mapping[str, Any]) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
+    """Return the connection with an answer that has the status 200. A busy API is asked again. Raises ModelError."""
+    for pause in (*_PAUSES, None):
+        connection, response = _request("POST", "/chat/completions", body)
+        if response.status == 200:
+            return connection, response
+        try:
+            error = _error_of(response.status, json.loads(response.read()))
+        except (OSError, ValueError, http.client.HTTPException):
+            error = ModelUnavailable(f"the address answers with status {response.status}")
+        finally:
+            connection.close()
+        final = response.getheader("X-Should-Retry") == "false" or response.status not in _AGAIN
+        if pause is None or final:
+            raise error
+        time.sleep(_pause(response.getheader("Retry-After"), pause))
+    raise AssertionError
+
+
+def _pause(retry_after: str | None, pause: float) -> float:
+    try:
+        return min(_LONGEST_PAUSE, max(0.0, float(retry_after or pause)))
+    except ValueError:  # a date
+        return pause
+
+
+def _error_of(status: int, answer: Any) -> ModelError:
+    """Return the error that an answer tells. Its message holds nothing of what an API says, which may quote prompts."""
+    error = answer.get("error") if isinstance(answer, Mapping) else None
+    error = error if isinstance(error, Mapping) else {}
+    code, own = str(error.get("code") or ""), error.get("type") == _OWN
+    words = str(error.get("message")) if own else f"the model's API answers with status {status}"
+    if code == "cap_reached":
+        return CapReached(words)
+    if status in _AGAIN or (own and code in ("not_on_tape", "no_game", "closed")):
+        return ModelUnavailable(words)
+    return ModelRefused(words)
+
+
+def _sent(method: str, path: str, body: Mapping[str, Any] | None) -> tuple[int, Any]:
+    connection, response = _request(method, path, body)
+    try:
+        return response.status, json.loads(response.read())
+    except (OSError, ValueError, http.client.HTTPException) as error:
+        raise ModelUnavailable(f"the answer cannot be read ({type(error).__name__})") from None
+    finally:
+        connection.close()
+
+
+def _request(
+    method: str, path: str, body: Mapping[str, Any] | None
+) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
+    address = urlsplit(os.environ.get("OPENAI_BASE_URL", ""))
+    if address.scheme != "http":
+        raise ModelUnavailable("there is no address of a model here; write llm into trial of config.yml")
+    connection = http.client.HTTPConnection(address.hostname or "", address.port, timeout=_SECONDS)
+    headers = {"Authorization": f"Bearer {os.environ.get('OPENAI_API_KEY', '')}", "Content-Type": "application/json"}
+    try:
+        connection.request(method, address.path + path, None if body is None else json.dumps(body).encode(), headers)
+        return connection, connection.getresponse()
+    except (OSError, http.client.HTTPException) as error:
+        connection.close()
+        raise ModelUnavailable(f"the address of the model does not answer ({type(error).__name__})") from None
