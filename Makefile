@@ -54,10 +54,11 @@ new: $(VENV)/local ## make a study of your own in PROJECT=../my-study from TEMPL
 check: $(VENV)/local ## find mistakes in config.yml, the step pages and agent.py of PROJECT=.
 	@$(HIPPODROME) check $(STUDY) $(ARGS)
 
-.PHONY: deploy plan register certificate doctor status cost data erase logs stop destroy
+.PHONY: deploy plan register secret certificate doctor status cost data erase logs stop destroy
 deploy: $(VENV)/deploy ## install on AWS (DOMAIN=, EMAIL=): the stack, its certificate, the study of PROJECT=.
 plan: $(VENV)/deploy ## show what `make deploy` would change in the installation
 register: $(VENV)/deploy ## register the study of PROJECT=. on AWS, or its new version
+secret: $(VENV)/deploy ## keep the key of a language model on AWS (ARGS="set LLM_KEY")
 certificate: $(VENV)/deploy ## order or renew the servers' certificate (ARGS=--production)
 doctor: $(VENV)/deploy ## check that everything is in order on AWS, and say what to do if not
 status: $(VENV)/deploy ## show participants' steps and servers (ARGS=--watch)
@@ -73,7 +74,7 @@ doctor status logs stop: TOLD = $(or $(STUDY),--all)
 data: TOLD = $(STUDY) $(call option,DATA,from)
 erase: TOLD = $(call option,DATA,from)
 erase: WHO = -- "$(USER_ID)" $(STUDY)
-deploy plan register certificate doctor status cost data erase logs stop destroy:
+deploy plan register secret certificate doctor status cost data erase logs stop destroy:
 	@$(HIPPODROME) $@ $(TOLD) $(ARGS) $(WHO) $(FOUND)
 
 WORKERS ?=

@@ -38,6 +38,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "plan": ("deployment.lifecycle.plan", "Show what would change in the installation"),
         "apply": ("deployment.lifecycle.apply", "Make the installation, or bring it up to date"),
         "register": ("deployment.study.register", "Put a study on AWS, or its new version"),
+        "secret": ("deployment.operate.secret", "Keep the key of a language model on AWS"),
         "certificate": ("deployment.stack.certificate", "Order or renew the servers' certificate"),
         "doctor": ("deployment.operate.doctor", "Check whether studies can be held, and advise if not"),
         "status": ("deployment.operate.status", "Show participants by step, servers, queues and alarms"),

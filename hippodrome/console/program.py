@@ -10,7 +10,7 @@ from pathlib import Path
 
 COMMANDS = (
     *("new", "check", "run", "try", "gym", "data", "erase", "links", "deploy", "plan", "apply", "register"),
-    *("certificate", "doctor", "status", "cost", "logs", "stop", "destroy"),
+    *("secret", "certificate", "doctor", "status", "cost", "logs", "stop", "destroy"),
 )
 """The names of all commands (hippodrome/cli.py)."""
 _SHOWN = re.compile(rf"(?<![\w/.-])hippodrome (?=(?:{'|'.join(COMMANDS)})\b)")

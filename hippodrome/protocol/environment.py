@@ -63,6 +63,10 @@ SPOOL = "SPOOL"
 STOP_SECONDS = "STOP_SECONDS"
 """Seconds from SIGTERM to SIGKILL; 30 by default, and at least 15."""
 
+LLM_KEY = "LLM_KEY"
+"""A secret: the key of the language model that `trial.llm` names. On AWS the task definition says where Fargate reads
+it; on one machine it is in the environment of `hippodrome run`."""
+
 # For tests and slow agents
 
 IDLE_SECONDS = "IDLE_SECONDS"

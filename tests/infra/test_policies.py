@@ -22,6 +22,7 @@ ON_EVERYTHING = {
     "ecs:ListTasks": "the tasks of a cluster are no resource; the condition names the cluster",
     "pricing:GetProducts": "knows no resources",
     "scheduler:ListSchedules": "knows no resources",
+    "ssm:DescribeParameters": "knows no resources",
 }
 WITH_CONDITION = {
     "ecs:ListTasks": "ecs:cluster",

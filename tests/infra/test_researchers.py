@@ -55,6 +55,9 @@ SHOWN = {  # every action of the policy: what it shows or does. Who adds one say
     "cloudwatch:GetMetricData": "counts",
     "ce:GetCostAndUsage": "money",
     "pricing:GetProducts": "prices",
+    "ssm:DescribeParameters": "names and dates of parameters, not what they hold",
+    "ssm:PutParameter": "stores the key of a language model, and tells only its number of versions",
+    "ssm:DeleteParameter": "removes that key",
     "logs:DescribeLogStreams": "names",
     "logs:FilterLogEvents": "logs, which hold no secrets: test_handlers.py, ministack/test_installation.py",
     "logs:GetLogEvents": "logs",
@@ -173,6 +176,7 @@ SECRET_KEYS = (
     "_slots/p.json",
     "_warm/p.json",
 )
+KEY_OF_MODEL = f"arn:aws:ssm:{HERE}:parameter/hippodrome/hippodrome/LLM_KEY"
 CLUSTER = {"ecs:cluster": f"arn:aws:ecs:{HERE}:cluster/hippodrome"}
 TASK = f"arn:aws:ecs:{HERE}:task/hippodrome/0123456789abcdef"
 FUNCTIONS = [*cfn.functions()]
@@ -238,6 +242,15 @@ def ways() -> Iterator[Ask]:
         ):
             if (role, service) != ("TaskExecutionRole", "ecs-tasks.amazonaws.com"):
                 yield Ask("iam:PassRole", arn, {"iam:PassedToService": service})
+    for action in (
+        "ssm:GetParameter",
+        "ssm:GetParametersByPath",
+        "ssm:GetParameterHistory",
+        "ssm:LabelParameterVersion",
+    ):
+        yield Ask(action, KEY_OF_MODEL)
+    yield Ask("ssm:GetParameters", f"arn:aws:ssm:{HERE}:parameter/hippodrome/another/LLM_KEY")
+    yield Ask("kms:Decrypt", f"arn:aws:kms:{HERE}:key/of-the-account")
     yield Ask("iam:CreatePolicyVersion", "arn:aws:iam::123456789012:policy/hippodrome-ResearcherPolicy")
     yield Ask("logs:PutSubscriptionFilter", f"arn:aws:logs:{HERE}:log-group:/hippodrome/hippodrome/trial")
 
@@ -278,6 +291,18 @@ def test_researchers_may_write_pages_and_nothing_with_a_similar_key(judge: Judge
 @pytest.mark.parametrize("role", LENT)
 def test_the_roles_of_containers_allow_no_way_to_a_secret(judge: Judge, role: str) -> None:
     assert [ask for ask in WAYS if judge.may(role, ask)] == []
+
+
+def test_the_key_of_a_language_model_is_read_by_fargate_alone(judge: Judge) -> None:
+    read = Ask("ssm:GetParameters", KEY_OF_MODEL)
+    assert judge.may("TaskExecutionRole", read)
+    assert not judge.may(POLICY, read)
+    assert judge.who_may(read) == frozenset(), "no function"
+    for action in ("ssm:PutParameter", "ssm:DeleteParameter"):
+        assert judge.may(POLICY, Ask(action, KEY_OF_MODEL))
+        assert not judge.may("TaskExecutionRole", Ask(action, KEY_OF_MODEL))
+        for other in ("hippodrome/another/LLM_KEY", "hippodrome/hippodrome/OTHER", "LLM_KEY"):
+            assert not judge.may(POLICY, Ask(action, f"arn:aws:ssm:{HERE}:parameter/{other}"))
 
 
 @pytest.mark.parametrize("role", LENT)

@@ -151,6 +151,12 @@ class Project(Record, frozen=True):
         return msgspec.structs.replace(self, trial={**self.trial, **own_keys}, game_pages=variants)
 
     @property
+    def uses_llm(self) -> bool:
+        """Whether a game of the study has a language model (`trial.llm`), so that its servers need the model's key."""
+        own_sections = (section.trial for step in self.steps for section in step.sections)
+        return any(trial.get("llm") for trial in (self.trial, *own_sections))
+
+    @property
     def pages_in_game(self) -> list[Step]:
         """The pages that game steps show, each as a `Step` with the key of `trial` that names the page."""
         pages = {key: self.trial.get(key) for key in GAME_PAGES} if self.game_steps else {}

@@ -83,8 +83,8 @@ _EXPLANATIONS = {
     Cause.INITIALISATION: _Explanation(
         FailureCategory.INITIALISATION,
         "ECS could not prepare the container: its log group, its secrets, or the login to the image's registry.",
-        "`hippodrome plan` shows what is missing and `apply` puts it back; with a network of your own, see "
-        "whether its subnets reach the Internet.",
+        "`hippodrome plan` shows what is missing and `apply` puts it back; `hippodrome doctor --all` says whether a "
+        "study's LLM_KEY is missing. With a network of your own, see whether its subnets reach the Internet.",
     ),
     Cause.CANNOT_BEGIN: _Explanation(
         FailureCategory.PROGRAM,

@@ -57,6 +57,11 @@ def code_bucket_region(stack: str, bucket: str) -> str | None:
     return found[1] if found else None
 
 
+def secret(stack: str, name: str) -> str:
+    """Return the name of the parameter of Systems Manager that holds the secret `name`."""
+    return f"/hippodrome/{stack}/{name}"
+
+
 def log_prefixes(stack: str) -> tuple[str, ...]:
     """Return the prefixes of the names of the stack's log groups."""
     return _OURS.format(stack), _VENDED.format(stack)

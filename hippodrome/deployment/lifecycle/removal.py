@@ -17,8 +17,10 @@ from hippodrome.control.aws import errors
 from hippodrome.control.aws.challenges import TTL
 from hippodrome.control.aws.tasks import EcsTasks
 from hippodrome.control.certificates.rules import names_of
+from hippodrome.deployment.aws import resource_names
 from hippodrome.deployment.aws.account import Account, Installation
 from hippodrome.deployment.aws.versions import VersionedBucket
+from hippodrome.deployment.core import secret_parameters
 from hippodrome.deployment.core.stages import Executor, PlanStep, step
 from hippodrome.deployment.operate.stop import Stopper
 from hippodrome.deployment.stack import acm_records, inventory, policies
@@ -73,6 +75,7 @@ class Removal:
         own = {one.get("PhysicalResourceId") for one in made}
         groups = inventory.log_groups(self.account, self.name)
         things += [ListedResource("log group", group) for group in groups if group not in own]
+        things += [ListedResource("secret", name) for name in self._secret_names()]
         if self._code.exists():
             things.append(ListedResource("S3 bucket", self._code.name))
         attached = [policies.attached(self.account, arn) for arn in ids_of(made, "AWS::IAM::ManagedPolicy")]
@@ -95,6 +98,7 @@ class Removal:
         steps += [step(self._remember, found), step(self._delete_stack, found)]
         steps += [step(self._acme_records, addresses) for addresses in found.addresses]
         steps += [step(self._validation_records), step(self._task_definitions), step(self._log_groups)]
+        steps.append(step(self._secrets))
         steps.append(step(self._bucket, self._code.name, "code"))
         return steps + ([step(self._data_buckets)] if data else [])
 
@@ -199,6 +203,14 @@ class Removal:
     def _log_groups(self) -> None:
         for group in inventory.log_groups(self.account, self.name):
             _remove(self.account.client("logs").delete_log_group, logGroupName=group)
+
+    def _secret_names(self) -> list[str]:
+        stored = secret_parameters.stored(self.account, self.name)
+        return [resource_names.secret(self.name, name) for name in stored]
+
+    def _secrets(self) -> None:
+        for name in self._secret_names():
+            _remove(self.account.client("ssm").delete_parameter, Name=name)
 
     def _data_buckets(self) -> None:
         resources = inventory.resources(self.account, inventory.stacks(self.account, self.name))

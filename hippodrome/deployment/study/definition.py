@@ -26,13 +26,18 @@ def port(installation: Installation) -> int:
     return int(installation["ServerPort"])
 
 
-def definition(installation: Installation, project_id: str, image: str, cpu: float, memory: float) -> dict[str, Any]:
+def definition(
+    installation: Installation, project_id: str, image: str, cpu: float, memory: float, *, secrets: Sequence[str] = ()
+) -> dict[str, Any]:
     """Make the task definition, as RegisterTaskDefinition takes it. `cpu` in vCPU, `memory` in GB.
+
+    `secrets` are the names of the secrets that the servers need (`deployment/core/secret_parameters.py`).
 
     The container's root is read-only. Fargate has no tmpfs; it makes a volume of the Dockerfile's VOLUME and gives it
     the owner that the path has in the image (ECS Developer Guide, "Use bind mounts with Amazon ECS"), so that a user
-    who is not root can write there. The definition holds no secret: RunTask gives a server its own values. There is no
-    task role, so the code in the container has no rights on AWS (hippodrome/control/servers/signing.py).
+    who is not root can write there. The definition holds no secret: RunTask gives a server its own values, and Fargate
+    reads those of the installation's studies in their parameters when it starts the container. There is no task role,
+    so the code in the container has no rights on AWS (hippodrome/control/servers/signing.py).
 
     A user without any capability may listen below 1024 if the kernel's parameter says so for the task's own network
     namespace. Fargate supports every `net.*` parameter from platform version 1.4.0 on (ECS API Reference,
@@ -63,6 +68,8 @@ def definition(installation: Installation, project_id: str, image: str, cpu: flo
     }
     if not installation.has_domain or port(installation) < PRIVILEGED:
         container["systemControls"] = [{"namespace": "net.ipv4.ip_unprivileged_port_start", "value": str(LOWEST_PORT)}]
+    if secrets:
+        container["secrets"] = [{"name": name, "valueFrom": _parameter(installation, name)} for name in secrets]
     return {
         "family": resource_names.family(installation.stack, project_id),
         "networkMode": "awsvpc",
@@ -86,7 +93,8 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
         raise
     if found.get("status", "ACTIVE") != "ACTIVE":
         return None
-    return str(found["taskDefinitionArn"]) if _contains(found, wanted) else None
+    same = _contains(found, wanted) and _secrets(found) == _secrets(wanted)
+    return str(found["taskDefinitionArn"]) if same else None
 
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
@@ -96,6 +104,18 @@ def register(account: Account, installation: Installation, project_id: str, want
         **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
     )
     return str(answer["taskDefinition"]["taskDefinitionArn"])
+
+
+def _parameter(installation: Installation, secret: str) -> str:
+    """Return the ARN of the parameter that holds the secret, which lies in the installation's account."""
+    _, partition, _, _, account, _ = installation["TaskExecutionRole"].split(":", 5)
+    name = resource_names.secret(installation.stack, secret)
+    return f"arn:{partition}:ssm:{installation.region}:{account}:parameter{name}"
+
+
+def _secrets(found: Mapping[str, Any]) -> list[str]:
+    """Return the names of the secrets that the containers get. A study without a model must not keep its key."""
+    return [secret["name"] for one in found["containerDefinitions"] for secret in one.get("secrets") or ()]
 
 
 def _contains(found: Any, wanted: Any) -> bool:

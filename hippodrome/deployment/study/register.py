@@ -25,7 +25,7 @@ from hippodrome.control.model.project import DEFAULT_PORT, Project, UnreadableEn
 from hippodrome.control.model.records import from_data
 from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK
-from hippodrome.deployment.core import options, project_folder, register_function
+from hippodrome.deployment.core import options, project_folder, register_function, secret_parameters
 from hippodrome.deployment.core.participants import registered_projects
 from hippodrome.deployment.cost.estimate import warm
 from hippodrome.deployment.cost.prices import REGION, Prices
@@ -150,6 +150,7 @@ def plan(account: Account, installation: Installation, folder: Path, request: Re
     changes = pages.compare(account, installation["Bucket"], found.id, folder, found.config.own_pages)
     if not found.plays:
         return RegisterPlan(found, before, changes, None, None)
+    _must_have_secrets(account, installation, found)
     trial = found.registration["trial"]
     wanted = image.plan(account, installation, found.id, folder, again=request.again, base=request.base, trial=trial)
     revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
@@ -219,8 +220,22 @@ def link(installation: Installation, project_id: str) -> str:
 
 
 def _definition(installation: Installation, found: project_folder.ProjectFolder, uri: str) -> dict[str, Any]:
-    setup = found.registration["awsSetup"]
-    return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"])
+    setup, secrets = found.registration["awsSetup"], secret_parameters.needed(_project(found))
+    return definition.definition(installation, found.id, uri, setup["cpu"], setup["memory"], secrets=secrets)
+
+
+def _project(found: project_folder.ProjectFolder) -> Project:
+    """Return the project as it will be registered, without what registering adds."""
+    return from_data(parse_registration(dict(found.registration)), Project)
+
+
+def _must_have_secrets(account: Account, installation: Installation, found: project_folder.ProjectFolder) -> None:
+    """Raise `Problem` if the study's servers need a secret that the installation lacks: none of them could start."""
+    for name in secret_parameters.missing(account, installation.stack, _project(found)):
+        raise Problem(
+            f"The study has trial.llm, and the installation {installation.stack} has no {name}: no server could start.",
+            f"Store {secret_parameters.NAMES[name]}: `hippodrome secret set {name}`. Then run this again.",
+        )
 
 
 def _registered(

@@ -59,6 +59,8 @@ def installed(world: World) -> World:
         "/aws/vendedlogs/hippodrome/hippodrome-lab/api",
     ):
         world.account.client("logs").create_log_group(logGroupName=group)
+    for name in ("/hippodrome/hippodrome/LLM_KEY", "/hippodrome/hippodrome-lab/LLM_KEY"):
+        world.account.client("ssm").put_parameter(Name=name, Value="sk-1", Type="SecureString")
     outputs = {
         "Bucket": DATA,
         "Cluster": "hippodrome",
@@ -128,6 +130,8 @@ def test_destroy_deletes_all_but_the_data(
         "/hippodrome/hippodromes/x",
         "/aws/vendedlogs/hippodrome/hippodrome-lab/api",
     }
+    secrets = [one["Name"] for one in installed.account.client("ssm").describe_parameters()["Parameters"]]
+    assert secrets == ["/hippodrome/hippodrome-lab/LLM_KEY"]
     assert installed.cloud.stack["StackStatus"] == "DELETE_COMPLETE"
     said = capsys.readouterr()
     assert DATA in said.out

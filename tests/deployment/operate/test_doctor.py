@@ -456,6 +456,17 @@ def test_task_definitions_that_cannot_run_are_bad(world: Installed, account: Acc
     assert "has no task definition" in only(images.projects(context(account))).text
 
 
+def test_a_study_whose_language_model_has_no_key_is_bad(world: Installed, account: Account) -> None:
+    talks = project(world, trial={"llm": {"url": "https://models.example.org/v1", "model": "small"}})
+    world.register(talks)
+    found = images.projects(context(account))
+    assert [one.text for one in found if one.mark is Mark.BAD] == [
+        "its servers need LLM_KEY, which is not stored: none can start."
+    ]
+    world.client("ssm").put_parameter(Name="/hippodrome/hippodrome/LLM_KEY", Value="sk-1", Type="SecureString")
+    assert all(one.mark is not Mark.BAD for one in images.projects(context(account)))
+
+
 def test_images_with_weaknesses_are_remarks(world: Installed, account: Account) -> None:
     counts = {"findingSeverityCounts": {"CRITICAL": 2, "HIGH": 7, "LOW": 90}}
     world.answer("ecr:DescribeImageScanFindings", {"imageScanFindings": counts})

@@ -11,6 +11,7 @@ from hippodrome.control.aws import errors
 from hippodrome.control.model import warm_pool
 from hippodrome.control.model.messages import CONTAINER
 from hippodrome.control.model.project import MIN_RUNTIME_MARGIN, Project
+from hippodrome.deployment.core import secret_parameters
 from hippodrome.deployment.core.finding import Finding, bad, good, look
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 from hippodrome.deployment.study.definition import STOP_TIMEOUT, port
@@ -58,6 +59,12 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
         return
     container = _container(definition)
     assert container is not None
+    for name in secret_parameters.missing(context.account, context.installation.stack, project):
+        yield bad(
+            check,
+            f"its servers need {name}, which is not stored: none can start.",
+            f"Run `hippodrome secret set {name}`.",
+        )
     if container.get("stopTimeout", 30) < STOP_TIMEOUT:
         yield look(
             check,
