@@ -6,7 +6,7 @@ A server reads in it which games its participants play, in which order, and what
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,8 @@ class Game:
     """A game on a participant's path, by its key.
 
     `trial` are the keys of the section `trial` that it has for itself, `levels` the levels of its block's factors, and
-    `position` which run of the block it is (0 outside of blocks).
+    `position` which run of the block it is (0 outside of blocks). `answers` are the keys of the answers that its agent
+    reads, each with the names under which the agent finds it: ("trust",), or ("trust", level).
     """
 
     key: str
@@ -26,6 +27,7 @@ class Game:
     trial: Mapping[str, Any] = field(default_factory=dict)
     levels: Mapping[str, str] = field(default_factory=dict)
     position: int = 0
+    answers: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +43,13 @@ def parse(body: bytes) -> Assigned:
     document = json.loads(body)
     try:
         games = {key: Game(key, **_known(value)) for key, value in document["games"].items()}
-        if not all(NAME.fullmatch(key) for key in games):
-            raise ValueError("an assignment names a game that cannot be")
+        if not all(NAME.fullmatch(key) for game in games.values() for key in (game.key, *game.answers)):
+            raise ValueError("an assignment names a step that cannot be")
         return Assigned(dict(document.get("condition", {})), games)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError("this is no assignment") from error
 
 
 def _known(value: Mapping[str, Any]) -> dict[str, Any]:
-    fields = ("step", "trial", "levels", "position")
+    fields = ("step", "trial", "levels", "position", "answers")
     return {name: value[name] for name in fields if name in value}

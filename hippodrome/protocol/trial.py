@@ -10,10 +10,11 @@ from typing import Any
 from hippodrome.protocol import key_maps, values
 from hippodrome.protocol import players as player_checks
 from hippodrome.protocol import section_keys as keyed
+from hippodrome.protocol.keys import NAME
 from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.protocol.trial_sections import SceneSection, Ui
-from hippodrome.protocol.values import KeyPath, number_in, show
+from hippodrome.protocol.values import KeyPath, Plain, number_in, show
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 MAX_EPISODES = 1_000_000
@@ -48,6 +49,19 @@ def _until(value: object) -> dict[str, int] | None:
     if not isinstance(value, dict) or [*value] != ["success"]:
         raise ValueError(f"must be a number of episodes that succeed, such as {{success: 3}}, not {show(value)}")
     return {"success": int(str(values.whole(1, MAX_EPISODES)(value["success"])))}
+
+
+def _step(value: object) -> str:
+    """Check the name of a step, or the number of a numbered one, and return it."""
+    name = value.text if isinstance(value, Plain) else value
+    if not isinstance(name, str) or not NAME.fullmatch(name.strip()):
+        raise ValueError(f"must be the name of a step, not {show(value)}")
+    return name.strip()
+
+
+def step_names(items: object) -> tuple[str, ...]:
+    """Return the names in a checked list of steps as it is written."""
+    return tuple(map(_step, items)) if isinstance(items, list | tuple) else ()
 
 
 def _rate(default: int, meaning: str, **more: Any) -> Any:
@@ -382,6 +396,17 @@ class TrialSection(Section):
         kind="a name of `actionSpace`, or a map by player",
         otherwise="`noop`, else the first",
         example="stay",
+    )
+    answers: tuple[str, ...] = keyed.items(
+        "step",
+        100,
+        _step,
+        (),
+        "Earlier steps whose answers your agent reads, such as beliefs about a partner; see "
+        "[callbacks.md](callbacks.md#earlier-answers). It can read no others.",
+        kind="list of names of steps",
+        otherwise="none",
+        example="[beliefs]",
     )
     options: dict[str, Any] = keyed.key(
         values.options,

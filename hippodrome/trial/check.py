@@ -123,7 +123,7 @@ def _play(folder: Path, section: Mapping[str, Any]) -> None:
     # A single player takes action 0, which every game has.
     adapter = AgentAdapter(folder, config.game or DEFAULT_GAME, config.action_space or ("noop",), reader)
     started = start(adapter, config.named_players())
-    started.set_options(config.options)
+    started.set_game(config.options)
     if isinstance(started, AgentAdapter):
         started.reset(1)
         started.render()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,8 @@ class TrialSettings:
     """The levels of the factors between people; empty before they are known."""
     levels: Mapping[str, Any] = field(default_factory=dict)
     """Of a trial: the levels of the factors within people, and the `position` of this run; empty outside of blocks."""
+    answers: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Of a trial: the keys of the answers to earlier steps that the agent gets, as in `protocol.assignment.Game`."""
     has_assignment: bool = False
     """Whether an assignment says which games are played here (`protocol/assignment.py`)."""
     match: bool = False

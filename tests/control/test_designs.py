@@ -617,3 +617,37 @@ def test_who_is_not_trained_leaves(tmp_path: Path, platform: FakePlatform, reach
     looks.play("ann", "level", reached=reached)
     ann.get()
     assert (looks.stored("ann", "end") or {}).get("end") == end
+
+
+# What agents read
+
+ASKS = """
+project:
+  id: looks
+  steps:
+    - consent
+    - practice: {maxEpisodes: 1}
+    - each: {look: [a, b]}
+      order: fixed
+      steps: [ask, game: {answers: [ask, rate]}, rate]
+    - again: {answers: [ask, rate]}
+    - debrief
+trial: {game: kitchen, answers: [consent]}
+"""
+
+
+def test_games_have_the_answers_that_they_name_as_rules_and_pages_see_them(
+    tmp_path: Path, platform: FakePlatform
+) -> None:
+    looks = DesignedStudy(write(tmp_path / "study", ASKS, PAGES | {"ask": "<input name='q'>"}), platform)
+    alice = looks.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.get()
+    games = looks.stored("alice", "assignment")["games"]
+    assert {key: game["answers"] for key, game in games.items()} == {
+        "practice": {"consent": ["consent"]},
+        "game-a": {"ask-a": ["ask"]},
+        "game-b": {"ask-b": ["ask"], "rate-a": ["rate", "a"]},
+        "again": {f"{step}-{level}": [step, level] for step in ("ask", "rate") for level in ("a", "b")},
+    }
+    assert set(looks.project.read_steps) == {"consent", "ask-a", "ask-b", "rate-a", "rate-b"}

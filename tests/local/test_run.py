@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import random
+import re
 import shutil
 import signal
 import socket
@@ -446,3 +447,32 @@ def test_an_invalid_origin_is_refused_in_a_sentence(local: Make) -> None:
     here = local()
     assert here.begin("--origin", "localhost:3000").wait(60) == 2
     assert "Write it like http://localhost:3000" in here.text()
+
+
+def test_an_agent_reads_earlier_answers_that_its_game_names(local: Make) -> None:
+    here = local()
+    config = here.folder / "config.yml"
+    steps = """
+    - hello
+    - each: {look: [a, b]}
+      order: fixed
+      steps: [game: {answers: [hello, bye]}, bye]
+    - end"""
+    text = config.read_text().replace(" {1: hello, 2: game, 3: bye, finalStep: end}", steps)
+    config.write_text(re.sub(r"  events: .*\n", "", text))
+    source = here.folder / "agent.py"
+    source.write_text(source.read_text() + "    def on_session_start(self, session):\n        return session.answers\n")
+    here.run()
+    walker = Walker(here.url, "quick", "P1")
+    walker.answer(word="hi")
+    for word in ("first", "second"):
+        walker.play(walker.until("ready"))
+        walker.answer(word=word)
+    assert "<h1>end</h1>" in walker.page()
+    told = {}
+    for path in (here.data / "quick" / "users" / "P1" / "trials").rglob("*.gz"):
+        lines = [json.loads(line) for line in gzip.decompress(path.read_bytes()).splitlines()]
+        (value,) = [line["value"] for line in lines if line.get("callback") == "on_session_start"]
+        told[lines[0]["step"]] = value
+    hello = {"hello": {"word": "hi"}}
+    assert told == {"game-a": hello, "game-b": {**hello, "bye": {"a": {"word": "first"}}}}

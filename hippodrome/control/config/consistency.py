@@ -18,6 +18,8 @@ from hippodrome.control.model.step_order import FINAL, default_start, position, 
 from hippodrome.control.model.step_types import type_of
 from hippodrome.protocol.environment import PLAIN_ORIGINS
 from hippodrome.protocol.players import HUMAN
+from hippodrome.protocol.similar import did_you_mean
+from hippodrome.protocol.trial import step_names
 from hippodrome.protocol.values import KeyPath
 
 
@@ -35,6 +37,7 @@ def check(sections: dict[str, Any], invalid: Iterable[KeyPath] = (), named: Mapp
         _game_step,
         _event_steps,
         _together,
+        _answers_read,
         _hours,
         _warm,
         _plain_clients,
@@ -204,6 +207,26 @@ def _together(checked: Checked) -> Iterator[Mistake]:
                 message = f"{are}, and project.players is {wanted}; all who play together play each game"
                 yield Mistake(design.paths[step.key], message)
                 break
+
+
+def _answers_read(checked: Checked) -> Iterator[Mistake]:
+    """`answers` of a game names steps that come before it, or that lie in its block: then those of earlier runs."""
+    design = checked.design
+    if not _keys_known(checked) or not checked.valid(("trial", "answers")):
+        return
+    keys = [step.key for step in design.steps]
+    for at, game in enumerate(design.steps):
+        own = design.own_trial.get(game.key, {})
+        names = step_names(own["answers"]) if "answers" in own else checked.trial.answers
+        path = (*design.paths[game.key], "answers") if "answers" in own else ("trial", "answers")
+        for place, name in enumerate(names if game.type.on_server else ()):
+            found = next((step for step in design.steps if step.key == name), None)
+            if found is None:
+                yield Mistake((*path, place), f"there is no step {name}{did_you_mean(name, keys)}")
+            elif found not in design.steps[:at] and (game.block is None or found.block != game.block):
+                give = "" if "answers" in own else f"; give {game.key} its own answers, such as answers: []"
+                message = f"{name} does not come before the game {game.key}, whose agent would read its answers{give}"
+                yield Mistake((*path, place), message)
 
 
 _START: KeyPath = ("project", "events", "startServerStep")

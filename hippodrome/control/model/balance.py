@@ -117,7 +117,7 @@ def assignment_of(project: Project, user_id: str, draw: Draw) -> Assignment:
     condition = named.get(draw.cell, {})
     orders = {block.name: _order(project, block, user_id, draw) for block in project.blocks}
     path = project.own(Assignment(condition=condition, orders=orders)).steps
-    return Assignment(project.version, condition, orders, games_on(path, condition))
+    return Assignment(project.version, condition, orders, games_on(path, condition, project.trial))
 
 
 def _order(project: Project, block: Block, user_id: str, draw: Draw) -> list[tuple[str, ...]]:

@@ -8,7 +8,7 @@ which each run of a block's step is a step with a key of its own, such as `trust
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -135,6 +135,7 @@ class Game(Record, frozen=True):
     trial: Mapping[str, Any] = msgspec.field(default_factory=dict)
     levels: Levels = msgspec.field(default_factory=dict)
     position: int = 0
+    answers: Mapping[str, Sequence[str]] = msgspec.field(default_factory=dict)
 
 
 class Assignment(Record, frozen=True):
@@ -226,15 +227,36 @@ def pages_of(step: Step, conditions: Sequence[Factor]) -> list[Step]:
     return [_at(step, levels) for levels in cells(named)]
 
 
-def games_on(path: Sequence[Step], condition: Levels) -> dict[str, Game]:
-    """Return the games of a path by their keys, in their order, each with what it has for itself."""
-    return {
-        step.key: Game(
-            step.step_name,
-            step.section({**condition, **step.levels}),
-            step.levels,
-            step.position,
-        )
-        for step in path
-        if step.type.on_server
-    }
+def same_run(runs: Iterable[Step], step: Step) -> Step | None:
+    """Return the one of a step's runs whose answers count at `step` as the answers to that step.
+
+    In a block it is the run of the same levels; None after the block, where the answers of all runs are seen by level.
+    """
+    return next((run for run in runs if not run.name or run.levels == step.levels), None)
+
+
+def games_on(path: Sequence[Step], condition: Levels, trial: Mapping[str, Any]) -> dict[str, Game]:
+    """Return the games of a path by their keys, in their order, each with what it has for itself.
+
+    `trial` is the section of the study, whose keys a game has unless it has them for itself.
+    """
+    games = {}
+    for at, step in enumerate(path):
+        if step.type.on_server:
+            section = step.section({**condition, **step.levels})
+            read = answers_read(path[:at], step, section.get("answers", trial.get("answers", ())))
+            games[step.key] = Game(step.step_name, section, step.levels, step.position, read)
+    return games
+
+
+def answers_read(before: Sequence[Step], game: Step, names: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Return the keys of the answers that a game's agent reads, with the names under which it finds each.
+
+    `before` are the steps before the game on the path, and `names` the steps of the study that the game names.
+    """
+    read: dict[str, tuple[str, ...]] = {}
+    for name in names:
+        runs = [run for run in before if run.step_name == name]
+        same = same_run(runs, game)
+        read |= {same.key: (name,)} if same else {run.key: (name, "-".join(run.levels.values())) for run in runs}
+    return read

@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from hippodrome.control.model import rules
-from hippodrome.control.model.design import FAILED, Assignment, End, Step
+from hippodrome.control.model.design import FAILED, Assignment, End, Step, same_run
 from hippodrome.control.model.participant import Progress
 from hippodrome.control.model.project import Project
 
@@ -148,9 +148,8 @@ class Standing:
         In a block they are those of the same run; after it they are `Runs`, by level. Empty if there are none.
         """
         runs = self._answered_runs(name)
-        for run in runs:
-            if not run.name or run.levels == step.levels:
-                return self._read(run.key)
+        if same := same_run(runs, step):
+            return self._read(same.key)
         return rules.Runs({"-".join(run.levels.values()): self._read(run.key) for run in runs}) if runs else {}
 
     def _answered_runs(self, name: str) -> list[Step]:

@@ -110,6 +110,13 @@ class Project(Record, frozen=True):
         return [step.key for step in self.all_runs if step.type.on_server]
 
     @property
+    def read_steps(self) -> list[str]:
+        """The keys of the steps whose answers agents may read (`answers` in `trial` and in games): of all runs."""
+        sections = (self.trial, *(section.trial for step in self.steps for section in step.sections))
+        names = {name for section in sections for name in section.get("answers", ())}
+        return [step.key for step in self.all_runs if step.step_name in names]
+
+    @property
     def all_runs(self) -> list[Step]:
         """The steps, with all runs of each block, also those that only some participants have."""
         whole = tuple(msgspec.structs.replace(block, take=None) for block in self.blocks)

@@ -81,6 +81,7 @@ class PastAttempt(Record, frozen=True):
     warm_server_name: str | None = None
     nonce: str = ""
     game_steps: tuple[str, ...] = ()
+    read_steps: tuple[str, ...] = ()
 
 
 class Server(Record, frozen=True):
@@ -115,6 +116,7 @@ class Server(Record, frozen=True):
     """For a warm server: the label of the record that owns its resources now."""
     nonce: str = ""  # its token and credential are derived from it (`secret.py`); not secret
     game_steps: tuple[str, ...] = ()  # the steps whose answers it may store: the project's when it was started
+    read_steps: tuple[str, ...] = ()  # the steps whose answers its agent may read: the project's when it was started
     may_match: bool = False  # with `matching: match`: whether it answers questions to `match` while it has no members
     players: int = 0  # how many players a session's trial is for; 0 if it is no session's
 
@@ -250,6 +252,7 @@ def new_attempt(
         counted=project.limits_servers,
         nonce=nonce,
         game_steps=tuple(project.game_steps),
+        read_steps=tuple(project.read_steps),
         may_match=is_session_id(user_id) and project.asks_match,
         players=project.players if is_session_id(user_id) else 0,
     )

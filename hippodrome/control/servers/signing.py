@@ -1,9 +1,10 @@
 """`sign_requests`: a server shows its credential and gets presigned requests for its own documents, and no others.
 
 Servers run researchers' code and have no rights on AWS. With presigned requests a server may read the certificate, its
-handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create its own
-recordings, and create and read the answers of its game steps. The credential is derived from the installation's secret
-(`secret.py`). It is not the token, which the participant's browser knows.
+handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create its
+own recordings, create and read the answers of its game steps, and read those of the steps that `answers` names. The
+credential is derived from the installation's secret (`secret.py`). It is not the token, which the participant's
+browser knows.
 
 A session's server may also read the session's document. Its answers are the answers of the members whom that document
 names, and its recordings are the session's. With `matching: match`, as long as it has no members, it may read the
@@ -136,6 +137,7 @@ class ServerAccess:
     label: str = ""
     attempt: int = 0
     game_steps: Sequence[str] = ()
+    read_steps: Sequence[str] = ()  # whose answers its agent may read
     closed: datetime | None = None
     certificate: Sequence[str] = ()  # the keys of the certificate's two documents
     members: Sequence[str] = ()
@@ -171,7 +173,7 @@ class ServerAccess:
             return self.closed is None and self._allows_reading(wanted.key)
         if self.is_unassigned or wanted.size is None or wanted.size < 0:
             return False
-        if self._is_answer(wanted.key) or self._is_groups(wanted.key):
+        if self._is_answer(wanted.key, self.game_steps) or self._is_groups(wanted.key):
             return wanted.size <= MAX_ANSWER
         return self.is_recording(wanted.key) and wanted.size <= MAX_RECORDING
 
@@ -200,15 +202,19 @@ class ServerAccess:
             return True
         if self.is_of_session and key == session_key(self.project_id, self.user_id):
             return True
-        return not self.is_unassigned and (self._is_answer(key) or self._is_earlier(key) or key == self._assignment_key)
+        if self.is_unassigned:
+            return False
+        is_answer = self._is_answer(key, (*self.game_steps, *self.read_steps))
+        return is_answer or self._is_earlier(key) or key == self._assignment_key
 
     @property
     def _assignment_key(self) -> str:
         return assignment_key(self.project_id, self.user_id)
 
-    def _is_answer(self, key: str) -> bool:
+    def _is_answer(self, key: str, steps: Sequence[str]) -> bool:
+        """Whether this is the key of an answer of its participant, or of a member of its session, to such a step."""
         players = self.members if self.is_of_session else (self.user_id,)
-        return any(key == answer_key(self.project_id, user, step) for user in players for step in self.game_steps)
+        return any(key == answer_key(self.project_id, user, step) for user in players for step in steps)
 
     def _is_earlier(self, key: str) -> bool:
         """Whether this is the key of a recording of an earlier server of the same participant or session."""
@@ -237,6 +243,7 @@ def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAc
                 record.label,
                 attempt=run.attempt,
                 game_steps=run.game_steps,
+                read_steps=run.read_steps,
                 closed=run.closed,
                 certificate=certificate,
                 may_match=record.may_match,

@@ -18,6 +18,7 @@ from typing import Any
 
 from hippodrome.control.config import Config, Diagnostic, layout
 from hippodrome.control.config.step_files import StepFileError, open_folder
+from hippodrome.control.model.design import Section, Step, answers_read, own_steps
 from hippodrome.control.model.matching import MATCH
 from hippodrome.local.check import waiting
 from hippodrome.local.check.agent_report import AgentReport
@@ -26,6 +27,7 @@ from hippodrome.local.inherited import inherited_environment
 from hippodrome.protocol import environment as variables
 from hippodrome.protocol.handover import Handover
 from hippodrome.trial.server import process_group
+from hippodrome.trial.server.earlier_answers import put
 from hippodrome.trial.settings import STEP_SECONDS
 
 SECONDS = 120.0  # seconds in which all calls of the agent must return, in each group
@@ -95,23 +97,55 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.TRIAL: json.dumps(config.registration()["trial"]),
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
-        "OPTIONS": json.dumps(_other_options(config)),
+        "GAMES": json.dumps(_games(folder, config, group)),
         "SECONDS": str(seconds),
         "CALL_SECONDS": str(CALL_SECONDS),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
 
 
-def _other_options(config: Config) -> list[dict[str, Any]]:
-    """The options that `reset` gets in other games of the study, and at other levels, each once."""
-    registered = config.registration()
-    seen = [registered["trial"].get("options") or {}]
-    for step in registered["steps"] if isinstance(registered["steps"], list) else ():
-        for section in step.get("sections", ()):
-            options = section["trial"].get("options")
-            if options is not None and options not in seen:
-                seen.append(options)
-    return seen[1:]
+def _games(folder: Path, config: Config, group: int | None) -> list[dict[str, Any]]:
+    """The `options` and `answers` that `reset` gets in the games of the study and at all levels, each once.
+
+    The first has the options of `trial`, with which the agent plays. The answers are made up, and None if a game's
+    agent reads none.
+    """
+    base = config.registration()["trial"]
+    path = own_steps(config.design.steps, config.design.blocks, None)
+    given = _made_up(folder, config, group)
+    games: list[dict[str, Any]] = []
+    for at, step in enumerate(path):
+        for section in (step.sections or (Section(),)) if step.type.on_server else ():
+            trial = {**base, **section.trial}
+            if any(section.levels.get(name, level) != level for name, level in step.levels.items()):
+                continue
+            games.append(
+                {
+                    "options": trial.get("options") or {},
+                    "answers": _answers(path[:at], step, trial["answers"], given) if trial.get("answers") else None,
+                }
+            )
+    played = {"options": base.get("options") or {}, "answers": games[0]["answers"]}
+    return [played, *(game for at, game in enumerate(games) if game not in (played, *games[:at]))]
+
+
+def _answers(before: list[Step], game: Step, names: list[str], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The answers that a game's agent gets, in the form in which it gets them."""
+    answers: dict[str, Any] = {}
+    steps = {step.key: step.step_name for step in before}
+    for key, found_at in answers_read(before, game, names).items():
+        put(answers, found_at, given.get(steps[key], {}))
+    return answers
+
+
+def _made_up(folder: Path, config: Config, group: int | None) -> dict[str, dict[str, Any]]:
+    """Answers to all questions of the study, by step."""
+    try:
+        given = EarlierAnswers(open_folder(folder).path, config, config.steps).answers(group)[0]
+    except StepFileError:
+        return {}
+    checks = (step.key for step in config.design.steps if step.right)
+    return given | {key: {**given.get(key, {}), "passed": True, "tries": 1} for key in checks}
 
 
 def _question(folder: Path, config: Config) -> dict[str, Any]:

@@ -12,7 +12,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -80,12 +81,21 @@ def _try(report: Path, deadline: Deadline) -> None:
     player: AgentAdapter | JointAdapter = progress.result
     joint = player if isinstance(player, JointAdapter) else OnePlayer(player, masked=config.pace == "turns")
 
+    games = json.loads(os.environ.pop("GAMES"))
+
+    def set_game(game: Mapping[str, Any]) -> None:
+        answers = game["answers"]
+        humans = [one.name for one in players if one.human]
+        by_player = answers if answers is None or len(humans) == 1 else dict.fromkeys(humans, answers)
+        player.set_game(game["options"], by_player)
+        progress.callbacks.facts = replace(progress.callbacks.facts, answers=by_player or {})
+
     def reset() -> Any:
         os.environ.__class__ = usual_class
         if given:
             assignment.set_environment(os.environ, _assigned(given))
+        set_game(games[0])
         progress.callbacks.session_begins()
-        player.set_options(config.options)
         return joint.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
@@ -108,7 +118,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     game = CheckedGame(joint, players, config, progress)
     if game.load(folder, adapter.agent_module) and game.play(reset):
         _note_idle(joint, players, config, progress)
-        if game.begin_each(json.loads(os.environ.pop("OPTIONS", "[]")), player.set_options) and game.close():
+        if game.begin_each(games[1:], set_game) and game.close():
             progress.over()
 
 

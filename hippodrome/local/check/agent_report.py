@@ -407,8 +407,13 @@ class AgentReport:
             "start": f'start("{printable(self._config.trial.game or "")}")',
             "step": f"step({self._report.get('action', 0)})",
         }.get(call, f"{call}()")
-        options = self._report.get("options")
-        return f"{named}, with the options {json.dumps(options, ensure_ascii=False)}," if options else named
+        given = [f"{what} {json.dumps(value, ensure_ascii=False)}" for what, value in self._game().items() if value]
+        return f"{named}, with the {' and the '.join(given)}," if given else named
+
+    def _game(self) -> Mapping[str, Any]:
+        """The options and answers with which an episode of another game or level was begun."""
+        game: Mapping[str, Any] = self._report.get("game", {})
+        return game
 
     def _at(
         self, place: tuple[str, int | None] | None, message: str, *, remark: bool = False, whole: bool = False

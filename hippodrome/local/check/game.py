@@ -109,16 +109,19 @@ class CheckedGame:
         callbacks.session_ended()
         return True
 
-    def begin_each(self, others: Sequence[Mapping[str, Any]], set_options: Callable[[Mapping[str, Any]], None]) -> bool:
-        """Begin an episode with the options of each other game and level; return False if a call failed."""
-        for options in others:
+    def begin_each(self, others: Sequence[Mapping[str, Any]], set_game: Callable[[Mapping[str, Any]], None]) -> bool:
+        """Begin an episode of each other game and level; return False if a call failed.
+
+        Each has its `options` and `answers`, which `set_game` gives to the agent.
+        """
+        for game in others:
             if self._progress.time_over():
                 break
-            set_options(options)
-            self._progress.known["options"] = options
+            set_game(game)
+            self._progress.known["game"] = game
             if not self._begin():
                 return False
-        self._progress.known.pop("options", None)
+        self._progress.known.pop("game", None)
         return True
 
     def _begin(self) -> bool:

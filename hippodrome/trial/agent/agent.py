@@ -190,6 +190,7 @@ class AgentAdapter:
         self._feedback: tuple[Callable[..., Any], bool] | None = None  # the agent's method; whether it takes the player
         self._word = signatures.NO_WORD  # the newest word of feedback since the last step
         self._options: dict[str, Any] | None = None
+        self._answers: dict[str, Any] | None = None
         self._env_reports_action = False
         self.action_space: tuple[str, ...] = self.configured_actions
         """The names of the actions, by their numbers; without names in config.yml, empty until `name_actions`."""
@@ -286,6 +287,7 @@ class AgentAdapter:
             signatures.WORD: self._word,
             signatures.SEED: seed,
             signatures.OPTIONS: self._options,
+            signatures.ANSWERS: self._answers,
             signatures.MODE: "rgb_array",
             signatures.PLAYER: player,
         }
@@ -294,9 +296,13 @@ class AgentAdapter:
         function = self._env_methods.get(method) or getattr(self._agent, method)
         return self._signatures[method].call(function, given)
 
-    def set_options(self, options: Mapping[str, Any]) -> None:
-        """Give `reset` these options from now on, if it takes options: those of the game that is played."""
+    def set_game(self, options: Mapping[str, Any], answers: Mapping[str, Any] | None = None) -> None:
+        """Give `reset` these options and answers from now on, if it takes them: those of the game that is played.
+
+        `answers` are the participant's answers to earlier steps; None if the game names none.
+        """
         self._options = dict(options) or None
+        self._answers = None if answers is None else dict(answers)
 
     def reset(self, seed: int) -> tuple[Any, Mapping[str, Any], bool]:
         """Begin an episode. Return its first observation, its info, and whether `reset` took the seed.

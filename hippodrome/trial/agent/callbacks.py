@@ -72,6 +72,9 @@ class Session:
     """The levels of the study's factors between people, by factor."""
     run: Mapping[str, Any]
     """The levels of the factors within people, by factor, and the `position` of this run; empty outside of blocks."""
+    answers: Mapping[str, Any]
+    """The answers to earlier steps that the game's key `answers` names: by step; after a block by step and level. If
+    several participants play, each one's stand under their player."""
     env: Any
     record: Record
     """`record(name, value)` writes the value into the recording, under this name."""
@@ -88,6 +91,7 @@ class TrialFacts:
     humans: tuple[str, ...] = (PLAYER,)
     condition: Mapping[str, str] = field(default_factory=dict)
     run: Mapping[str, Any] = field(default_factory=dict)
+    answers: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -262,6 +266,7 @@ class Callbacks:
             replaying=self.replaying,
             condition=facts.condition,
             run=facts.run,
+            answers=facts.answers,
             env=self._env(),
             record=_discard if self.replaying else call.record,
         )

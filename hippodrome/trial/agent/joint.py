@@ -104,9 +104,9 @@ class JointAdapter:
         """The imported agent.py, as in `AgentAdapter.agent_module`."""
         return self._adapter.agent_module
 
-    def set_options(self, options: Mapping[str, Any]) -> None:
-        """Give `reset` these options from now on, as in `AgentAdapter.set_options`."""
-        self._adapter.set_options(options)
+    def set_game(self, options: Mapping[str, Any], answers: Mapping[str, Any] | None = None) -> None:
+        """Give `reset` these options and answers from now on, as in `AgentAdapter.set_game`."""
+        self._adapter.set_game(options, answers)
 
     def reset(self, seed: int) -> tuple[Joint, bool]:
         """Begin an episode. Return its first observations and infos, and whether `reset` took the seed.

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
-CONFIG, PLAYER = "config", "player"
-"""The kinds of arguments. CONFIG is the section `trial` in HIPPO's form (`hippo_config.py`). PLAYER is the player whose
-view `render` draws. WORD is the newest word of feedback since the last step, or NO_WORD."""
+CONFIG, PLAYER, ANSWERS = "config", "player", "answers"
+"""The kinds of arguments. CONFIG is the section `trial` in HIPPO's form (`hippo_config.py`). PLAYER is the player
+whose view `render` draws, ANSWERS the answers to earlier steps that the game's key `answers` names. WORD is the newest
+word of feedback since the last step, or NO_WORD."""
 
 NO_WORD = "None"
 """The text that HIPPO's TAMER and COACH agents get if there was no feedback."""
@@ -35,7 +36,8 @@ _FORMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "reset": ((), (ENV,)),
     "close": ((), (ENV,)),
 }
-"""The positional arguments of each method, its usual form first. `reset` gets `seed` and `options` by name."""
+"""The positional arguments of each method, its usual form first. `reset` gets the arguments of `_BY_NAME` by name."""
+_BY_NAME = (SEED, OPTIONS, ANSWERS)
 
 _SHOWN = {
     "start": "start(game)",
@@ -57,7 +59,7 @@ class Signature:
     order: tuple[str, ...]
     """The kinds of the positional arguments."""
     named: tuple[str, ...] = ()
-    """The kinds of the arguments that are given by name. The name is the kind: `seed`, `options`."""
+    """The kinds of the arguments that are given by name. The name is the kind, such as `seed`."""
     optional: tuple[str, ...] = ()
     """Those of `named` with a default of their own, which stays if there is no value."""
 
@@ -105,17 +107,18 @@ def _by_name(
     if method != "reset":
         return (), (), parameters
     named: set[str] = set()
-    optional: tuple[str, ...] = ()
+    optional: list[str] = []
     rest: list[inspect.Parameter] = []
     for p in parameters:
-        if p.kind is p.VAR_KEYWORD or (p.name == SEED and p.kind is not p.POSITIONAL_ONLY):
+        if p.kind is p.VAR_KEYWORD:
             named.add(SEED)
-        elif p.name == OPTIONS and p.kind is not p.POSITIONAL_ONLY:
-            named.add(OPTIONS)
-            optional = () if p.default is p.empty else (OPTIONS,)
+        elif p.name in _BY_NAME and p.kind is not p.POSITIONAL_ONLY:
+            named.add(p.name)
+            if p.name != SEED and p.default is not p.empty:
+                optional.append(p.name)
         else:
             rest.append(p)
-    return tuple(sorted(named)), optional, rest
+    return tuple(sorted(named)), tuple(optional), rest
 
 
 def _positional(parameters: list[inspect.Parameter]) -> tuple[list[str], list[str]]:

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import secrets
 import uuid
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -51,6 +51,7 @@ from hippodrome.trial.recordings.recording import Line
 from hippodrome.trial.recordings.spool import Spool
 from hippodrome.trial.recordings.store import Store, short_error
 from hippodrome.trial.server.callbacks import TrialCallbacks
+from hippodrome.trial.server.earlier_answers import read_earlier
 from hippodrome.trial.server.started import StartedAgent, TrialPlayers
 from hippodrome.trial.server.watch import Watchers
 from hippodrome.trial.settings import TrialSettings
@@ -85,6 +86,7 @@ class TrialLoop:
         """A function that removes members' ids from a text, since a session's recording belongs to all members."""
         self._worker = worker
         self._watchers = watchers
+        self._store = store
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls: Calls
         self._callbacks = TrialCallbacks(
@@ -194,16 +196,19 @@ class TrialLoop:
         if answers is not None:
             self._apply(self.core.already_played(answers))
             return
+        given = await self._answers_given(answered)
         started = await agent_ready
         playing = None if started is None else await self._players_of(started)
-        if started is None or playing is None:
+        if started is None or playing is None or given is None:
             self._apply(self.core.agent_failed(self._loop.time()))
             return
         recorded = await self._recorder.recorded()
-        self._calls = self._calls_of(started, playing)
+        by_player = {player: given[user_id] for user_id, player in playing.places.items()}
+        earlier = by_player if self.settings.session else given[self.settings.user_id]
+        self._calls = self._calls_of(started, playing, earlier)
         self._action_starts = started.agent.action_starts
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
-        self._use_callbacks(started, playing.players)
+        self._use_callbacks(started, playing.players, earlier)
         effects = self.core.start(
             playing.players,
             recorded,
@@ -226,6 +231,17 @@ class TrialLoop:
         over = bool(answers) and len(answers) == len(self.settings.seats)
         return (answers, {}) if over else (None, answers)
 
+    async def _answers_given(self, over: Collection[str]) -> dict[str, dict[str, Any]] | None:
+        """The answers to earlier steps that the agent gets, by participant; None if they cannot be read.
+
+        That is logged, and another server replaces this one, as if the agent could not be started.
+        """
+        try:
+            return await read_earlier(self._store, self.settings, over)
+        except OSError as error:
+            log.error("the participants' answers to earlier steps cannot be read (%s)", short_error(error))
+            return None
+
     async def _players_of(self, started: StartedAgent) -> TrialPlayers | None:
         """Return who plays in this trial; None if the policies cannot be loaded, which is logged."""
         settings = self.settings
@@ -237,9 +253,9 @@ class TrialLoop:
             log.error("a policy cannot be loaded\n%s", report(error, settings.agent_dir, settings.private))
         return None
 
-    def _calls_of(self, started: StartedAgent, playing: TrialPlayers) -> Calls:
+    def _calls_of(self, started: StartedAgent, playing: TrialPlayers, earlier: Mapping[str, Any]) -> Calls:
         stamp, config = self._recorder.stamp, self.settings.trial
-        started.agent.set_options(config.options)
+        started.agent.set_game(config.options, earlier if config.answers else None)
         if isinstance(started.agent, JointAdapter):
             return JointCalls(
                 started.agent,
@@ -305,7 +321,7 @@ class TrialLoop:
     def _call(self, call: Call) -> None:
         self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._call_ended, call))
 
-    def _use_callbacks(self, started: StartedAgent, players: Sequence[Player]) -> None:
+    def _use_callbacks(self, started: StartedAgent, players: Sequence[Player], earlier: Mapping[str, Any]) -> None:
         """If the agent has callbacks, call them from now on."""
         settings, agent = self.settings, started.agent
         if not started.callbacks:
@@ -321,6 +337,7 @@ class TrialLoop:
                 tuple(player.name for player in players if player.human),
                 settings.condition,
                 settings.levels,
+                earlier if settings.trial.answers else {},
             ),
             lambda: agent.env,
             seconds=settings.trial.callback_seconds,

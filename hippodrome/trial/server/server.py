@@ -393,10 +393,11 @@ class TrialServer:
         """The settings of the trial of this step: with the keys of `trial` that the game has for itself."""
         game = self._assigned.games.get(step) if self._assigned else None
         if self._assigned is None or game is None:
-            return self.settings
+            return replace(self.settings, answers={name: (name,) for name in self.settings.trial.answers})
         section = trial_section({**self.settings.trial.document(), **game.trial})
         levels = {**game.levels, "position": game.position} if game.levels else {}
-        return replace(self.settings, trial=section, condition=self._assigned.condition, levels=levels)
+        condition = self._assigned.condition
+        return replace(self.settings, trial=section, condition=condition, levels=levels, answers=game.answers)
 
     def _next_step(self) -> str:
         steps = self.settings.game_steps

@@ -74,6 +74,17 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
             "(with partner: helpful)",
         ),
         (
+            "    - game\n",
+            "    - game: {answers: [consents]}\n",
+            "config.yml:7: project.steps item 3.game.answers item 1: there is no step consents; did you mean consent?",
+        ),
+        (
+            "  game: kitchen\n",
+            "  game: kitchen\n  answers: [quiz, rate]\n",
+            "config.yml:16: trial.answers item 2: rate does not come before the game game, whose agent would read its "
+            "answers; give game its own answers, such as answers: []",
+        ),
+        (
             "soups: 3",
             "soup: 3",
             "config.yml:6: project.steps item 2.quiz.right.soup: the page of quiz has no field soup; did you mean "

@@ -124,6 +124,7 @@ def test_keys_that_are_not_given_have_their_defaults(folder: Path) -> None:
             "actionBufferLifespan": 1,
             "maxEpisodes": 20,
             "until": None,
+            "answers": [],
             "betweenEpisodes": 3,
             "instructions": None,
             "resetFreeze": 0,

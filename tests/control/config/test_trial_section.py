@@ -55,6 +55,7 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
     trial.RATE_CHANGE_MISSPELT: FLAGS,
     "betweenEpisodes": NUMBERS | st.sampled_from(["pause", "pause.html", "../pause", "game"]),
     "until": st.dictionaries(st.sampled_from(["success", "reached"]), NUMBERS, max_size=2),
+    "answers": st.lists(st.sampled_from(["1", "2", "../1", "", 1]), max_size=2),
     "instructions": st.sampled_from(["rules", "rules.html", "a/b", "game", "é", 3]),
     "keys": st.dictionaries(st.sampled_from(["a", "A", "Space", "a+b", "Left", "Tab", "p"]), NAMES.map(str) | ACTIONS),
     "labels": st.dictionaries(st.sampled_from(["up", "Up", "left", ""]), st.sampled_from(["Go", "", 3, "x" * 65])),

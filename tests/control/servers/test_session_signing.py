@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import msgspec
 import pytest
 
 from hippodrome.control.model import ids, server
@@ -81,6 +82,15 @@ def test_a_sessions_server_gets_requests_for_the_session_and_each_members_answer
 def test_a_sessions_server_gets_no_request_for_anything_else(world: World, wish: dict[str, Any]) -> None:
     form(world, "alice", "bob")
     assert ask(world, wish) == 403
+
+
+def test_a_sessions_server_reads_the_named_answers_of_its_members_alone(world: World) -> None:
+    form(world, "alice", "bob")
+    record = msgspec.structs.replace(claim(world), read_steps=("1",))
+    world.keep(record)
+    assert ask(world, get(answer("alice", "1")), get(answer("bob", "1"))) == 200
+    for other in (get(answer("carol", "1")), get(answer("alice", "2")), put(answer("alice", "1"))):
+        assert ask(world, other) == 403
 
 
 def test_before_the_session_is_formed_its_server_may_read_only_its_document_and_certificate(world: World) -> None:

@@ -158,6 +158,14 @@ def test_a_server_gets_no_request_for_any_other_document(world: World, wish: dic
     assert not any(part in json.dumps(found) for part in (ALICE, BOB, PROJECT, NAME)), "the sentence names nothing"
 
 
+def test_a_server_reads_the_answers_that_the_study_names_and_stores_none(world: World) -> None:
+    world.keep(world.claim(project=study(id=PROJECT, trial={"game": "x", "answers": ["1"]})))
+    consent = f"{FOLDER}/answers/1.json"
+    assert world.ask(get(consent))[0] == 200
+    for other in (put(consent), get(f"{FOLDER}/answers/2.json"), get(f"{PROJECT}/users/{BOB}/answers/1.json")):
+        assert world.ask(other)[0] == 403
+
+
 def test_one_document_that_is_not_allowed_refuses_the_whole_request(world: World) -> None:
     assert world.ask(put(ANSWER), put(f"{FOLDER}/answers/1.json"))[0] == 403
 

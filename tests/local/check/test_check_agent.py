@@ -128,6 +128,23 @@ def test_an_agent_that_fails_with_the_options_of_one_level_only_is_reported(fold
     assert "AssertionError" in problem
 
 
+@pytest.mark.parametrize(("field", "is_well"), [("word", True), ("words", False)])
+def test_an_agent_gets_made_up_answers_to_the_steps_that_a_game_names(folder: Path, field: str, is_well: bool) -> None:
+    config(folder, "trial:\n", 'trial:\n  answers: ["1"]\n')
+    agent(
+        folder,
+        "    def reset(self, seed=None):\n        return self.env",
+        "    def on_session_start(self, session):\n"
+        f"        self.word = session.answers['1']['{field}']\n"
+        "    def reset(self, seed=None, answers=None):\n"
+        f"        assert answers['1']['{field}']\n"
+        "        return self.env",
+    )
+    problems = tried(folder)
+    assert (problems == []) == is_well, problems
+    assert is_well or f"reset() fails: KeyError: '{field}'" in str(problems)
+
+
 def test_an_agent_that_fails_in_one_group_only_is_reported(folder: Path) -> None:
     (folder / "steps" / "hello.html").unlink()
     page(folder, "<p>0", "hello-0")

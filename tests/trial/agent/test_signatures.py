@@ -98,7 +98,7 @@ def test_reset_gets_the_options_of_the_game(tmp_path: Path, parameters: str, wit
         tmp_path, "def reset(self):\n        return", body, AGENT.replace('self.env.said.append("reset")', "return")
     )
     player.reset(1)
-    player.set_options({"partner": "kind"})
+    player.set_game({"partner": "kind"})
     player.reset(1)
     assert player.env.said == [without, {"partner": "kind"}]
 
@@ -106,7 +106,7 @@ def test_reset_gets_the_options_of_the_game(tmp_path: Path, parameters: str, wit
 def test_an_environments_own_reset_gets_the_options_of_the_game(tmp_path: Path) -> None:
     source = OWN_STEP.replace("SPACE", "spaces.Discrete(2)").replace("self.taken = []", "self.taken = [options]")
     player = started_agent(tmp_path, source=source)
-    player.set_options({"layout": "ring"})
+    player.set_game({"layout": "ring"})
     player.reset(1)
     assert player.env.taken == [{"layout": "ring"}]
 
