@@ -56,7 +56,8 @@ def left_in_english(config: Config) -> Iterator[Remark]:
     own = config.project.own_texts
     pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
     languages = [found[1] for page in pages if (found := _PAGE_LANGUAGE.search(page))]
-    needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions)
+    has_chat = config.trial.registered().get("chat") is not None
+    needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions, has_chat=has_chat)
     yield from _left(own, languages, needed)
 
 

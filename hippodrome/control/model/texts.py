@@ -298,6 +298,99 @@ _TOGETHER = {
     "someLeft": "A participant is not there any more, so the game has ended. This is not your fault. Please go on.",
     "tooSlow": "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
 }
+_TALK = {
+    "messages": "Messages",
+    "writeMessage": "Write a message",
+    "sendMessage": "Send",
+    "yourMessage": "You:",
+    "ai": "AI",
+    "isTyping": "{name} is typing…",
+    "areTyping": "{names} are typing…",
+    "writesNext": "{name} writes next.",
+    "newMessages": "New messages",
+    "charactersLeft": "{number} characters left",
+    "charactersOver": "{number} characters too many",
+    "messageTooLong": "Your message is too long: it may have {number} characters.",
+    "tooManyMessages": "You are writing faster than your messages can be sent. Please wait a moment.",
+    "messageKept": "No connection. Your message is kept, and sent as soon as there is one.",
+    "messageHeld": "Your message was not passed on.",
+    "messageRefused": "Your message could not be sent. Please try again.",
+    "talkTitle": "Conversation",
+    "talkWaiting": "Waiting for the conversation",
+    "talkGettingReady": "Your conversation is getting ready",
+    "talkStartingAlone": (
+        "We are starting a computer for you alone. You need not do anything: the conversation appears on this page by "
+        "itself."
+    ),
+    "talkStartingTogether": (
+        "We are starting a computer for your conversation. You need not do anything: the conversation appears on this "
+        "page by itself."
+    ),
+    "talkLoading": "Loading the conversation…",
+    "talkEnd": "End the conversation",
+    "talkEndConfirm": "End the conversation now? You cannot go on with it afterwards.",
+    "talkEndForAll": "End the conversation for everybody",
+    "endRound": "End this round",
+    "roundOf": "Round {game} of {games}",
+    "roundOver": "Round {game} of {games} is over",
+    "nextRoundIn": "The next round begins in {time}.",
+    "nextRound": "Next round",
+    "toTalk": "Go to the conversation",
+    "backToTalk": "Back to the conversation",
+    "talkSaving": "Saving your conversation…",
+    "talkOver": "The conversation is over",
+    "thanksForTalking": "Thank you for taking part!",
+    "talkSaved": "Your conversation is saved. One moment, please…",
+    "talkBegins": "The conversation begins",
+    "talkGoesOn": "The conversation goes on",
+    "talkLobbyOther": (
+        "Two people talk with each other. You need not do anything: the conversation begins on this page by itself. "
+        "Please stay on this page."
+    ),
+    "talkLobbyOthers": (
+        "{players} people talk with each other. You need not do anything: the conversation begins on this page by "
+        "itself. Please stay on this page."
+    ),
+    "talkPreparedTitle": "Your conversation is being prepared – {study}",
+    "talkPrepared": "Your conversation is being prepared.",
+    "talkPreparedHeading": "Your conversation is being prepared",
+    "talkWith": "You talk with {people}.",
+    "talkEnded": "The conversation has ended",
+}
+IN_TALK = {
+    "game": "talkTitle",
+    "waitingForGame": "talkWaiting",
+    "gettingReady": "talkGettingReady",
+    "startingAlone": "talkStartingAlone",
+    "startingTogether": "talkStartingTogether",
+    "loading": "talkLoading",
+    "end": "talkEnd",
+    "endConfirm": "talkEndConfirm",
+    "endForAll": "talkEndForAll",
+    "reset": "endRound",
+    "gameOf": "roundOf",
+    "gameOver": "roundOver",
+    "nextGameIn": "nextRoundIn",
+    "nextGame": "nextRound",
+    "toGame": "toTalk",
+    "backToGame": "backToTalk",
+    "saving": "talkSaving",
+    "over": "talkOver",
+    "thanksForPlaying": "thanksForTalking",
+    "savedMoment": "talkSaved",
+    "begins": "talkBegins",
+    "goesOn": "talkGoesOn",
+    "lobbyOther": "talkLobbyOther",
+    "lobbyOthers": "talkLobbyOthers",
+    "preparedTitle": "talkPreparedTitle",
+    "prepared": "talkPrepared",
+    "preparedHeading": "talkPreparedHeading",
+    "playWith": "talkWith",
+    "hasEnded": "talkEnded",
+}
+"""By the name of a text on the page of a game: that of the text that stands there if the game is `talk`."""
+NOT_IN_TALK = ("yourScore", "totalScore", "orArrow")
+"""Texts that say nothing if the game is `talk`, which has neither scores nor arrows."""
 SAID_ALONE = {
     "saidRoundFailed": "Something went wrong, so this game has ended. The next game begins.",
     "saidRoundAgain": "This game could not go on where it was, so it begins again. The games before it are kept.",
@@ -362,6 +455,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     "The game": _GAME,
     "The lobby": _LOBBY,
     "Playing with others": _TOGETHER,
+    "Talk": _TALK,
     "What the game's server says": SAID,
     "Links and errors": _LINKS,
 }
@@ -384,11 +478,12 @@ def is_right_to_left(language: str) -> bool:
     return bool(_SCRIPTS.fullmatch(script) if by_script else _RIGHT_TO_LEFT.fullmatch(name))
 
 
-def texts_of(*, has_game: bool, has_sessions: bool) -> list[str]:
-    """Return the names of the texts that participants may read in a study with or without a game and sessions."""
+def texts_of(*, has_game: bool, has_sessions: bool, has_chat: bool = False) -> list[str]:
+    """Return the names of the texts that participants may read in a study with or without a game, sessions and talk."""
     groups = [_PAGES, _LINKS]
     groups += [_WAITING, _ENDED, _GAME, SAID_ALONE] if has_game else []
     groups += [_LOBBY, _TOGETHER, SAID_TOGETHER] if has_sessions else []
+    groups += [_TALK] if has_chat else []
     return [name for name in ENGLISH if any(name in group for group in groups)]
 
 
@@ -431,6 +526,14 @@ class Texts:
     def say(self, name: str, /, **values: Any) -> str:
         """Return the text with these values in its placeholders. A placeholder without a value stays as it is."""
         return PLACE.sub(lambda place: str(values.get(place[1], place[0])), self[name])
+
+    def in_talk(self) -> Texts:
+        """Return the texts of a page whose game is `talk`: its words for a round and a conversation."""
+        said = {name: self._own.get(own) or self._own.get(name) or ENGLISH[own] for name, own in IN_TALK.items()}
+        texts = Texts({})
+        texts._own = self._own | said | dict.fromkeys(NOT_IN_TALK, "")
+        texts._hash = hash(frozenset(texts._own.items()))
+        return texts
 
     def of_server(self) -> dict[str, str]:
         """Return the study's own words for sentences of servers, by the English sentence. Sentences without own words

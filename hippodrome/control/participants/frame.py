@@ -85,14 +85,14 @@ def frame(
     heading: bool = False,
     head: Html = Html(),  # noqa: B008 - immutable
     body: str = "step",
-    sheet: str = "",
+    sheets: tuple[str, ...] = (),
     data: Html = Html(),  # noqa: B008
 ) -> Html:
     """Return the whole HTML of a step's page.
 
     `main`, `head`, `script` and `data` are its parts: the content, further elements of the head, the scripts, and
     attributes of the body. `body` is the kind of page, for `style`. With `heading`, the study's name is the page's
-    first heading. `sheet` names a further style sheet of `hippodrome/web/`, which only some pages need.
+    first heading. `sheets` names further style sheets of `hippodrome/web/`, which only some pages need.
     """
     texts = Texts(project.texts)
     lang = lang or texts.language
@@ -107,7 +107,7 @@ def frame(
         dir=_direction(lang),
         title=texts.say("titleStep", title=title or name, **numbers) if shows_progress else title or name,
         head=head,
-        style=Html(style(body) + (_sheet(sheet) if sheet else "") + _of_direction(lang)),
+        style=Html(style(body) + "".join(map(_sheet, sheets)) + _of_direction(lang)),
         body=body,
         data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
         header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),

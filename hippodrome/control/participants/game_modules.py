@@ -18,12 +18,24 @@ def _has_scene(trial: Mapping[str, Any]) -> bool:
     return trial.get("scene") is not None
 
 
+def has_chat(trial: Mapping[str, Any]) -> bool:
+    """Whether participants talk (`trial.chat`)."""
+    return trial.get("chat") not in (None, False)
+
+
+def is_talk(trial: Mapping[str, Any]) -> bool:
+    """Whether there is no game beside the talk."""
+    return trial.get("game") == TALK
+
+
 def _jumps(trial: Mapping[str, Any]) -> bool:
     """Whether the game has a button for up, and none for down."""
     ui = trial.get("ui")
     return isinstance(ui, Mapping) and ui.get("up") is True and not ui.get("down")
 
 
+TALK = "talk"
+"""The built-in game (`trial.game`) in which participants only talk."""
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "labels.js": lambda trial: bool(trial.get("labels")),
@@ -32,6 +44,7 @@ MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "turns.js": lambda trial: trial.get("pace") == "turns",
     "countdown.js": lambda trial: bool(trial.get("resetFreeze") or trial.get("episodeSeconds")),
     "thumbs.js": _jumps,
+    "chat.js": lambda trial: has_chat(trial) or is_talk(trial),
     **dict.fromkeys(("painter.js", "scene.js", "sprites.js"), _has_scene),
 }
 """By file name in `hippodrome/web/game/`: whether a project with this registered `trial` section needs the module."""

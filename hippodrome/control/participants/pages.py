@@ -119,7 +119,9 @@ def fragment(view: StepView) -> str:
 def game_page(view: GameView) -> Page:
     """Return the page of a game step: waiting and playing. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
-    texts = Texts(view.project.texts)
+    modules = game_modules.modules_of(view.project)
+    is_talk = game_modules.is_talk(view.project.trial)
+    texts = Texts(view.project.texts).in_talk() if is_talk else Texts(view.project.texts)
     state = str(view.state["state"])
     over = is_over(view.state)
     data: dict[str, Any] = {
@@ -135,6 +137,7 @@ def game_page(view: GameView) -> Page:
         data["said"] = said
     over_title, over_text = _over_texts(view.state, texts) if over else ("", "")
     moved = bool(view.state.get("replaces"))
+    data |= {"talk": True} if is_talk else {}
     together = view.project.has_sessions
     if together:
         trial = view.project.trial
@@ -168,9 +171,9 @@ def game_page(view: GameView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("game/main.js", nonce, module=True, also=game_modules.modules_of(view.project), texts=texts),
+        script=script("game/main.js", nonce, module=True, also=modules, texts=texts),
         head=Html(refresh + (f"<style>\n{style_of_pages_in_game()}</style>\n" if view.texts else "")),
-        sheet="sessions.css" if together else "",
+        sheets=("sessions.css",) * together + ("chat.css",) * ("chat.js" in modules),
         body="game",
     )
     return Page(text, headers(view.project, nonce, connect=view.sources))

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from hippodrome.control.config.__main__ import main as command
-from hippodrome.control.model.texts import ENGLISH, GROUPS, IN_ENGLISH, SAID, Texts, places
+from hippodrome.control.model.texts import ENGLISH, GROUPS, IN_ENGLISH, IN_TALK, SAID, Texts, places
 from hippodrome.control.participants import frame, game_modules, scripts
 from hippodrome.control.participants.texts import NAMED, in_script, in_template
 from hippodrome.trial.core import session, trial
@@ -33,6 +33,8 @@ NO_WORDS = {
     "Key",
     "Space",
     "Meta",
+    "Enter",
+    "Escape",
     "Unreachable",
     "Arial",
     "Accept",
@@ -49,6 +51,7 @@ def test_each_text_is_used() -> None:
     named = {name for file in SOURCES for name in NAMED.findall(file.read_text())}
     python = "".join(file.read_text() for file in PYTHON)
     named |= set(NAMED.findall(python)) | set(re.findall(r"[\"'](\w+)[\"']", python))
+    named |= set(IN_TALK.values())
     named |= {f"{name}Text" for name in named} | {"endedTitle", "failedTitle"} | set(SAID)
     assert ENGLISH.keys() - named == {"language"} - named
 
@@ -120,6 +123,17 @@ def test_a_study_has_its_own_texts_and_otherwise_the_english_ones() -> None:
     assert texts.language == "en"
     assert texts == Texts({"seconds": "{seconds} Sekunden", "start": "Los"}) != IN_ENGLISH
     assert hash(texts) == hash(Texts({"seconds": "{seconds} Sekunden", "start": "Los"}))
+
+
+def test_a_page_of_talk_speaks_of_rounds_and_a_conversation_and_not_of_a_score() -> None:
+    texts = Texts({"gameOf": "Runde {game}", "endRound": "Schluss", "reset": "Neu"}).in_talk()
+    assert texts["gameOf"] == "Runde {game}"
+    assert texts["reset"] == "Schluss"
+    assert texts["gameOver"] == "Round {game} of {games} is over"
+    assert texts["yourScore"] == ""
+    assert Texts({})["gameOver"] == "Game {game} of {games} is over"
+    for name, own in IN_TALK.items():
+        assert set(places(ENGLISH[own])) == set(places(ENGLISH[name])), name
 
 
 def test_the_page_gets_texts_for_messages_of_servers_only_if_the_study_has_its_own() -> None:
