@@ -184,7 +184,7 @@ def test_two_people_read_german_from_the_link_to_the_end(come: Callable[[str, in
     wide.wait_for_text("#overlay-title", "Warten auf die andere Person")
     wide.wait_for_text("#overlay-hint", "übernimmt ein Computerspieler den Platz")
     wide.check_german("waits")
-    wide.wait_for_text("#trouble", "Ein Computerspieler hat den Platz der anderen Person übernommen.")
+    wide.wait_for_text("#trouble", "Ein Computerspieler hat die andere Person ersetzt.")
     wide.check_german("replaced")
     phone.reconnect()
     wide.wait_for_text("#trouble", "Die andere Person ist wieder da.")
@@ -228,5 +228,5 @@ def test_ending_the_game_is_confirmed_in_german_and_the_other_participant_is_tol
 def test_the_page_of_a_broken_link_is_german(come: Callable[[str, int], Person], study: StudyProcess) -> None:
     phone = come("cy", 360)
     phone.page.goto(f"{study.link}&userId=a%20b")
-    phone.wait_for_text("h1", "Dieser Link ist nicht vollständig")
+    phone.wait_for_text("h1", "Dieser Link funktioniert nicht")
     phone.check_german("broken-link")

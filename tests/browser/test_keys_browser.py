@@ -88,7 +88,7 @@ def test_each_action_has_a_button_except_those_that_two_keys_make_together(
     wait_for_press(world_with_keys, "ArrowLeft")
     if width > 1000:
         assert tab.inner_text("#legend") == (
-            "←A Go left\n↑ up\nSpace Jump!\nEnter put\n1 one\nP start and pause\nR begin again"
+            "←A Go left\n↑ up\nSpace Jump!\nEnter put\n1 one\nP start or pause\nR restart"
         )
 
 
@@ -208,7 +208,7 @@ def test_a_button_on_the_last_picture_opens_the_page_between_two_games(world_wit
     world_with_pages.wait_for({"command": "start"})
     before = len(world_with_pages.player_commands())
     tell(world_with_pages, state="break")
-    tab.click("#overlay-button:text('Go on')")
+    tab.click("#overlay-button:text('Resume')")
     tab.wait_for_selector("text=Have a rest")
     assert world_with_pages.player_commands()[before:] == []
 
@@ -226,7 +226,7 @@ def test_the_first_picture_stands_still_with_a_countdown(
     play(world, tab)
     tell(world, state="playing", startsIn=2.9, timeLeft=90)
     tab.wait_for_selector("#overlay-title:text('Get ready')")
-    assert tab.inner_text("#announce") == "Get ready. The game begins in 3 seconds."
+    assert tab.inner_text("#announce") == "Get ready. The game starts in 3 seconds."
     assert tab.inner_text("#left") == "1:30"
     assert tab.inner_text("#overlay-hint") == "3"
     shot(tab, f"{width}-countdown")
@@ -234,7 +234,7 @@ def test_the_first_picture_stands_still_with_a_countdown(
         tab.clock.run_for(1_000)
         assert tab.inner_text("#overlay-hint") == left
     assert tab.inner_text("#left") == "1:30"
-    assert tab.inner_text("#announce") == "Get ready. The game begins in 3 seconds."
+    assert tab.inner_text("#announce") == "Get ready. The game starts in 3 seconds."
     tell(world, state="playing", timeLeft=11.5)
     tab.wait_for_selector("#overlay", state="hidden")
     assert tab.inner_text("#announce") == "Playing"

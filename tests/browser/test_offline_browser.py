@@ -41,7 +41,7 @@ def paused(world: World, page: Any) -> None:
 def on_a_break(world: World, page: Any) -> None:
     play(world, page)
     tell(world, state="break", nextIn=60)
-    page.wait_for_selector("#overlay-hint:text('The next game begins')")
+    page.wait_for_selector("#overlay-hint:text('The next game starts')")
 
 
 def reading(world: World, page: Any) -> None:
@@ -61,7 +61,7 @@ def over(world: World, page: Any) -> None:
     play(world, page)
     page.route("**/*", lambda route: route.abort() if route.request.method == "HEAD" else route.continue_())
     world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1}))
-    page.click("#overlay-button:text('Go on')")
+    page.click("#overlay-button:text('Continue')")
     page.wait_for_selector("#leave:visible")
     page.unroute("**/*")
 
@@ -82,7 +82,7 @@ def test_without_a_network_the_page_says_what_is_kept_and_what_to_do_and_it_reco
     lone_tab.wait_for_function(
         "() => ['connection', 'trying again', 'stay on this page', 'another network'].every(each => document.body.innerText.toLowerCase().includes(each))"
     )
-    assert re.search(r"Your (answers are|game is) (kept|saved)", lone_tab.inner_text("main"))
+    assert re.search(r"Your (answers are|game is) (safe|saved)", lone_tab.inner_text("main"))
     assert lone_tab.evaluate("[document.documentElement.scrollWidth - innerWidth]") == [0]
     shot(lone_tab, f"{width}-no-network-{phase.__name__}")
     requests = len(world.polls)

@@ -16,7 +16,7 @@ __all__ = ["phone", "phone_context"]  # fixtures
 pytestmark = pytest.mark.browser
 ALL = ["up", "down", "left", "right", "start", "pause"]
 SIZES = [(320, 568), (360, 740), (740, 360), (768, 1024), (1280, 800)]
-TIMED_OUT = "Time was up: “Defect” was chosen for you."
+TIMED_OUT = "Time ran out, so “Defect” was chosen for you."
 
 
 def apart(page: Any, one: str, other: str) -> bool:
@@ -52,7 +52,7 @@ def test_at_the_end_of_a_game_its_last_picture_and_score_are_seen_whole(
     play_on(world, phone, size, {"scene": scene}, ui)
     before = box(phone, ".stage")
     tell(world, state="break", nextIn=9)
-    phone.wait_for_selector("#overlay-hint:text('The next game begins')")
+    phone.wait_for_selector("#overlay-hint:text('The next game starts')")
     check_panel(phone, size)
     name = f"{size[0]}-{scene.get('height', 'low')}-{len(ui)}"
     shot(phone, f"{name}-break")
@@ -104,7 +104,7 @@ def test_choices_are_equally_large_and_a_choice_is_shown(dilemma: World, phone: 
     assert overflow(phone) == [0, 0]
     shot(phone, f"{size[0]}-time-up")
     tell(dilemma, state="break", nextIn=9, toAct=False, timeUp="")
-    phone.wait_for_selector("#choice:text-is('The time for a choice was up, so this game has ended.')")
+    phone.wait_for_selector("#choice:text-is('Time ran out, so this game has ended.')")
     check_panel(phone, size)
     tell(dilemma, state="playing", toAct=True)
     phone.wait_for_selector("#choice:empty", state="attached")
@@ -118,7 +118,7 @@ def test_a_choice_without_a_button_is_said_in_words(dilemma: World, phone: Any) 
 
 @pytest.mark.parametrize(
     ("labels", "words"),
-    [({}, "Time was up; nothing was chosen for you."), ({"noop": "Stay"}, "Time was up: “Stay” was chosen for you.")],
+    [({}, "Time ran out, so no choice was made."), ({"noop": "Stay"}, "Time ran out, so “Stay” was chosen for you.")],
     ids=["no label", "label"],
 )
 def test_the_idle_action_has_no_name_for_participants_unless_the_study_gives_it_one(
@@ -136,7 +136,7 @@ def test_who_loses_the_network_at_the_end_stays_in_the_study(world: World, phone
     play_on(world, phone, (360, 740), {}, [])
     tell(world, state="ended")
     world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 3}))
-    phone.wait_for_selector("#overlay-button:text('Go on')")
+    phone.wait_for_selector("#overlay-button:text('Continue')")
     phone.context.set_offline(True)
     try:
         phone.click("#overlay-button")

@@ -138,7 +138,7 @@ def test_a_form_that_is_too_large_is_not_sent(world: World, tab: Any) -> None:
     tab.goto(world.url)
     tab.fill("#t", "x" * 300_000)
     tab.click("text=Continue")
-    assert "Please shorten the longest answer by about 51,000 characters." in tab.inner_text(".status")
+    assert "Please shorten your longest answer by about 51,000 characters." in tab.inner_text(".status")
     assert len(tab.input_value("#t")) == 300_000
     assert world.posts == []
 
@@ -148,7 +148,7 @@ def test_the_page_says_by_how_many_characters_an_answer_is_too_long(world: World
     tab.goto(world.url)
     tab.evaluate("document.getElementById('t').value = '\\u{1F600}'.repeat(80_000)")  # 320 KB, and encoded 960 KB
     tab.click("text=Continue")
-    assert "Please shorten the answer to “Story” by about 60,000 characters." in tab.inner_text(".status")
+    assert "Please shorten your answer to “Story” by about 60,000 characters." in tab.inner_text(".status")
     tab.evaluate("document.getElementById('t').value = '\\u{1F600}'.repeat(20_000)")
     tab.click("text=Continue")
     tab.wait_for_selector("text=Step 2 of 4")
@@ -160,7 +160,7 @@ def test_a_missing_answer_is_named(world: World, tab: Any) -> None:
     )
     tab.goto(world.url)
     tab.click("text=Continue")
-    assert tab.inner_text(".status") == "An answer is missing: “How are you?”"
+    assert tab.inner_text(".status") == "Please answer this question: “How are you?”"
     assert tab.evaluate("document.activeElement.name") == "r"
 
 
@@ -173,7 +173,7 @@ def test_the_sentence_on_a_missing_answer_goes_when_the_answer_is_given(world: W
     tab.goto(world.url)
     for answer, name in (("age", "Age"), ("r", "How are you?")):
         tab.click("text=Continue")
-        assert tab.inner_text(".status") == f"An answer is missing: “{name}”"
+        assert tab.inner_text(".status") == f"Please answer this question: “{name}”"
         if answer == "age":
             tab.check("text=Tired")
             tab.evaluate("document.querySelectorAll('[type=radio]').forEach((each) => { each.checked = false; })")
@@ -190,7 +190,7 @@ def test_without_a_connection_the_first_click_only_warns(world: World, lone_tab:
     lone_tab.goto(world.url)
     lone_tab.context.set_offline(True)
     lone_tab.click("text=Continue")
-    assert "You seem to be offline" in lone_tab.inner_text(".status")
+    assert "You appear to be offline" in lone_tab.inner_text(".status")
     lone_tab.context.set_offline(False)
     lone_tab.click("text=Continue")
     lone_tab.wait_for_selector("text=Step 2 of 4")
@@ -301,10 +301,10 @@ def test_the_page_goes_from_waiting_to_the_game_without_a_reload(world: World, t
     world.step = 2
     tab.goto(world.url)
     tab.evaluate("window.same = true")
-    assert tab.inner_text("[aria-current=step]") == "Your request has been received"
+    assert tab.inner_text("[aria-current=step]") == "Request received"
     world.state = {"state": "naming", "seconds": 9, "typical": 20, "attempt": 1}
     tab.wait_for_selector("[aria-current=step]:text('connection')")
-    assert "Usually it takes about 20 seconds." in tab.inner_text(".clock")
+    assert "This usually takes about 20 seconds." in tab.inner_text(".clock")
     world.ready()
     tab.wait_for_selector("#overlay-button:visible")
     assert tab.evaluate("window.same") is True
@@ -362,7 +362,7 @@ def test_while_the_game_is_paused_both_buttons_say_what_they_do(world: World, ta
         said[state] = (tab.inner_text("[data-command=toggle]"), tab.text_content("#overlay-button"))
     assert said["ready"] == ("Start", "Start")
     assert said["playing"][0] == "Pause"
-    assert said["paused"] == ("Go on", "Go on")
+    assert said["paused"] == ("Resume", "Resume")
 
 
 def test_frames_are_drawn_in_order_and_acknowledged(world: World, tab: Any) -> None:
@@ -410,7 +410,7 @@ def test_the_numeric_keypad_has_arrows_without_numlock_and_digits_with_it(world:
 def test_the_legend_lists_the_controls_of_the_project(world: World, tab: Any) -> None:
     play(world, tab)
     legend = tab.eval_on_selector_all("#legend > span", "all => all.map((each) => each.textContent)")
-    assert legend == ["←↑→ move", "Space fire", "P start and pause", "R begin again"]
+    assert legend == ["←↑→ move", "Space fire", "P start or pause", "R restart"]
     said = {"UI": ["left"], "actionSpace": ["noop", "left", "right"], "state": "ready", "episode": 1}
     world.connections[0].send(json.dumps(said))
     tab.wait_for_selector("#legend > span:nth-child(3)", state="detached")
@@ -445,7 +445,7 @@ def test_each_control_of_the_project_has_a_button(world: World, tab: Any) -> Non
     names = tab.eval_on_selector_all(
         "#controls button", "all => all.map(each => each.getAttribute('aria-label') ?? each.textContent)"
     )
-    assert names == ["Up", "Left", "Right", "Fire", "Start", "Begin again"]  # "down" is no action of this game
+    assert names == ["Up", "Left", "Right", "Fire", "Start", "Restart"]  # "down" is no action of this game
     assert tab.evaluate("document.documentElement.scrollWidth") <= 360
     tab.dispatch_event("#controls button.left", "pointerdown", {"button": 0, "pointerId": 1})
     tab.focus("#controls button.right")
@@ -568,7 +568,7 @@ def test_a_break_shows_the_score_and_counts_down(world: World, stopped_clock_tab
     tab.keyboard.down("ArrowLeft")
     world.wait_for({"action": "left", "held": True})
     tell(world, state="break", nextIn=2.9)
-    tab.wait_for_selector("#overlay-hint:text('The next game begins in 3 seconds.')")
+    tab.wait_for_selector("#overlay-hint:text('The next game starts in 3 seconds.')")
     assert tab.inner_text("#overlay-title") == "Game 1 of 2 is over"
     assert tab.inner_text("#overlay-score") == "Your score: 30"
     world.wait_for({"action": "left", "held": False})
@@ -578,8 +578,8 @@ def test_a_break_shows_the_score_and_counts_down(world: World, stopped_clock_tab
     world.wait_for({"action": "fire", "held": False})
     assert world.player_commands() == before, "no key of the game ends the break"
     tab.clock.run_for(2_000)
-    assert tab.inner_text("#overlay-hint") == "The next game begins in 1 second."
-    tab.click("text=Go on now")
+    assert tab.inner_text("#overlay-hint") == "The next game starts in 1 second."
+    tab.click("text=Continue now")
     world.wait_for({"command": "start"})
     tab.wait_for_selector("#overlay", state="hidden")
     assert tab.inner_text("#overlay-score") == ""
@@ -623,7 +623,7 @@ def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: W
     wait_for_next_page(tab, within=4_000)
 
 
-FAILED = "Something went wrong, so the game ends here. What you have played is kept."
+FAILED = "Something went wrong, so the game ends here. What you have played so far is saved."
 
 
 @pytest.mark.parametrize("own", [None, "Das Spiel ging kaputt."])
@@ -655,7 +655,7 @@ def test_a_participant_can_go_on_from_the_last_picture_at_once(world: World, sto
     world.step = 3
     world.source = "<h1>Next page</h1>"
     world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
-    tab.wait_for_selector("#overlay-button:text('Go on')")
+    tab.wait_for_selector("#overlay-button:text('Continue')")
     assert tab.evaluate("document.activeElement.id") == "overlay-button"
     tab.keyboard.press("Enter")
     wait_for_next_page(tab, within=3_900)
@@ -669,7 +669,7 @@ def test_the_last_picture_is_drawn_even_if_it_comes_with_the_end(world: World, t
     world.wait_for({"command": "start"})
     world.connections[0].send(pack(3, RED * 4))
     world.connections[0].send(json.dumps({"done": True, "episodes": 1, "score": 7}))
-    tab.wait_for_selector("#overlay-button:text('Go on')")
+    tab.wait_for_selector("#overlay-button:text('Continue')")
     pixel = "[...document.getElementById('screen').getContext('2d').getImageData(0, 0, 1, 1).data].join()"
     tab.wait_for_function(f"() => {pixel} === '255,0,0,255'")
 
@@ -721,7 +721,7 @@ def play_two_games(world: World, tab: Any, server: Running, width: int) -> None:
     assert tab.evaluate(FLAWS) == []
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     shot(tab, f"{width}-game-break")
-    tab.click("text=Go on now")
+    tab.click("text=Continue now")
     tab.wait_for_selector("#episode:text('Game 2 of 2')")
     world.step, world.source = 3, "<h1>Next page</h1>"
     tab.wait_for_selector("#overlay-title:text('The game is over')")
@@ -740,10 +740,10 @@ def test_the_page_says_that_the_server_was_lost_and_goes_on_with_the_next(world:
     world.connections[0].socket.close()
     world.connections[0].close()
     tab.wait_for_selector("#overlay-title:text('Connection lost')")
-    assert "Your game is kept" in tab.inner_text("#overlay-hint")
+    assert "Your game is safe" in tab.inner_text("#overlay-hint")
     shot(tab, f"{width}-3-lost-connection")
     world.state = {"state": "queued", "seconds": 1, "attempt": 2, "reason": "lost", "replaces": True}
-    tab.wait_for_selector("h1:text('starts on another computer'):visible")
+    tab.wait_for_selector("h1:text('is moving to another server'):visible")
     assert tab.locator("h1:visible").count() == 1
     shot(tab, f"{width}-3-moves")
     world.ready()
@@ -760,7 +760,7 @@ def test_a_game_that_could_not_begin_is_still_loading_and_not_lost(world: World,
     tab.goto(world.url)
     tab.wait_for_selector(f"#trouble:text('{world.refusal}')")
     world.state = {**world.state, "url": NOWHERE}
-    tab.wait_for_selector("#overlay-hint:text('This takes longer than usual. Please stay on this page.')")
+    tab.wait_for_selector("#overlay-hint:text('This is taking longer than usual. Please stay on this page.')")
     assert tab.inner_text("#overlay-title") == "Loading the game…"
     shot(tab, f"{width}-not-begun")
     world.refusal = ""
@@ -771,7 +771,7 @@ def test_a_game_that_could_not_begin_is_still_loading_and_not_lost(world: World,
 def test_the_page_of_a_first_server_does_not_say_that_the_game_moves(world: World, tab: Any) -> None:
     world.step = 2
     tab.goto(world.url)
-    assert tab.locator("h1:visible").all_inner_texts() == ["Your game is getting ready"]
+    assert tab.locator("h1:visible").all_inner_texts() == ["Preparing your game"]
 
 
 def test_the_page_says_what_may_help_if_the_server_cannot_be_reached(world: World, lone_tab: Any) -> None:
@@ -799,7 +799,7 @@ def test_a_page_that_waits_for_long_reloads_itself(world: World, lone_tab: Any) 
         assert time.monotonic() < until
         lone_tab.clock.run_for(4_000)
         lone_tab.wait_for_timeout(5)
-    lone_tab.wait_for_selector("h1:visible:text('Your game is getting ready')")
+    lone_tab.wait_for_selector("h1:visible:text('Preparing your game')")
     assert len(loads) == 2
 
 
@@ -825,12 +825,12 @@ def test_a_participant_goes_on_without_a_game_that_failed(world: World, tab: Any
     world.step = 2
     world.state = {"state": "failed", "seconds": 5, "attempt": 3, "again": again, "without": True, "reason": "lost"}
     tab.goto(world.url)
-    buttons = ["Go on without the game", "Try again"] if again else ["Go on without the game"]
+    buttons = ["Continue without the game", "Try again"] if again else ["Continue without the game"]
     assert tab.locator("main button:visible").all_inner_texts() == buttons
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-3-without{'-or-again' if again else ''}")
     with tab.expect_navigation():
-        tab.click("button:text('Go on without the game')")
+        tab.click("button:text('Continue without the game')")
     assert world.posts == [{"hippodrome-step": "3", "hippodrome-ticket": "T", "hippodrome-action": "without"}]
     assert tab.locator("#over").count() == 0, "the next step is shown"
 

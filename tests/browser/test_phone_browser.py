@@ -201,7 +201,7 @@ def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
     world: World, phone: Any, size: tuple[int, int]
 ) -> None:
     play(world, phone, size, {}, ALL)
-    failed = "Something went wrong, so the game ends here. What you have played is kept."
+    failed = "Something went wrong, so the game ends here. What you have played so far is saved."
     world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1, "error": failed}))
     phone.wait_for_selector("#overlay-hint:visible:text('ends here')")
     shot(phone, f"{size[0]}-failed")
@@ -213,7 +213,7 @@ def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
 
 # Bad Wi-Fi
 
-HANGS = "The connection hangs. Please stay on this page."
+HANGS = "Your connection is slow. Please stay on this page."
 
 
 def fall_silent(world: World, heard: list[dict[str, Any]], state: str = "playing") -> None:
@@ -282,10 +282,10 @@ COVERED = """() => {
 def test_a_message_covers_none_of_the_words_over_the_picture(world: World, phone: Any, size: tuple[int, int]) -> None:
     hold_timers(phone, MESSAGE)
     play(world, phone, size, {}, ALL)
-    failed = "Something went wrong, so this game has ended. The next game begins."
+    failed = "Something went wrong, so this game has ended. You will continue with the next game."
     world.connections[0].send(json.dumps({"error": failed}))
     tell(world, state="break", nextIn=9)
-    phone.wait_for_selector("#overlay-hint:text('The next game begins')")
+    phone.wait_for_selector("#overlay-hint:text('The next game starts')")
     assert (phone.evaluate(COVERED), phone.inner_text("#trouble")) == ([], failed)
     shot(phone, f"{size[0]}-message-in-a-break")
     world.connections[0].send(json.dumps({"error": failed}))

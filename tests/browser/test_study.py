@@ -263,7 +263,7 @@ def test_a_participant_can_consent_with_the_keyboard_alone(visit: Any) -> None:
     assert page.evaluate(outlined)
     page.keyboard.press("Enter")  # one answer is missing
     assert page.evaluate(focused) == "consent"
-    assert "An answer is missing" in page.locator(".status").inner_text()
+    assert "Please answer this question" in page.locator(".status").inner_text()
     visitor.pictures = True
     visitor.shot("1-consent-missing")
     page.keyboard.press("Space")

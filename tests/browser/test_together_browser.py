@@ -77,18 +77,20 @@ def test_the_lobby_says_how_many_wait_for_how_long_and_what_happens_then(
     tab.set_viewport_size({"width": width, "height": height})
     tab.goto(group.url)
     assert tab.locator("h1:visible").all_inner_texts() == ["Waiting for another participant"]
-    assert tab.inner_text("#lobby-here") == "You are the first of 2"
-    wait_for_text(tab, "#lobby-clock", "You have waited for 4")
-    wait_for_text(tab, "#lobby-then", "If nobody else comes in the next 4 min ")
-    assert tab.inner_text("#lobby-then").endswith("you go on to the next part of the study without this game.")
+    assert tab.inner_text("#lobby-here") == "You are the first of 2 people"
+    wait_for_text(tab, "#lobby-clock", "Waiting time: 4")
+    wait_for_text(tab, "#lobby-then", "If nobody else joins within 4 min ")
+    assert tab.inner_text("#lobby-then").endswith(
+        "you will continue with the next part of the study, without this game."
+    )
     assert tab.locator(".stages:visible, .clock:visible").count() == 1
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []
     shot(tab, f"{width}-lobby")
     group.state = {**LOBBY, "here": 2, "seconds": 44, "proposed": True}
-    wait_for_text(tab, "#lobby-here", "Found: another participant is here. One moment, please…")
+    wait_for_text(tab, "#lobby-here", "Another participant is here. Just a moment…")
     assert tab.inner_text("#lobby-then") == ""
-    assert tab.title().startswith("Found \u2013 ")
+    assert tab.title().startswith("Match found \u2013 ")
     shot(tab, f"{width}-lobby-found")
 
 
@@ -97,10 +99,10 @@ def test_a_lobby_for_many_players_counts_the_participants(group: World, tab: Any
     group.state = {**LOBBY, "players": 16, "here": 11, "then": "policies"}
     tab.goto(group.url)
     assert tab.inner_text("h1:visible") == "Waiting for other participants"
-    assert tab.inner_text("#lobby-here") == "11 of 16 are here, you included"
+    assert tab.inner_text("#lobby-here") == "11 of 16 people are here, including you"
     assert tab.locator("#lobby-places i").count() == 16
     assert tab.locator("#lobby-places .taken").count() == 11
-    assert "computer players take the empty places" in tab.inner_text("#lobby-then")
+    assert "computer players will fill the empty places" in tab.inner_text("#lobby-then")
     assert tab.evaluate("document.documentElement.scrollWidth") <= 360
     shot(tab, "360-lobby-16")
     group.state = {**group.state, "here": 23}
@@ -120,41 +122,41 @@ def test_a_change_in_the_lobby_is_announced_once(group: World, tab: Any) -> None
     wait_for_polls(group, 2)
     assert tab.evaluate("window.said") == []
     group.state = {**group.state, "here": 2}
-    wait_for_text(tab, "#lobby-here", "2 of 3 are here")
-    assert tab.evaluate("window.said") == ["2 of 3 are here, you included"]
+    wait_for_text(tab, "#lobby-here", "2 of 3 people are here")
+    assert tab.evaluate("window.said") == ["2 of 3 people are here, including you"]
 
 
 def test_when_the_patience_is_over_the_page_says_what_happens(group: World, tab: Any) -> None:
     group.state = {**LOBBY, "seconds": 297, "then": "policies"}
     tab.goto(group.url)
     wait_for_text(
-        tab, "#lobby-then", "If nobody else comes in the next 3 seconds, you play with a computer player instead."
+        tab, "#lobby-then", "If nobody else joins within 3 seconds, you will play with a computer player instead."
     )
     group.state = {**group.state, "seconds": 300}
     wait_for_text(
-        tab, "#lobby-then", "Nobody else has come, so you play with a computer player instead. One moment, please…"
+        tab, "#lobby-then", "Nobody else joined, so you will play with a computer player instead. Just a moment…"
     )
 
 
 @pytest.mark.parametrize(
     ("players", "here", "then", "said"),
     [
-        (2, 1, "policies", "Nobody else has come: you play with a computer player. One moment, please…"),
-        (3, 1, "policies", "Nobody else has come: you play with computer players. One moment, please…"),
+        (2, 1, "policies", "Nobody else joined, so you will play with a computer player. Just a moment…"),
+        (3, 1, "policies", "Nobody else joined, so you will play with computer players. Just a moment…"),
         (
             3,
             2,
             "policies",
-            "2 of 3 are here, you included: a computer player takes the empty place. One moment, please…",
+            "2 of 3 people are here, including you. A computer player will fill the empty place. Just a moment…",
         ),
         (
             4,
             2,
             "policies",
-            "2 of 4 are here, you included: computer players take the empty places. One moment, please…",
+            "2 of 4 people are here, including you. Computer players will fill the empty places. Just a moment…",
         ),
-        (3, 3, "policies", "Found: enough participants are here. One moment, please…"),
-        (2, 1, "unmatched", "You are the first of 2"),
+        (3, 3, "policies", "Enough participants are here. Just a moment…"),
+        (2, 1, "unmatched", "You are the first of 2 people"),
     ],
 )
 def test_with_too_few_participants_the_page_does_not_say_that_others_are_found(
@@ -165,7 +167,7 @@ def test_with_too_few_participants_the_page_does_not_say_that_others_are_found(
     tab.goto(group.url)
     wait_for_text(tab, "#lobby-here", said)
     assert tab.inner_text("#lobby-here") == said
-    assert tab.title().startswith("Found") is (here == players)
+    assert tab.title().startswith("Match found") is (here == players)
     assert tab.evaluate("document.documentElement.scrollWidth") <= tab.viewport_size["width"]
     assert tab.evaluate(FLAWS) == []
 
@@ -198,8 +200,8 @@ def test_after_the_match_the_game_is_prepared_and_played_without_a_reload(group:
     group.state = dict(MATCHED)
     tab.wait_for_selector("h1:visible:text('Your game is being prepared')")
     assert tab.is_hidden("#lobby")
-    assert tab.inner_text("#company") == "You play with another participant."
-    assert tab.inner_text("[aria-current=step]") == "Your request has been received"
+    assert tab.inner_text("#company") == "You will play with another participant."
+    assert tab.inner_text("[aria-current=step]") == "Request received"
     assert tab.title().startswith("Your game is being prepared \u2013 ")
     assert tab.evaluate(FLAWS) == []
     shot(tab, "360-prepared")
@@ -216,9 +218,9 @@ def test_after_the_match_the_game_is_prepared_and_played_without_a_reload(group:
 @pytest.mark.parametrize(
     ("players", "members", "says"),
     [
-        (2, 1, "You play with a computer player."),
-        (4, 2, "You play with another participant and 2 computer players."),
-        (4, 4, "You play with 3 other participants."),
+        (2, 1, "You will play with a computer player."),
+        (4, 2, "You will play with another participant and 2 computer players."),
+        (4, 4, "You will play with 3 other participants."),
     ],
 )
 def test_a_page_that_is_opened_again_says_who_plays(
@@ -233,14 +235,14 @@ def test_a_page_that_is_opened_again_says_who_plays(
 def test_the_page_reloads_for_another_number_of_players_without_leaving_the_lobby(group: World, tab: Any) -> None:
     """The study was registered again: the page's sentences and modules depend on the number of players."""
     tab.goto(group.url)
-    assert tab.inner_text("#lobby-here") == "You are the first of 2"
+    assert tab.inner_text("#lobby-here") == "You are the first of 2 people"
     group.more = {"players": 3}
     group.state = {**LOBBY, "players": 3, "here": 2}
-    wait_for_text(tab, "#lobby-here", "2 of 3 are here, you included")
-    assert "3 people play this game together." in tab.inner_text("#lobby")
+    wait_for_text(tab, "#lobby-here", "2 of 3 people are here, including you")
+    assert "This is a game for 3 people." in tab.inner_text("#lobby")
     group.more = {"players": 4}
     group.state = {**MATCHED, "players": 4, "members": 4}
-    wait_for_text(tab, "#company", "You play with 3 other participants.")
+    wait_for_text(tab, "#company", "You will play with 3 other participants.")
     assert group.posts == []
 
 
@@ -276,8 +278,8 @@ def test_closing_the_page_of_a_game_sends_no_form(group: World, tab: Any) -> Non
 def test_the_lobby_explains_why_the_waiting_time_begins_again(group: World, tab: Any) -> None:
     tab.goto(group.url)
     group.state = {**LOBBY, "seconds": 2}
-    wait_for_text(tab, "#announce", "You were away for a while, so your waiting time has begun again.")
-    wait_for_text(tab, "#lobby-note", "You were away for a while, so your waiting time has begun again.")
+    wait_for_text(tab, "#announce", "You were away for a while, so your waiting time has restarted.")
+    wait_for_text(tab, "#lobby-note", "You were away for a while, so your waiting time has restarted.")
 
 
 def test_the_lobby_says_that_there_is_no_connection_and_goes_on_when_it_is_back(group: World, lone_tab: Any) -> None:
@@ -287,14 +289,14 @@ def test_the_lobby_says_that_there_is_no_connection_and_goes_on_when_it_is_back(
     shot(lone_tab, "360-lobby-offline")
     lone_tab.context.set_offline(False)
     lone_tab.wait_for_selector("#wait-status:empty", state="attached")
-    wait_for_text(lone_tab, "#lobby-here", "You are the first of 2")
+    wait_for_text(lone_tab, "#lobby-here", "You are the first of 2 people")
 
 
 def test_the_lobby_says_that_the_study_was_closed(group: World, tab: Any) -> None:
     tab.goto(group.url)
     wait_for_polls(group, 1)
     group.closed = True
-    tab.wait_for_selector("text=There is no such study")
+    tab.wait_for_selector("text=Study not found")
 
 
 def test_without_javascript_the_lobby_says_that_the_game_needs_it_and_does_not_reload(
@@ -327,7 +329,7 @@ def test_a_game_of_two_shows_who_is_missing_then_a_countdown_then_the_game(
     tab.goto(group.url)
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant')")
     assert tab.is_hidden("#overlay-button")
-    assert tab.inner_text("#overlay-hint") == "The game begins as soon as everybody is here."
+    assert tab.inner_text("#overlay-hint") == "The game will start as soon as everyone is here."
     assert players_shown(tab) == ["You: Blue", "Red (not here yet)"]
     shot(tab, f"{width}-gathering")
     tab.keyboard.press("ArrowLeft")
@@ -335,7 +337,7 @@ def test_a_game_of_two_shows_who_is_missing_then_a_countdown_then_the_game(
     assert group.player_commands() == [], "nobody presses start"
     tell(group, state="ready", beginsIn=3, **presence(red="here"))
     wait_for_text(tab, "#overlay-score", "3")
-    assert tab.inner_text("#overlay-title") == "The game begins"
+    assert tab.inner_text("#overlay-title") == "The game is starting"
     assert players_shown(tab) == ["You: Blue", "Red"]
     shot(tab, f"{width}-begins")
     tab.clock.run_for(1_000)
@@ -355,7 +357,7 @@ def test_a_game_of_two_shows_who_is_missing_then_a_countdown_then_the_game(
 @pytest.mark.parametrize(("width", "height"), [(360, 640), (320, 568), (740, 360), (1280, 800)])
 @pytest.mark.parametrize(
     ("after", "next"),
-    [("end", "the game ends for everybody"), ("policy", "a computer player takes their place")],
+    [("end", "the game will end for everyone"), ("policy", "a computer player will take their place")],
 )
 def test_a_held_game_says_for_whom_it_waits_how_long_and_what_follows(
     group: World, stopped_clock_tab: Any, width: int, height: int, after: str, next: str
@@ -366,13 +368,13 @@ def test_a_held_game_says_for_whom_it_waits_how_long_and_what_follows(
     start_game(group, tab)
     tell(group, state="paused", heldFor=23, **presence(red="away"))
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant')")
-    assert tab.inner_text("#overlay-hint") == f"If they are not here in 23 seconds, {next}."
+    assert tab.inner_text("#overlay-hint") == f"If they are not here within 23 seconds, {next}."
     assert tab.is_hidden("#overlay-button")
     assert players_shown(tab) == ["You: Blue", "Red (away)"]
     check_overlay_fits(tab)
     shot(tab, f"{width}-held")
     tab.clock.run_for(1_000)
-    assert tab.inner_text("#overlay-hint") == f"If they are not here in 22 seconds, {next}."
+    assert tab.inner_text("#overlay-hint") == f"If they are not here within 22 seconds, {next}."
     tell(group, state="playing", **presence(red="here"))
     tab.wait_for_selector("#overlay", state="hidden")
     wait_for_text(tab, "#trouble", "The other participant is back.")
@@ -391,7 +393,7 @@ def start_game(world: World, page: Any) -> None:
 def test_the_page_says_that_a_computer_player_has_taken_a_place(group: World, tab: Any) -> None:
     start_game(group, tab)
     tell(group, state="playing", **presence(red="policy"))
-    wait_for_text(tab, "#trouble", "A computer player has taken the place of the other participant.")
+    wait_for_text(tab, "#trouble", "A computer player has replaced the other participant.")
     assert players_shown(tab) == ["You: Blue", "Red (computer)"]
     shot(tab, "360-policy")
     tell(group, state="playing", **presence(red="here"))
@@ -413,7 +415,7 @@ def test_the_button_that_ends_the_game_says_that_it_ends_for_everybody(group: Wo
     group.controls |= {"UI": ["start", "stop"]}
     start_game(group, tab)
     tell(group, state="playing", **presence(red="here"))
-    tab.wait_for_selector("[data-command=stop]:text-is('End the game for everybody')", state="attached")
+    tab.wait_for_selector("[data-command=stop]:text-is('End the game for everyone')", state="attached")
 
 
 def test_with_many_players_the_page_says_how_many_are_there(group: World, tab: Any) -> None:
@@ -439,13 +441,13 @@ def test_a_participant_who_was_away_is_told_so_and_not_that_the_others_are_missi
     group.trial_state = {**held, "people": {"blue": "away", "red": "here"}}
     group.connections[0].send(json.dumps(group.trial_state))
     tab.wait_for_selector("#overlay-title:text('You were away for a moment')")
-    assert tab.inner_text("#overlay-hint") == "The game goes on as soon as everybody is here."
+    assert tab.inner_text("#overlay-hint") == "The game will continue as soon as everyone is here."
     check_overlay_fits(tab)
     shot(tab, f"{width}-was-away")
     group.trial_state = {**held, "people": {"blue": "here", "red": "away"}}
     group.connections[0].send(json.dumps(group.trial_state))
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant')")
-    wait_for_text(tab, "#overlay-hint", "If they are not here in 8 seconds")
+    wait_for_text(tab, "#overlay-hint", "If they are not here within 8 seconds")
 
 
 def test_a_participant_whose_round_trip_is_being_measured_is_not_told_that_they_were_away(
@@ -455,7 +457,7 @@ def test_a_participant_whose_round_trip_is_being_measured_is_not_told_that_they_
     group.trial_state = {"state": "ready", "heldFor": 8, "you": "blue", "people": {"blue": "awaited", "red": "here"}}
     group.connections[0].send(json.dumps(group.trial_state))
     tab.wait_for_selector("#overlay-title:text-is('Waiting for the other participant')")
-    assert tab.inner_text("#overlay-hint") == "The game begins as soon as everybody is here."
+    assert tab.inner_text("#overlay-hint") == "The game will start as soon as everyone is here."
     assert tab.get_attribute("#people b:first-child", "class") == "awaited"
     tell(group, state="playing", **presence(red="here"))
     tab.wait_for_selector("#people b.here:first-child")
@@ -473,7 +475,7 @@ def test_words_over_a_low_picture_are_seen_whole(group: World, tab: Any, width: 
     group.connections[0].send(struct.pack("!BI", 4, 3) + drawn.encode())
     tab.wait_for_function("() => document.getElementById('screen').getBoundingClientRect().height < 80")
     tell(group, state="paused", heldFor=8, **presence(red="away"))
-    wait_for_text(tab, "#overlay-hint", "If they are not here in")
+    wait_for_text(tab, "#overlay-hint", "If they are not here within")
     assert tab.evaluate(SEEN_WHOLE, "overlay")
     shot(tab, f"{width}-low-picture")
     tell(group, state="playing", **presence(red="here"))
@@ -507,10 +509,10 @@ def open_with_image(group: World, tab: Any, size: int, stands: dict[str, Any]) -
 
 def test_during_the_countdown_the_page_does_not_say_that_images_are_loading(group: World, tab: Any) -> None:
     open_with_image(group, tab, 80_000, {"beginsIn": 30, **presence(red="here")})
-    tab.wait_for_selector("#overlay-title:text-is('The game begins')")
+    tab.wait_for_selector("#overlay-title:text-is('The game is starting')")
     group.connections[0].send(struct.pack("!BHI", 6, 0, 0) + bytes(4_000))
     tab.wait_for_function("() => document.querySelector('#overlay progress').value > 0")
-    assert tab.inner_text("#overlay-title") == "The game begins"
+    assert tab.inner_text("#overlay-title") == "The game is starting"
     assert tab.inner_text("#overlay-score").isdecimal()
 
 
@@ -530,7 +532,7 @@ def test_the_pause_button_appears_only_while_the_game_plays(group: World, tab: A
     tab.goto(group.url)
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant')")
     assert tab.is_hidden("[data-command=toggle]")
-    assert "pause and go on" in tab.inner_text("#legend")
+    assert "pause or resume" in tab.inner_text("#legend")
     tell(group, state="playing", **presence(red="here"))
     tab.wait_for_selector("[data-command=toggle]:text-is('Pause')")
 
@@ -573,9 +575,9 @@ def test_a_lost_connection_of_the_page_is_told_apart_from_the_absence_of_the_oth
 @pytest.mark.parametrize(
     ("outcome", "reason", "says"),
     [
-        ("partnerLeft", "", "The other participant is not there any more, so the game has ended."),
+        ("partnerLeft", "", "The other participant left, so the game has ended."),
         ("left", "", "You were away for too long"),
-        ("ping", "", "Your connection to the game is too slow"),
+        ("ping", "", "Your connection is too slow to play"),
         ("partnerLeft", PARTNER_MISSING, PARTNER_MISSING),
         ("ping", PING, PING),
     ],
@@ -664,7 +666,7 @@ def test_the_server_is_told_when_the_instructions_are_read(group: World, stopped
     tab.wait_for_selector("h2:text('How to play'):visible")
     assert group.player_commands() == []
     tell(group, state="ready", heldFor=20, you="blue", people={"blue": "reads", "red": "here"})
-    wait_for_text(tab, "#reading", "The other participant waits for you. Please go on within 20 seconds.")
+    wait_for_text(tab, "#reading", "The other participant is waiting for you. Please continue within 20 seconds.")
     assert tab.is_visible("h2:text('How to play')")
     shot(tab, "360-reading")
     group.started = {"state": "ready", "episode": 1, "heldFor": 18, **presence(red="reads")}
@@ -672,7 +674,7 @@ def test_the_server_is_told_when_the_instructions_are_read(group: World, stopped
     group.wait_for({"command": "start"})
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant'):visible")
     assert players_shown(tab) == ["You: Blue", "Red (reading)"]
-    assert "They have not gone on yet. The game begins in 18 seconds at the latest." in tab.inner_text("#overlay-hint")
+    assert "They are still reading. The game will start in 18 seconds at the latest." in tab.inner_text("#overlay-hint")
 
 
 def test_instructions_that_were_read_before_a_reload_are_not_shown_again(group: World, stopped_clock_tab: Any) -> None:
@@ -730,7 +732,7 @@ def test_a_phone_that_wakes_shows_the_present_state_of_the_game(group: World, ta
     with asleep(tab):
         tell(group, state="paused", heldFor=4, **presence(red="away"))
         tell(group, state="paused", beginsIn=9, **presence(red="here"))
-    tab.wait_for_selector("#overlay-title:text('The game goes on')")
+    tab.wait_for_selector("#overlay-title:text('The game is about to continue')")
     assert players_shown(tab) == ["You: Blue", "Red"]
 
 
@@ -786,7 +788,7 @@ def test_a_second_tab_takes_the_game_and_the_first_one_says_so(group: World, tab
     group.connections[0].close(4409, "opened elsewhere")
     tab.wait_for_selector("text=Play here instead")
     assert players_shown(tab) == ["You: Blue", "Red"]
-    assert tab.inner_text("#overlay-hint") == "If you have closed it there, go on here."
+    assert tab.inner_text("#overlay-hint") == "If you have closed it there, continue here."
     check_overlay_fits(tab)
     shot(tab, "360-elsewhere")
 
@@ -816,5 +818,5 @@ def test_a_message_right_behind_the_first_one_is_shown(group: World, tab: Any) -
     note_texts(tab, "#overlay-score")
     group.state = dict(MATCHED)
     group.ready()
-    tab.wait_for_selector("#overlay-title:text('The game begins')")
+    tab.wait_for_selector("#overlay-title:text('The game is starting')")
     wait_for_noted(tab, "#overlay-score", "30")

@@ -97,7 +97,7 @@ def come(chromium: Any, study: StudyProcess) -> Iterator[Any]:
     assert [person.complaints for person in people] == [[] for _ in people]
 
 
-ELSEWHERE = "The game was opened in another tab or on another device"
+ELSEWHERE = "The game is open in another tab or on another device"
 SEATS = (["You: Red", "Blue"], ["Red", "You: Blue"])
 """What each of the two pages says about the players. Places are drawn by lot."""
 
@@ -115,7 +115,7 @@ def press(person: Person, key: str, button: str) -> None:
 
 def test_two_people_meet_in_the_lobby_and_play_together(come: Any) -> None:
     ada = come("ada")
-    wait_for_text(ada.page, "#lobby-here", "You are the first of 2")
+    wait_for_text(ada.page, "#lobby-here", "You are the first of 2 people")
     bert = come("bert", narrow=True)
     for person in (ada, bert):
         person.wait_until_playing()
@@ -129,8 +129,8 @@ def test_two_people_meet_in_the_lobby_and_play_together(come: Any) -> None:
     # A phone whose screen is locked: the game is held, and goes on when its participant is back.
     with asleep(bert.page):
         ada.wait_for_title("Waiting for the other participant")
-        wait_for_text(ada.page, "#overlay-hint", "the game ends for everybody")
-    ada.wait_for_earlier_title("The game goes on")
+        wait_for_text(ada.page, "#overlay-hint", "the game will end for everyone")
+    ada.wait_for_earlier_title("The game is about to continue")
     for person in (ada, bert):
         person.wait_until_playing()
     # A reload in the game. The game is held unless the page is back before the server sees that it was gone.
@@ -192,7 +192,7 @@ def test_the_game_waits_for_a_participant_who_looks_at_another_tab(come: Any) ->
     theo.page.evaluate(LOOKS_AWAY, True)
     ida.wait_for_title("Waiting for the other participant")
     theo.page.evaluate(LOOKS_AWAY, False)
-    ida.wait_for_earlier_title("The game goes on")
+    ida.wait_for_earlier_title("The game is about to continue")
     for person in (ida, theo):
         person.wait_until_playing()
 
@@ -215,10 +215,10 @@ def test_two_tabs_and_a_reload_in_the_lobby_are_one_participant(come: Any) -> No
     second = eva.tab()
     second.goto(eva.link)
     for page in (eva.page, second):
-        wait_for_text(page, "#lobby-here", "You are the first of 2")
+        wait_for_text(page, "#lobby-here", "You are the first of 2 people")
         page.wait_for_timeout(2_500)
-        assert page.inner_text("#lobby-here") == "You are the first of 2"
-    assert "You have waited for 0" not in eva.page.inner_text("#lobby-clock")
+        assert page.inner_text("#lobby-here") == "You are the first of 2 people"
+    assert "Waiting time: 0" not in eva.page.inner_text("#lobby-clock")
     assert eva.page.inner_text("#lobby-note") == "", "the reload has not begun the waiting anew"
     otto = come("otto")
     otto.wait_until_playing()
@@ -256,7 +256,7 @@ def test_two_people_with_one_link_are_one_participant_and_the_last_page_plays(co
         hans.wait_for_title("Waiting for the other participant")
         # The other page's words are still true, and say how to get the game back.
         gwen.wait_for_title(ELSEWHERE)
-        assert gwen.page.inner_text("#overlay-hint") == "If you have closed it there, go on here."
+        assert gwen.page.inner_text("#overlay-hint") == "If you have closed it there, continue here."
         shot(gwen.page, "1280-two-players-elsewhere")
         gwen.page.locator("#overlay-button").click()
         hans.wait_until_playing()

@@ -109,7 +109,7 @@ def recorded(study: StudyProcess, session: str) -> list[dict[str, Any]]:
 
 def test_two_people_find_each_other_play_and_go_on(come: Come, study: StudyProcess, games: GamesToEnd) -> None:
     wide = come("ada", 1280)
-    wait_for_text(wide, "#lobby-here", "You are the first of 2")
+    wait_for_text(wide, "#lobby-here", "You are the first of 2 people")
     phone = come("bo", 360)
     for page in (wide, phone):
         page.wait_for_selector("#play:not([hidden])")
@@ -153,8 +153,8 @@ def test_a_participant_who_goes_away_is_waited_for_replaced_and_let_in_again(
         note_texts(wide, each)
     phone.goto("about:blank")
     wait_for_noted(wide, "#overlay-title", "Waiting for the other participant")
-    wait_for_noted(wide, "#overlay-hint", "a computer player takes their place")
-    wait_for_noted(wide, "#trouble", "A computer player has taken the place")
+    wait_for_noted(wide, "#overlay-hint", "a computer player will take their place")
+    wait_for_noted(wide, "#trouble", "A computer player has replaced")
     wide.wait_for_function(PLAYS)
     phone.goto(with_user(study.link, "di"))
     wait_for_noted(wide, "#trouble", "The other participant is back")
@@ -176,7 +176,7 @@ def test_a_participant_without_a_partner_goes_on_and_gets_another_completion_cod
 ) -> None:
     study = without_others
     page = come("ed", 360, study)
-    wait_for_text(page, "#lobby-then", "you go on to the next part of the study without this game")
+    wait_for_text(page, "#lobby-then", "you will continue with the next part of the study, without this game")
     page.wait_for_selector("body[data-step='4']")
     page.wait_for_selector("text=There was nobody to play with")
     page.get_by_label("Yes").check()

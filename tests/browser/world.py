@@ -187,7 +187,7 @@ def world() -> Iterator[World]:
                 time.sleep(here.slow)
                 self.reply(400 if here.closed else 200, "application/json", json.dumps(here.state), {})
             elif here.closed:
-                self.reply(404, "text/html; charset=utf-8", "<h1>There is no such study</h1>", {})
+                self.reply(404, "text/html; charset=utf-8", "<h1>Study not found</h1>", {})
             else:
                 page = here.page()
                 self.reply(200, "text/html; charset=utf-8", page.html, page.headers)

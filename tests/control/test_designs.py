@@ -108,10 +108,10 @@ def test_who_fails_the_check_twice_gets_the_ends_code_and_link(tmp_path: Path, p
     first = alice.get()
     alice.answer(first, soups="2", late="no")
     page = alice.get()
-    assert "One answer is not right yet. You have one try left." in page
+    assert "One answer is not correct yet. You have one attempt left." in page
     assert "<p>soups</p>" in page, "the page may say which"
     alice.answer(first, soups="3", late="no")
-    assert "One answer is not right yet." in alice.get(), "going back gives no further try"
+    assert "One answer is not correct yet." in alice.get(), "going back gives no further try"
     alice.answer(page, soups="4", late="yes")
     page = alice.get()
     assert "CS1" in page
@@ -446,7 +446,7 @@ def test_time_runs_out_between_the_tries_of_a_check_too(tmp_path: Path, platform
     times = study(config, tmp_path, platform)
     alice = times.visitor("alice")
     alice.answer(alice.get(), soups="2")
-    assert "One answer is not right yet." in alice.get()
+    assert "One answer is not correct yet." in alice.get()
     platform.wait(seconds=31)
     assert heading(alice.get()) == "Thanks"
     assert times.answers("alice")["quiz"] == {"soups": "2", "passed": False, "tries": 1, "outcome": "timeOver"}

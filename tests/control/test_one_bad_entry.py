@@ -64,7 +64,7 @@ def test_participants_of_other_projects_go_on(platform: FakePlatform, entry: Any
 def test_participants_of_an_unreadable_entry_see_that_the_study_is_out_of_order(platform: FakePlatform) -> None:
     spoil(platform, BROKEN["no steps"])
     status, text = page(platform, "alice", "broken")
-    assert (status, "out of order" in text) == (500, True)
+    assert (status, "temporarily unavailable" in text) == (500, True)
     assert page(platform, "alice", "never-was")[0] == 404
 
 

@@ -258,7 +258,7 @@ def test_a_broken_page_is_reported_once_with_its_name(project: Any, tmp_path: Pa
     folder = project(s3upload=False)
     (folder / "steps" / "after.html").write_text("<h1>After</h1>\n{{ nobody( }}")
     text = said(rehearsal(folder, "--bots", "2", "--play", "1", TMPDIR=str(tmp_path)))
-    assert text.count("This page is broken. ") + text.count("This page is broken It") == 1
+    assert text.count("This page cannot be shown. ") + text.count("This page cannot be shown It") == 1
     assert re.search(r"2 times: bot-\w+-1: status 500 on the page after step 3", text)
     assert re.search(r"\d times: step page broken \(file after, line 2\)", text)
     assert "none expected: config.yml says `s3upload: false`" in text

@@ -33,74 +33,79 @@ _PAGES = {
     "studyBy": "A study by {researcher}",
     "continue": "Continue",
     "send": "Send",
-    "saved": "Your answers are saved.",
+    "saved": "Your answers have been saved.",
     "sending": "Sending…",
     "stillSending": "Still sending… Please check your connection.",
-    "noReply": "Still no reply. Your answers are kept; you can press the button again.",
+    "noReply": "No reply yet. Your answers are still here; you can press the button again.",
     "offline": (
-        "You seem to be offline. Your answers are kept on this device; press the button again when you are back."
+        "You appear to be offline. Your answers are kept on this device. Press the button again when you are back "
+        "online."
     ),
-    "missing": "An answer is missing: “{question}”",
-    "lookAgain": "Please look at this answer again: “{question}”",
-    "tooLong": "Your answers are too long to be sent. Please tell whoever invited you.",
-    "shorten": "Your answers are too long to be sent. Please shorten the answer to “{question}”. Nothing is lost.",
+    "missing": "Please answer this question: “{question}”",
+    "lookAgain": "Please check this answer: “{question}”",
+    "tooLong": "Your answers are too long to send. Please contact the researchers who invited you.",
+    "shorten": "Your answers are too long to send. Please shorten your answer to “{question}”. Nothing has been lost.",
     "shortenBy": (
-        "Your answers are too long to be sent. Please shorten the answer to “{question}” by about {characters} "
-        "characters. Nothing is lost."
+        "Your answers are too long to send. Please shorten your answer to “{question}” by about {characters} "
+        "characters. Nothing has been lost."
     ),
-    "shortenLongest": "Your answers are too long to be sent. Please shorten the longest answer. Nothing is lost.",
+    "shortenLongest": "Your answers are too long to send. Please shorten your longest answer. Nothing has been lost.",
     "shortenLongestBy": (
-        "Your answers are too long to be sent. Please shorten the longest answer by about {characters} characters. "
-        "Nothing is lost."
+        "Your answers are too long to send. Please shorten your longest answer by about {characters} characters. "
+        "Nothing has been lost."
     ),
     "copy": "Copy",
     "copied": "Copied",
-    "wrongOne": "One answer is not right yet.",
-    "wrongSome": "{number} answers are not right yet.",
-    "tooSoon": "Please take your time: you can go on in {seconds} s.",
-    "triesOne": "You have one try left.",
-    "triesSome": "You have {number} tries left.",
+    "wrongOne": "One answer is not correct yet.",
+    "wrongSome": "{number} answers are not correct yet.",
+    "tooSoon": "Please take your time. You can continue in {seconds} s.",
+    "triesOne": "You have one attempt left.",
+    "triesSome": "You have {number} attempts left.",
     "endTitle": "Thank you",
-    "endText": "The study ends here for you.",
+    "endText": "This is the end of the study for you.",
     "endCode": "Your code:",
     "endLink": "Finish",
 }
 _WAITING = {
     "waitingForGame": "Waiting for the game",
-    "gettingReady": "Your game is getting ready",
+    "gettingReady": "Preparing your game",
     "startingAlone": (
-        "We are starting a computer for you alone. You need not do anything: the game appears on this page by itself."
+        "We are starting a game server just for you. You don’t need to do anything: the game will appear on this "
+        "page automatically."
     ),
     "startingTogether": (
-        "We are starting a computer for your game. You need not do anything: the game appears on this page by itself."
+        "We are starting the server for your game. You don’t need to do anything: the game will appear on this "
+        "page automatically."
     ),
-    "stageQueued": "Your request has been received",
-    "stageStarting": "A computer is starting for you",
-    "stageNaming": "The connection is being set up",
+    "stageQueued": "Request received",
+    "stageStarting": "Starting your game server",
+    "stageNaming": "Setting up the connection",
     "stageReady": "Ready to play",
-    "waiting": "Waiting for {time}.",
-    "usually": "Usually it takes about {time}.",
-    "takesLonger": "This takes longer than usual. Please stay on this page.",
+    "waiting": "Waiting time: {time}.",
+    "usually": "This usually takes about {time}.",
+    "takesLonger": "This is taking longer than usual. Please stay on this page.",
     "clockWrong": (
-        "Your device's clock is wrong, so it cannot connect: it should show {time}. Please set it right; we keep "
-        "trying."
+        "Your device’s clock is wrong, so your browser cannot connect. It should show {time}. Please correct it; we "
+        "will keep trying."
     ),
     "noConnection": (
-        "No connection – trying again… Your answers are kept. Please stay on this page: it continues by itself. "
-        "If this lasts for minutes, try another network, or tell whoever invited you to this study."
+        "No connection. Trying again… Your answers are safe. Please stay on this page; it will continue "
+        "automatically. If this lasts more than a few minutes, try another network or contact the researchers who "
+        "invited you."
     ),
     "needsScript": (
-        "The game needs JavaScript, which is switched off in this browser. "
-        "Please switch it on, or open your study link in another browser."
+        "The game needs JavaScript, which is turned off in this browser. Please turn it on, or open your study "
+        "link in another browser."
     ),
-    "movedTitle": "Your game starts on another computer",
+    "movedTitle": "Your game is moving to another server",
     "moved": (
-        "The previous computer has failed. This is not your fault. You need not do anything: the game appears on this "
-        "page by itself. What you have answered and played before is kept."
+        "The previous server stopped working. This is not your fault. You don’t need to do anything: the game "
+        "will appear on this page automatically. Your earlier answers and games are saved."
     ),
     "movedProgramTitle": "The connection to your game was lost",
     "movedProgram": (
-        "Your game goes on on another computer, which takes about a minute to start. Press the button to wait for it."
+        "Your game will continue on another server, which takes about a minute to start. Press the button to wait "
+        "for it."
     ),
     "second": "1 second",
     "seconds": "{seconds} seconds",
@@ -108,35 +113,35 @@ _WAITING = {
 }
 _ENDED = {
     "endedTitle": "The game has ended",
-    "failedTitle": "The game could not be started",
+    "failedTitle": "The game could not start",
     "lostTitle": "The game could not be played",
-    "fullTitle": "The study is full just now",
-    "stopped": "The computer for your game was switched off by the researchers.",
-    "deadline": "The time for it was over.",
-    "idle": "The game was not played for a while, or the time for it was over, so its computer switched itself off.",
-    "failed": "The computers that we tried for your game failed, or it could not begin on them. This is not your fault.",
-    "refused": "No computer for your game can be started as the study is set up. This is not your fault.",
-    "noCapacity": "There is no free computer for your game at the moment. This is not your fault.",
-    "full": "All places for this game are taken at the moment. This is not your fault.",
-    "computerGone": "Its computer is not there any more.",
-    "kept": "What you have answered and played before is kept.",
-    "tryLater": "Please try again in a few minutes, here or by opening your link later.",
-    "goOnWith": "With “{button}” you go on.",
-    "goOnBelow": "With the button below you go on.",
-    "without": "You can go on with the study without this game.",
-    "withoutOrAgain": "You can go on with the study without this game, or try once more.",
-    "goWithoutGame": "Go on without the game",
-    "contact": "The researchers can be reached here: {contact}",
-    "quote": "If you write to them, please name your id {user} and the code {code}.",
-    "tellIfAgain": "If this happens again, please tell whoever invited you to this study.",
-    "tell": "Please tell whoever invited you to this study.",
+    "fullTitle": "The study is full right now",
+    "stopped": "The researchers stopped the server for your game.",
+    "deadline": "The time limit was reached.",
+    "idle": "The game was inactive for too long, or its time limit was reached, so it was closed.",
+    "failed": "The game did not work on any of the servers we tried. This is not your fault.",
+    "refused": "A problem with the study’s setup prevents your game from starting. This is not your fault.",
+    "noCapacity": "No server is available for your game right now. This is not your fault.",
+    "full": "All places in this game are taken right now. This is not your fault.",
+    "computerGone": "The game server has stopped.",
+    "kept": "Your earlier answers and games are saved.",
+    "tryLater": "Please try again in a few minutes, here or with your study link.",
+    "goOnWith": "Press “{button}” to continue.",
+    "goOnBelow": "Press the button below to continue.",
+    "without": "You can continue the study without this game.",
+    "withoutOrAgain": "You can continue the study without this game, or try the game again.",
+    "goWithoutGame": "Continue without the game",
+    "contact": "You can contact the researchers here: {contact}",
+    "quote": "If you write to them, please include your ID {user} and the code {code}.",
+    "tellIfAgain": "If this happens again, please contact the researchers who invited you.",
+    "tell": "Please contact the researchers who invited you.",
     "tryAgain": "Try again",
     "startAgain": "Start again",
 }
 _GAME = {
     "game": "Game",
     "score": "Score",
-    "picture": "The game's picture",
+    "picture": "Game picture",
     "toRead": "To read",
     "loading": "Loading the game…",
     "pictures": "Pictures of the game",
@@ -148,10 +153,10 @@ _GAME = {
     "playing": "Playing",
     "pause": "Pause",
     "paused": "Paused",
-    "goOn": "Go on",
+    "goOn": "Resume",
     "end": "End the game",
-    "endConfirm": "End the game now? You cannot go on with it afterwards.",
-    "reset": "Begin again",
+    "endConfirm": "End the game now? You will not be able to return to it.",
+    "reset": "Restart",
     "good": "Good",
     "bad": "Bad",
     "trainOnline": "Train online",
@@ -166,10 +171,10 @@ _GAME = {
     "down": "Down",
     "space": "Space",
     "keyMove": "move",
-    "keyToggle": "start and pause",
+    "keyToggle": "start or pause",
     "keyStart": "start",
-    "keyPause": "pause and go on",
-    "keyReset": "begin again",
+    "keyPause": "pause or resume",
+    "keyReset": "restart",
     "keyGood": "good",
     "keyBad": "bad",
     "gameOf": "Game {game} of {games}",
@@ -177,7 +182,7 @@ _GAME = {
     "yourScore": "Your score: {score}",
     "totalScore": "Your total score in {games} games: {score}",
     "getReady": "Get ready",
-    "getReadyIn": "Get ready. The game begins in {time}.",
+    "getReadyIn": "Get ready. The game starts in {time}.",
     "timeLeft": "Time left",
     "secondsLeft": "{seconds} seconds left",
     "yourTurn": "Your turn",
@@ -185,70 +190,70 @@ _GAME = {
     "otherTurn": "The other player’s turn",
     "othersTurn": "The others’ turn",
     "youChose": "You chose “{action}”.",
-    "timeUp": "Time was up: “{action}” was chosen for you.",
-    "timeUpIdle": "Time was up; nothing was chosen for you.",
-    "timeUpEnds": "The time for a choice was up, so this game has ended.",
+    "timeUp": "Time ran out, so “{action}” was chosen for you.",
+    "timeUpIdle": "Time ran out, so no choice was made.",
+    "timeUpEnds": "Time ran out, so this game has ended.",
     "gameOver": "Game {game} of {games} is over",
-    "nextGameIn": "The next game begins in {time}.",
-    "goOnNow": "Go on now",
+    "nextGameIn": "The next game starts in {time}.",
+    "goOnNow": "Continue now",
     "instructions": "Instructions",
     "toGame": "Go to the game",
     "backToGame": "Back to the game",
     "nextGame": "Next game",
-    "hangs": "The connection hangs. Please stay on this page.",
-    "lost": "Connection lost – trying again…",
+    "hangs": "Your connection is slow. Please stay on this page.",
+    "lost": "Connection lost. Trying again…",
     "lostNote": (
-        "Your game is kept. Please stay on this page: it continues by itself. "
-        "If this lasts for minutes, try another network, or tell whoever invited you to this study."
+        "Your game is safe. Please stay on this page; it will continue automatically. If this lasts more than a "
+        "few minutes, try another network or contact the researchers who invited you."
     ),
-    "elsewhere": "The game was opened in another tab or on another device",
-    "elsewhereNote": "If you have closed it there, go on here.",
+    "elsewhere": "The game is open in another tab or on another device",
+    "elsewhereNote": "If you have closed it there, continue here.",
     "playHere": "Play here instead",
     "saving": "Saving your game…",
     "over": "The game is over",
     "thanksForPlaying": "Thank you for playing!",
-    "savedMoment": "Your game is saved. One moment, please…",
+    "savedMoment": "Your game is saved. Just a moment…",
     "savedOffline": (
-        "Your game is saved. No connection – trying again… Please stay on this page: it continues "
-        "by itself. If this lasts for minutes, try another network."
+        "Your game is saved. No connection. Trying again… Please stay on this page; it will continue "
+        "automatically. If this lasts more than a few minutes, try another network."
     ),
 }
 _LOBBY = {
     "lobbyTitleOther": "Waiting for another participant",
     "lobbyTitleOthers": "Waiting for other participants",
     "lobbyOther": (
-        "Two people play this game together. You need not do anything: the game begins on this page by itself. "
+        "This is a game for two people. You don’t need to do anything: it will start on this page automatically. "
         "Please stay on this page."
     ),
     "lobbyOthers": (
-        "{players} people play this game together. You need not do anything: the game begins on this page by itself. "
-        "Please stay on this page."
+        "This is a game for {players} people. You don’t need to do anything: it will start on this page "
+        "automatically. Please stay on this page."
     ),
-    "firstOf": "You are the first of {players}",
-    "hereWithYou": "{here} of {players} are here, you included",
+    "firstOf": "You are the first of {players} people",
+    "hereWithYou": "{here} of {players} people are here, including you",
     "countOf": "{here} of {players}",
-    "found": "Found",
-    "foundOther": "Found: another participant is here.",
-    "foundEnough": "Found: enough participants are here.",
-    "moment": "One moment, please…",
-    "waited": "You have waited for {time}.",
-    "lobbyAway": "You were away for a while, so your waiting time has begun again.",
-    "ifNobody": "If nobody else comes in the next {time}, {next}.",
-    "ifFew": "If not enough people come in the next {time}, {next}.",
-    "nobodyCame": "Nobody else has come, so {next}.",
-    "fewCame": "Not enough people have come, so {next}.",
-    "goWithout": "you go on to the next part of the study without this game",
-    "playComputer": "you play with a computer player instead",
-    "beginWithFew": "the game begins with those who are here, and computer players take the empty places",
-    "aloneWithOne": "Nobody else has come: you play with a computer player.",
-    "aloneWithSome": "Nobody else has come: you play with computer players.",
-    "takesPlace": "{here} of {players} are here, you included: a computer player takes the empty place.",
-    "takePlaces": "{here} of {players} are here, you included: computer players take the empty places.",
+    "found": "Match found",
+    "foundOther": "Another participant is here.",
+    "foundEnough": "Enough participants are here.",
+    "moment": "Just a moment…",
+    "waited": "Waiting time: {time}.",
+    "lobbyAway": "You were away for a while, so your waiting time has restarted.",
+    "ifNobody": "If nobody else joins within {time}, {next}.",
+    "ifFew": "If not enough people join within {time}, {next}.",
+    "nobodyCame": "Nobody else joined, so {next}.",
+    "fewCame": "Not enough people joined, so {next}.",
+    "goWithout": "you will continue with the next part of the study, without this game",
+    "playComputer": "you will play with a computer player instead",
+    "beginWithFew": "the game will start with those who are here, and computer players will fill the empty places",
+    "aloneWithOne": "Nobody else joined, so you will play with a computer player.",
+    "aloneWithSome": "Nobody else joined, so you will play with computer players.",
+    "takesPlace": "{here} of {players} people are here, including you. A computer player will fill the empty place.",
+    "takePlaces": "{here} of {players} people are here, including you. Computer players will fill the empty places.",
     "preparedTitle": "Your game is being prepared – {study}",
     "prepared": "Your game is being prepared.",
     "preparedHeading": "Your game is being prepared",
-    "playWith": "You play with {people}.",
-    "playWithBoth": "You play with {people} and {computers}.",
+    "playWith": "You will play with {people}.",
+    "playWithBoth": "You will play with {people} and {computers}.",
     "oneOther": "another participant",
     "someOthers": "{number} other participants",
     "oneComputer": "a computer player",
@@ -266,37 +271,44 @@ _TOGETHER = {
     "waitingForOthers": "Waiting for the other participants",
     "waitingForNames": "Waiting for {names}",
     "youWereAway": "You were away for a moment",
-    "begins": "The game begins",
-    "goesOn": "The game goes on",
-    "beginsWithAll": "The game begins as soon as everybody is here.",
-    "goesOnWithAll": "The game goes on as soon as everybody is here.",
-    "theyRead": "They have not gone on yet. The game begins in {time} at the latest.",
-    "absentEnds": "If they are not here in {time}, the game ends for everybody.",
-    "absentReplaced": "If they are not here in {time}, a computer player takes their place.",
-    "otherWaits": "The other participant waits for you. Please go on within {time}.",
-    "othersWait": "The other participants wait for you. Please go on within {time}.",
-    "otherReplaced": "A computer player has taken the place of the other participant.",
-    "replaced": "A computer player has taken the place of {name}.",
+    "begins": "The game is starting",
+    "goesOn": "The game is about to continue",
+    "beginsWithAll": "The game will start as soon as everyone is here.",
+    "goesOnWithAll": "The game will continue as soon as everyone is here.",
+    "theyRead": "They are still reading. The game will start in {time} at the latest.",
+    "absentEnds": "If they are not here within {time}, the game will end for everyone.",
+    "absentReplaced": "If they are not here within {time}, a computer player will take their place.",
+    "otherWaits": "The other participant is waiting for you. Please continue within {time}.",
+    "othersWait": "The other participants are waiting for you. Please continue within {time}.",
+    "otherReplaced": "A computer player has replaced the other participant.",
+    "replaced": "A computer player has replaced {name}.",
     "otherBack": "The other participant is back.",
     "back": "{name} is back.",
     "theirTurn": "{names}: their turn",
     "otherSees": (
-        "The other participant can see that you are away, and the game waits for a short while. "
-        "What you have played is kept. Please stay on this page. If this lasts, try another network."
+        "The other participant can see that you are away, and the game will wait for a short time. What you have "
+        "played so far is saved. Please stay on this page. If this lasts, try another network."
     ),
     "othersSee": (
-        "The other participants can see that you are away, and the game waits for a short while. "
-        "What you have played is kept. Please stay on this page. If this lasts, try another network."
+        "The other participants can see that you are away, and the game will wait for a short time. What you have "
+        "played so far is saved. Please stay on this page. If this lasts, try another network."
     ),
-    "endForAll": "End the game for everybody",
+    "endForAll": "End the game for everyone",
     "hasEnded": "The game has ended",
     "thanks": "Thank you!",
-    "youLeft": "You were away for too long, so the game has ended. What you have played is kept. Please go on.",
-    "otherLeft": (
-        "The other participant is not there any more, so the game has ended. This is not your fault. Please go on."
+    "youLeft": (
+        "You were away for too long, so the game has ended. What you have played so far is saved. Please continue "
+        "with the study."
     ),
-    "someLeft": "A participant is not there any more, so the game has ended. This is not your fault. Please go on.",
-    "tooSlow": "Your connection to the game is too slow to play with others. This is not your fault. Please go on.",
+    "otherLeft": (
+        "The other participant left, so the game has ended. This is not your fault. Please continue with the study."
+    ),
+    "someLeft": (
+        "Another participant left, so the game has ended. This is not your fault. Please continue with the study."
+    ),
+    "tooSlow": (
+        "Your connection is too slow to play with others. This is not your fault. Please continue with the study."
+    ),
 }
 _TALK = {
     "messages": "Messages",
@@ -392,30 +404,32 @@ IN_TALK = {
 NOT_IN_TALK = ("yourScore", "totalScore", "orArrow")
 """Texts that say nothing if the game is `talk`, which has neither scores nor arrows."""
 SAID_ALONE = {
-    "saidRoundFailed": "Something went wrong, so this game has ended. The next game begins.",
-    "saidRoundAgain": "This game could not go on where it was, so it begins again. The games before it are kept.",
-    "saidGameFailed": ("Something went wrong, so the game ends here. What you have played is kept."),
+    "saidRoundFailed": "Something went wrong, so this game has ended. You will continue with the next game.",
+    "saidRoundAgain": (
+        "This game could not be resumed, so it starts again from the beginning. Your earlier games are saved."
+    ),
+    "saidGameFailed": "Something went wrong, so the game ends here. What you have played so far is saved.",
 }
 SAID_TOGETHER = {
     "saidPartnerLeft": (
-        "Another participant has gone and has not come back, so the game ends here for all. "
-        "That is not your fault, and what you have played is kept. Please continue."
+        "Another participant left, so the game has ended for everyone. This is not your fault. What you have "
+        "played so far is saved. Please continue with the study."
     ),
     "saidPartnerStopped": (
-        "Another participant has ended the game, so it ends here for all. "
-        "That is not your fault, and what you have played is kept. Please continue."
+        "Another participant ended the game, so it is over for everyone. This is not your fault. What you have "
+        "played so far is saved. Please continue with the study."
     ),
     "saidPartnerMissing": (
-        "Another participant has not come, so the game cannot be played together. "
-        "That is not your fault. Please continue."
+        "Another participant did not join, so the game cannot be played. This is not your fault. Please continue "
+        "with the study."
     ),
     "saidLeft": (
-        "You were away for longer than the others could wait, so the game has ended for all. "
-        "What you have played is kept. Please continue."
+        "You were away for longer than the others could wait, so the game has ended for everyone. What you have "
+        "played so far is saved. Please continue with the study."
     ),
     "saidPing": (
-        "Your connection to the game is too slow for a game with others. That is not your fault: "
-        "it may be far from here, or shared with many. Please continue."
+        "Your connection is too slow to play with others. This is not your fault: the game server may be far "
+        "away, or others may be using your network. Please continue with the study."
     ),
 }
 SAID = SAID_ALONE | SAID_TOGETHER
@@ -423,29 +437,29 @@ SAID = SAID_ALONE | SAID_TOGETHER
 _LINKS = {
     "studyFull": "This study is full",
     "studyFullText": (
-        "All places are taken, and nothing has been kept of your visit. Thank you for your interest! "
-        "Now and then a place becomes free: you are welcome to come back later with the same link."
+        "All places are taken, and nothing about your visit has been saved. Thank you for your interest! A place "
+        "may become free: you are welcome to try the same link again later."
     ),
     "notSaved": "Your answers were not saved",
-    "notSavedText": "{why} Nothing is lost: go back.",
-    "formUnread": "What your browser sent could not be read.",
-    "formTooLong": "Your answers are too long to be sent: 256 KB is the most. Please shorten them.",
+    "notSavedText": "{why} Go back and try again; your answers are still there.",
+    "formUnread": "We could not read what your browser sent.",
+    "formTooLong": "Your answers are too long to send (the limit is 256 KB). Please shorten them.",
     "outdated": "This page is out of date",
     "outdatedText": "Please open your study link again.",
-    "whoAreYou": "Who are you?",
-    "whoAreYouText": "The link lacks its userId. Please open your study link again.",
-    "brokenLink": "This link is broken",
-    "brokenLinkText": "Please copy the whole link again from your invitation.",
-    "brokenId": "Its {field} should be 1 to 64 letters, digits, dashes or underscores.",
-    "byInvitation": "This study is by invitation",
-    "byInvitationText": "It needs the link of your own invitation. Please copy the whole link again from there.",
+    "whoAreYou": "This link is incomplete",
+    "whoAreYouText": "Your userId is missing from the link. Please open your study link again.",
+    "brokenLink": "This link does not work",
+    "brokenLinkText": "Please copy the whole link from your invitation again.",
+    "brokenId": "Its {field} must be 1 to 64 letters, digits, hyphens or underscores.",
+    "byInvitation": "This study is by invitation only",
+    "byInvitationText": "You need your personal link. Please copy the whole link from your invitation again.",
     "pageMissing": "This page is missing",
-    "pageMissingText": "It was not uploaded. Please tell whoever invited you.",
-    "pageBroken": "This page is broken",
-    "pageBrokenText": "It could not be shown. Please tell whoever invited you.",
+    "pageMissingText": "It was not uploaded. Please contact the researchers who invited you.",
+    "pageBroken": "This page cannot be shown",
+    "pageBrokenText": "It contains an error. Please contact the researchers who invited you.",
     "aStudy": "A study",
-    "preview": "This is a preview. Once you have accepted the task, the study opens here.",
-    "openInBrowser": "Open the link in a browser to take part.",
+    "preview": "This is a preview. The study will open here once you accept the task.",
+    "openInBrowser": "Please open the link in a browser to take part.",
 }
 
 GROUPS: Mapping[str, Mapping[str, str]] = {

@@ -95,7 +95,9 @@ class Journey:
             user_id = _verify_invitation(request, project, user_id, texts)
         if user_id is None:
             if request.wants_json:  # a program would follow a redirect, but not learn the new id from the page
-                raise PageError(400, "Who are you?", "The address lacks userId.", PROJECT_NOT_FOUND)
+                raise PageError(
+                    400, "This link is incomplete", "Your userId is missing from the link.", PROJECT_NOT_FOUND
+                )
             return http.found(request.url(userId=secrets.token_hex(12)))
         if request.method == "HEAD":
             return Response(200)
@@ -114,13 +116,17 @@ class Journey:
             status = 404 if request.query else 200
             raise PageError(status, "This is where studies run", text, PROJECT_NOT_FOUND)
         text = "The link may be misspelled, or the study may be over."
-        not_found = PageError(404, "There is no such study", text, PROJECT_NOT_FOUND)
+        not_found = PageError(404, "Study not found", text, PROJECT_NOT_FOUND)
         project_id = request.query_value("projectId")
         if project_id is None or not ids.is_project_id(project_id):
             raise not_found
         project = self._project_cache.live_project(project_id)
         if project is None and self._project_cache.is_unreadable(project_id):
-            raise PageError(500, "This study is out of order", "Please tell whoever invited you, and come back later.")
+            raise PageError(
+                500,
+                "This study is temporarily unavailable",
+                "Please try again later, or contact the researchers who invited you.",
+            )
         if project is None:
             raise not_found
         return project

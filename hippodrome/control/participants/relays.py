@@ -75,7 +75,7 @@ class Relays:
             return self._project_of_ticket(str(user_id), form), str(user_id)
         project = self._project_cache.live_project(str(project_id)) if ids.is_project_id(project_id) else None
         if project is None:
-            raise Refusal(404, "There is no such study.")
+            raise Refusal(404, "Study not found.")
         if not ids.is_user_id(user_id):
             raise Refusal(400, "userId should be 1 to 64 letters, digits, dashes or underscores.")
         return project, str(user_id)

@@ -123,6 +123,6 @@ def _nothing_here(method: str, accept: str) -> GatewayResponse:
     if method not in ("GET", "HEAD") or "text/html" not in accept:
         return _message(404, "Not Found")
     text = "Please open your study link again. It looks like /next?projectId=…"
-    page = frame.message_page("There is nothing here", text)
+    page = frame.message_page("Page not found", text)
     headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
     return GatewayResponse(404, [(name.lower(), value) for name, value in headers.items()], page.html.encode())

@@ -24,23 +24,24 @@ from hippodrome.trial.core.seeds import policy_seed
 from hippodrome.trial.core.unfinished import RecordedTrial
 
 PARTNER_LEFT = (
-    "Another participant has gone and has not come back, so the game ends here for all. "
-    "That is not your fault, and what you have played is kept. Please continue."
+    "Another participant left, so the game has ended for everyone. This is not your fault. What you have played "
+    "so far is saved. Please continue with the study."
 )
 PARTNER_STOPPED = (
-    "Another participant has ended the game, so it ends here for all. "
-    "That is not your fault, and what you have played is kept. Please continue."
+    "Another participant ended the game, so it is over for everyone. This is not your fault. What you have "
+    "played so far is saved. Please continue with the study."
 )
 PARTNER_MISSING = (
-    "Another participant has not come, so the game cannot be played together. That is not your fault. Please continue."
+    "Another participant did not join, so the game cannot be played. This is not your fault. Please continue "
+    "with the study."
 )
 LEFT = (
-    "You were away for longer than the others could wait, so the game has ended for all. "
-    "What you have played is kept. Please continue."
+    "You were away for longer than the others could wait, so the game has ended for everyone. What you have "
+    "played so far is saved. Please continue with the study."
 )
 PING = (
-    "Your connection to the game is too slow for a game with others. That is not your fault: "
-    "it may be far from here, or shared with many. Please continue."
+    "Your connection is too slow to play with others. This is not your fault: the game server may be far away, "
+    "or others may be using your network. Please continue with the study."
 )
 
 

@@ -75,9 +75,11 @@ from hippodrome.trial.core.timing import Due, Timing
 from hippodrome.trial.core.unfinished import RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.settings import TrialSettings
 
-EPISODE_FAILED = "Something went wrong, so this game has ended. The next game begins."
-EPISODE_BEGINS_AGAIN = "This game could not go on where it was, so it begins again. The games before it are kept."
-TRIAL_FAILED = "Something went wrong, so the game ends here. What you have played is kept."
+EPISODE_FAILED = "Something went wrong, so this game has ended. You will continue with the next game."
+EPISODE_BEGINS_AGAIN = (
+    "This game could not be resumed, so it starts again from the beginning. Your earlier games are saved."
+)
+TRIAL_FAILED = "Something went wrong, so the game ends here. What you have played so far is saved."
 
 
 class Phase(Enum):

@@ -11,7 +11,7 @@ export const overlays = {
   lost: { title: TEXT.lost, note: TEXT.lostNote },
   elsewhere: { title: TEXT.elsewhere, button: TEXT.playHere, note: TEXT.elsewhereNote },
   ended: { title: TEXT.saving, aside: true },
-  over: { title: TEXT.over, button: TEXT.goOn, aside: true },
+  over: { title: TEXT.over, button: TEXT.continue, aside: true },
 };
 
 // Shows the overlay with that name; no overlay for names without one, such as "playing".

@@ -72,7 +72,7 @@ hooks.overlay.push((name) => {
   else if (reading && name !== "lost") closeText();
 });
 
-if (texts.between) overlays.break.button = TEXT.goOn;
+if (texts.between) overlays.break.button = TEXT.continue;
 find("overlay").append(again);
 find("reading").append(trouble);
 again.addEventListener("click", () => openText("instructions", TEXT.backToGame));

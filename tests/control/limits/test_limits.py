@@ -242,7 +242,7 @@ def test_beyond_max_servers_no_server_starts_and_the_page_says_so_until_there_is
     assert (record(platform).state, record(platform).reason) == (ServerState.CLOSED, Reason.FULL)
     assert set(platform.timers.due) == {ids.server_name(ids.server_label("maze", "bob"), 1)}
     page = alice.get()
-    assert "The study is full just now" in page
+    assert "The study is full right now" in page
     state = json.loads(alice.get(accept="application/json"))
     assert (state["state"], state["reason"], state["again"], state["attempt"]) == ("failed", "full", True, 1)
     assert platform.bus.sent == []  # a moment ago there was no room

@@ -505,8 +505,8 @@ def test_a_program_whose_game_is_over_gets_a_page_that_asks_for_another_server(
     platform.tasks.fail = [Refused("no")]
     Servers(platform).start(StartServer("maze", "alice"))
     page = program(alice)["page"]
-    assert "The game could not be started" in page
-    assert "With the button below you go on." in page
+    assert "The game could not start" in page
+    assert "Press the button below to continue." in page
     platform.bus.sent.clear()
     assert program(alice, hidden(page))["page"] == "wait"
     assert platform.bus.sent == [(Topic.START, {"projectId": "maze", "userId": "alice", "attempt": 2})]

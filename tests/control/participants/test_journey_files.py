@@ -217,7 +217,7 @@ def test_a_page_that_is_missing_or_broken_says_so(platform: FakePlatform) -> Non
     alice = Browser(platform)
     for file in ("consent-0", "consent-1"):
         platform.documents.put(f"maze/steps/{file}.html", b"{{ 1 / 0 }}")
-    assert (alice.send()["statusCode"], "This page is broken" in alice.send()["body"]) == (500, True)
+    assert (alice.send()["statusCode"], "This page cannot be shown" in alice.send()["body"]) == (500, True)
     bob = Browser(installed_without_pages(), "projectId=maze&userId=bob")
     assert (bob.send()["statusCode"], "This page is missing" in bob.send()["body"]) == (500, True)
 

@@ -300,7 +300,7 @@ def test_members_whose_game_ends_after_the_study_is_closed_get_the_same_answer_a
     alone_platform.documents.put(answer_key("maze", "ann", "3"), b"{}")
     said, polled = told_of(alone), alone.poll(address_of_one)
     assert said[0] == 404
-    assert "There is no such study" in said[1]
+    assert "Study not found" in said[1]
     place.use(platform)
     assert [told_of(player) for player in (ann, bob)] == [said, said]
     assert [player.poll(address) for player, address in zip((ann, bob), addresses, strict=True)] == [polled, polled]
@@ -344,7 +344,7 @@ def test_the_page_of_a_pair_stays_that_of_a_pair_when_another_number_is_register
         page, data = ann.get(), ann.data
         assert (data["players"], data["state"]["players"], data["state"]["members"]) == (2, 2, 2)
         assert data["absentEnds"]
-        assert "Two people play this game together." in page
+        assert "This is a game for two people." in page
         assert ann.poll()["players"] == 2
         serve(platform)
 
@@ -365,7 +365,7 @@ def test_a_participant_in_the_lobby_gets_the_new_number_of_players_by_page_and_p
     register_three(platform)
     assert ann.poll()["players"] == 3
     assert (ann.data["players"], ann.data["absentEnds"]) == (3, False)
-    assert "3 people play this game together." in ann.get()
+    assert "This is a game for 3 people." in ann.get()
 
 
 def test_a_missing_page_that_the_pairs_earlier_registration_named_is_left_out(platform: FakePlatform) -> None:

@@ -178,7 +178,7 @@ def test_the_final_page_has_a_form_only_if_it_has_questions() -> None:
     assert ">Send</button>" in asking
     saved = Elements(step("<h1>Bye</h1><p>{{ completion_code }}</p><input name=a>", at=4, answered=True).html)
     assert not saved.named("form")
-    assert "Your answers are saved" in saved.text
+    assert "Your answers have been saved" in saved.text
     assert "CODE" in saved.text
     assert "disabled" in saved.named("fieldset")[0]
 
@@ -392,7 +392,7 @@ def test_the_lobby_names_how_many_others_it_waits_for() -> None:
 def test_the_page_of_a_game_for_several_has_its_own_text_and_style() -> None:
     together, alone = game(project=TOGETHER).html, game().html
     assert ("Your game is being prepared" in together, "Your game is being prepared" in alone) == (True, False)
-    assert ("Your game is getting ready" in together, "Your game is getting ready" in alone) == (False, True)
+    assert ("Preparing your game" in together, "Preparing your game" in alone) == (False, True)
     style = together.split("<style>\n")[1].split("</style>")[0]
     assert style.startswith(frame.style("game"))
     assert "#people" in style.removeprefix(frame.style("game"))
@@ -452,12 +452,15 @@ def test_a_participant_whose_game_failed_reads_how_to_go_on_and_whom_to_ask() ->
     project = msgspec.structs.replace(PROJECT, contact="study@example.org <b>")
     failed: dict[str, Any] = {"state": "failed", "reason": Reason.LOST, "without": True}
     code = ids.completion_code(PROJECT.secret, "P1", "failed")
-    for again, way in ((True, "without this game, or try once more."), (False, "with the study without this game.")):
+    for again, way in (
+        (True, "without this game, or try the game again."),
+        (False, "continue the study without this game."),
+    ):
         text = Elements(game(project=project, again=again, **failed).html).text
         assert way in text
-        assert "The researchers can be reached here: study@example.org <b>" in text
-        assert f"your id P1 and the code {code}." in text
-    assert "Please tell whoever invited you to this study." in Elements(game(**failed).html).text
+        assert "You can contact the researchers here: study@example.org <b>" in text
+        assert f"your ID P1 and the code {code}." in text
+    assert "Please contact the researchers who invited you." in Elements(game(**failed).html).text
 
 
 @pytest.mark.parametrize("reason", [*Reason, None])
@@ -465,15 +468,15 @@ def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> 
     state = "failed" if reason in FAILURES else "ended"
     _, over = game(state=state, reason=reason, again=True).html.split('<section id="over"')
     text = Elements(f"<section {over}").text
-    assert ("The time for it was over." in text) is (reason == Reason.DEADLINE)
-    assert ("switched off by the researchers" in text) is (reason == Reason.STOPPED)
-    assert ("The game was not played for a while" in text) is (reason == Reason.ENDED)
+    assert ("The time limit was reached." in text) is (reason == Reason.DEADLINE)
+    assert ("researchers stopped the server" in text) is (reason == Reason.STOPPED)
+    assert ("The game was inactive for too long" in text) is (reason == Reason.ENDED)
     assert ("not your fault" in text) is (state == "failed")
-    assert ("no free computer" in text) is (reason == Reason.NO_CAPACITY)
-    assert "What you have answered and played before is kept." in text
+    assert ("No server is available" in text) is (reason == Reason.NO_CAPACITY)
+    assert "Your earlier answers and games are saved." in text
     button = "Try again" if state == "failed" else "Start again"
-    later = "Please try again in a few minutes, here or by opening your link later."
-    advice = later if reason in (Reason.NO_CAPACITY, Reason.FULL) else f"With “{button}” you go on."
+    later = "Please try again in a few minutes, here or with your study link."
+    advice = later if reason in (Reason.NO_CAPACITY, Reason.FULL) else f"Press “{button}” to continue."
     assert advice in text
     assert advice not in Elements(game(state=state, reason=reason).html).text
 
@@ -482,9 +485,9 @@ def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> 
     ("reason", "title", "report"),
     [
         (Reason.LOST, "The game could not be played", True),
-        (Reason.FULL, "The study is full just now", False),
-        (Reason.REFUSED, "The game could not be started", True),
-        (Reason.NO_CAPACITY, "The game could not be started", False),
+        (Reason.FULL, "The study is full right now", False),
+        (Reason.REFUSED, "The game could not start", True),
+        (Reason.NO_CAPACITY, "The game could not start", False),
         (Reason.DEADLINE, "The game has ended", False),
     ],
 )
@@ -494,20 +497,20 @@ def test_the_page_of_a_closed_server_says_what_happened_and_whom_to_tell(
     state = "failed" if reason in FAILURES else "ended"
     again = game(state=state, reason=reason, again=True).html
     assert f'<h1 id="over-title">{title}</h1>' in again
-    assert ("If this happens again, please tell" in again) is report
-    assert "Please tell whoever invited you" not in again
+    assert ("If this happens again, please contact" in again) is report
+    assert "Please contact the researchers who invited you." not in again
     last = game(state=state, reason=reason).html
     assert "If this happens again" not in last
-    assert "Please tell whoever invited you" in last
+    assert "Please contact the researchers who invited you." in last
 
 
 @pytest.mark.parametrize(
     ("reason", "words"),
     [
-        ("lost", "failed, or it could not begin on them"),
-        ("refused", "as the study is set up"),
-        ("full", "All places for this game are taken"),
-        ("unheard of", "Its computer is not there any more."),
+        ("lost", "did not work on any of the servers"),
+        ("refused", "A problem with the study’s setup"),
+        ("full", "All places in this game are taken"),
+        ("unheard of", "The game server has stopped."),
     ],
 )
 def test_each_reason_has_its_sentence(reason: str, words: str) -> None:
@@ -518,7 +521,7 @@ def test_each_reason_has_its_sentence(reason: str, words: str) -> None:
 def test_the_button_of_a_closed_server_names_what_it_does(state: str, says: str) -> None:
     page = game(state=state, again=True, without=True).html
     buttons = re.findall(r'<button type="submit" name="hippodrome-action" value="(\w+)">(.*)</button>', page)
-    assert buttons == [("without", "Go on without the game"), ("restart", says)]
+    assert buttons == [("without", "Continue without the game"), ("restart", says)]
 
 
 @pytest.mark.parametrize("replaces", [False, True])

@@ -65,7 +65,7 @@ def test_the_modules_of_such_pages_are_in_no_other_game_page(platform: FakePlatf
     assert "reading-button" not in game_page(installed())
 
 
-@pytest.mark.parametrize(("source", "title"), [("", "This page is missing"), ("{% if %}", "This page is broken")])
+@pytest.mark.parametrize(("source", "title"), [("", "This page is missing"), ("{% if %}", "This page cannot be shown")])
 def test_a_page_that_cannot_be_shown_gets_an_error_page(source: str, title: str) -> None:
     platform = with_pages(STUDY, pause=source)
     try:

@@ -72,7 +72,7 @@ def test_a_program_that_previews_a_link_sees_the_study_and_begins_nothing(platfo
     for query in (LINK, "projectId=maze"):
         page = Browser(platform, query).get(user_agent=agent)
         assert "A maze" in page
-        assert "Open the link in a browser" in page
+        assert "open the link in a browser" in page
         assert "<form" not in page
         assert not re.search("agree|alice", page)
     assert untouched(platform)
@@ -168,7 +168,7 @@ def test_a_visitor_without_a_valid_signature_gets_nothing(closed: FakePlatform, 
 def test_a_link_with_a_wrong_signature_is_said_to_be_broken(closed: FakePlatform) -> None:
     answer = Browser(closed, f"{LINK}&signature=x").send()
     assert answer["statusCode"] == 403
-    assert "This link is broken" in answer["body"]
+    assert "This link does not work" in answer["body"]
 
 
 def test_a_link_without_an_id_is_refused_and_no_id_is_made(closed: FakePlatform) -> None:

@@ -132,7 +132,7 @@ def test_other_requests_are_not_found(site: Site, method: str, path: str) -> Non
 def test_an_unknown_address_gets_an_error_page(site: Site) -> None:
     answer = site.http.get("/nothing", headers={"accept": "text/html,*/*"})
     assert (answer.status_code, answer.headers["content-type"]) == (404, "text/html; charset=utf-8")
-    assert "There is nothing here" in answer.text
+    assert "Page not found" in answer.text
     assert site.events == []
     event = site.event("GET", "/next/?projectId=p")
     assert (event["rawPath"], event["requestContext"]["http"]["path"]) == ("/next", "/next")

@@ -368,7 +368,7 @@ def test_an_episode_whose_replay_differs_begins_again_with_its_seed():
     driver.reset()
     controls, words = sent(driver.connect())
     assert controls["episode"] == 2
-    assert "begins again" in words["error"]
+    assert "starts again" in words["error"]
     assert driver.records("error") == []
 
 
