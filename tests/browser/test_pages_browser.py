@@ -901,13 +901,13 @@ def test_participants_may_change_the_frame_rate_if_the_project_lets_them(world: 
     world.trial = {"allowFrameRateChange": True}
     world.controls = {"UI": ["start", "fpsSet", "fpsUp", "fpsDown"], "allowFrameRateChange": True}
     play(world, tab)
-    assert tab.inner_text(".rates output") == "30 per second"
+    assert tab.inner_text(".rates output") == "30 frames per second"
     tab.click("[data-command=faster]")
     world.wait_for({"changeFrameRate": "faster"})
     tab.fill("#rate", "12")
     world.wait_for({"changeFrameRate": 12})
     tell(world, state="playing", frameRate=12)
-    tab.wait_for_selector(".rates output:text-is('12 per second')")
+    tab.wait_for_selector(".rates output:text-is('12 frames per second')")
 
 
 @pytest.mark.parametrize(

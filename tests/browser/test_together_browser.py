@@ -406,7 +406,7 @@ def test_turn_by_turn_the_page_says_whose_turn_it_is(group: World, tab: Any) -> 
     start_game(group, tab)
     there = presence(red="here", green="here")
     tell(group, state="playing", toAct=False, turnOf=["green"], **there)
-    tab.wait_for_selector("#turn:text-is('Green: their turn')")
+    tab.wait_for_selector("#turn:text-is('Turn: Green')")
     tell(group, state="playing", toAct=True, turnOf=["blue"], **there)
     tab.wait_for_selector("#turn:text-is('Your turn')")
 

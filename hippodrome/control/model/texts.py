@@ -36,7 +36,7 @@ _PAGES = {
     "saved": "Your answers have been saved.",
     "sending": "Sending…",
     "stillSending": "Still sending… Please check your connection.",
-    "noReply": "No reply yet. Your answers are still here; you can press the button again.",
+    "noReply": "The server has not replied yet. Your answers are still here; you can press the button again.",
     "offline": (
         "You appear to be offline. Your answers are kept on this device. Press the button again when you are back "
         "online."
@@ -164,7 +164,7 @@ _GAME = {
     "slower": "Slower",
     "faster": "Faster",
     "speed": "Speed",
-    "perSecond": "{rate} per second",
+    "perSecond": "{rate} frames per second",
     "up": "Up",
     "left": "Left",
     "right": "Right",
@@ -191,7 +191,7 @@ _GAME = {
     "othersTurn": "The others’ turn",
     "youChose": "You chose “{action}”.",
     "timeUp": "Time ran out, so “{action}” was chosen for you.",
-    "timeUpIdle": "Time ran out, so no choice was made.",
+    "timeUpIdle": "Time ran out before you chose.",
     "timeUpEnds": "Time ran out, so this game has ended.",
     "gameOver": "Game {game} of {games} is over",
     "nextGameIn": "The next game starts in {time}.",
@@ -284,7 +284,7 @@ _TOGETHER = {
     "replaced": "A computer player has replaced {name}.",
     "otherBack": "The other participant is back.",
     "back": "{name} is back.",
-    "theirTurn": "{names}: their turn",
+    "theirTurn": "Turn: {names}",
     "otherSees": (
         "The other participant can see that you are away, and the game will wait for a short time. What you have "
         "played so far is saved. Please stay on this page. If this lasts, try another network."
@@ -447,7 +447,7 @@ _LINKS = {
     "outdated": "This page is out of date",
     "outdatedText": "Please open your study link again.",
     "whoAreYou": "This link is incomplete",
-    "whoAreYouText": "Your userId is missing from the link. Please open your study link again.",
+    "whoAreYouText": "Your participant ID (userId) is missing from the link. Please open your study link again.",
     "brokenLink": "This link does not work",
     "brokenLinkText": "Please copy the whole link from your invitation again.",
     "brokenId": "Its {field} must be 1 to 64 letters, digits, hyphens or underscores.",

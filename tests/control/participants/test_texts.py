@@ -147,7 +147,7 @@ def test_the_page_gets_texts_for_messages_of_servers_only_if_the_study_has_its_o
         ("say(TEXT.start);", {}, 'say("Start");'),
         ("say(TEXT.seconds(left));", {}, "say(`${left} seconds`);"),
         ("say(TEXT.gameOver(f(a, [b, c]), { d }));", {}, "say(`Game ${f(a, [b, c])} of ${{ d }} is over`);"),
-        ('say(TEXT.theirTurn(names.join(", ")));', {}, 'say(`${names.join(", ")}: their turn`);'),
+        ('say(TEXT.theirTurn(names.join(", ")));', {}, 'say(`Turn: ${names.join(", ")}`);'),
         ("say(`${TEXT.start}: ${TEXT.seconds(a)}!`);", {}, "say(`Start: ${a} seconds!`);"),
         ("say(TEXT.ifNobody(TEXT.seconds(a), TEXT.goWithout));", {"goWithout": "b", "ifNobody": "{next}"}, 'say(`${"b"}`);'),
         ("say(TEXT.gameOf(a, b));", {"gameOf": "{games}: {game}, {game}"}, "say(`${b}: ${a}, ${a}`);"),
