@@ -208,7 +208,7 @@ def test_a_button_on_the_last_picture_opens_the_page_between_two_games(world_wit
     world_with_pages.wait_for({"command": "start"})
     before = len(world_with_pages.player_commands())
     tell(world_with_pages, state="break")
-    tab.click("#overlay-button:text('Resume')")
+    tab.click("#overlay-button:text('Continue')")
     tab.wait_for_selector("text=Have a rest")
     assert world_with_pages.player_commands()[before:] == []
 
