@@ -80,9 +80,7 @@ def test_the_lobby_says_how_many_wait_for_how_long_and_what_happens_then(
     assert tab.inner_text("#lobby-here") == "You are the first of 2 people"
     wait_for_text(tab, "#lobby-clock", "Waiting time: 4")
     wait_for_text(tab, "#lobby-then", "If nobody else joins within 4 min ")
-    assert tab.inner_text("#lobby-then").endswith(
-        "you will continue with the next part of the study, without this game."
-    )
+    assert tab.inner_text("#lobby-then").endswith("you will continue without this game.")
     assert tab.locator(".stages:visible, .clock:visible").count() == 1
     assert tab.evaluate("document.documentElement.scrollWidth") <= width
     assert tab.evaluate(FLAWS) == []

@@ -176,7 +176,7 @@ def test_a_participant_without_a_partner_goes_on_and_gets_another_completion_cod
 ) -> None:
     study = without_others
     page = come("ed", 360, study)
-    wait_for_text(page, "#lobby-then", "you will continue with the next part of the study, without this game")
+    wait_for_text(page, "#lobby-then", "you will continue without this game")
     page.wait_for_selector("body[data-step='4']")
     page.wait_for_selector("text=There was nobody to play with")
     page.get_by_label("Yes").check()

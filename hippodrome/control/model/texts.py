@@ -70,12 +70,10 @@ _WAITING = {
     "waitingForGame": "Waiting for the game",
     "gettingReady": "Preparing your game",
     "startingAlone": (
-        "We are starting a game server just for you. You don’t need to do anything: the game will appear on this "
-        "page automatically."
+        "We are starting a game server just for you. Please wait: the game will appear on this page automatically."
     ),
     "startingTogether": (
-        "We are starting the server for your game. You don’t need to do anything: the game will appear on this "
-        "page automatically."
+        "We are starting the server for your game. Please wait: the game will appear on this page automatically."
     ),
     "stageQueued": "Request received",
     "stageStarting": "Starting your game server",
@@ -99,8 +97,8 @@ _WAITING = {
     ),
     "movedTitle": "Your game is moving to another server",
     "moved": (
-        "The previous server stopped working. This is not your fault. You don’t need to do anything: the game "
-        "will appear on this page automatically. Your earlier answers and games are saved."
+        "The previous server stopped working. This is not your fault. Please wait: the game will appear on this "
+        "page automatically. Your earlier answers and games are saved."
     ),
     "movedProgramTitle": "The connection to your game was lost",
     "movedProgram": (
@@ -221,14 +219,8 @@ _GAME = {
 _LOBBY = {
     "lobbyTitleOther": "Waiting for another participant",
     "lobbyTitleOthers": "Waiting for other participants",
-    "lobbyOther": (
-        "This is a game for two people. You don’t need to do anything: it will start on this page automatically. "
-        "Please stay on this page."
-    ),
-    "lobbyOthers": (
-        "This is a game for {players} people. You don’t need to do anything: it will start on this page "
-        "automatically. Please stay on this page."
-    ),
+    "lobbyOther": "This is a game for two people. Please stay on this page: the game will start automatically.",
+    "lobbyOthers": "This is a game for {players} people. Please stay on this page: the game will start automatically.",
     "firstOf": "You are the first of {players} people",
     "hereWithYou": "{here} of {players} people are here, including you",
     "countOf": "{here} of {players}",
@@ -242,7 +234,7 @@ _LOBBY = {
     "ifFew": "If not enough people join within {time}, {next}.",
     "nobodyCame": "Nobody else joined, so {next}.",
     "fewCame": "Not enough people joined, so {next}.",
-    "goWithout": "you will continue with the next part of the study, without this game",
+    "goWithout": "you will continue without this game",
     "playComputer": "you will play with a computer player instead",
     "beginWithFew": "the game will start with those who are here, and computer players will fill the empty places",
     "aloneWithOne": "Nobody else joined, so you will play with a computer player.",
