@@ -508,7 +508,7 @@ def test_the_page_of_a_closed_server_says_what_happened_and_whom_to_tell(
     ("reason", "words"),
     [
         ("lost", "did not work on any of the servers"),
-        ("refused", "A problem with the study’s setup"),
+        ("refused", "setup prevents your game from starting"),
         ("full", "All places in this game are taken"),
         ("unheard of", "The game server has stopped."),
     ],
