@@ -63,6 +63,12 @@ def command(
         ),
     ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin without data; earlier data are moved aside.")] = False,
+    fake_model: Annotated[
+        bool,
+        typer.Option(
+            "--fake-model", help="Let a stand-in answer instead of the language model, even if LLM_KEY is set."
+        ),
+    ] = False,
     starter: Annotated[
         int | None, typer.Option(help="End the study when the process with this id has ended.", hidden=True)
     ] = None,
@@ -95,7 +101,7 @@ def command(
             "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses.",
             exit_code=Exit.MISUSE,
         )
-    new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names)
+    new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names, fake_model=fake_model)
     try:
         _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study, starter=starter)
     except files.InUse as error:

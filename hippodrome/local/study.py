@@ -19,6 +19,7 @@ from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend.authority import Authority
 from hippodrome.local.backend.platform import LocalPlatform
 from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.stand_in import StandIn
 from hippodrome.local.watch import Watch
 from hippodrome.local.web.access import TLS_NAMES
 from hippodrome.local.web.app import App
@@ -49,11 +50,13 @@ class Study:
         origins: Collection[str] = (),
         tls: bool = False,
         names: str | None = None,
+        fake_model: bool = False,
     ) -> None:
         """Publish the project in `folder` and take a port. Raises `NotPublished`, `NoPort`, and OSError.
 
         With `tls`, pages are served by https, and servers have names below localhost. `names` ("hash" or "userId") says
-        how servers are named; None: as the project says.
+        how servers are named; None: as the project says. With `fake_model`, a stand-in answers in the place of the
+        study's language model also if there is a key.
         """
         self._data = data
         self._state = state
@@ -75,6 +78,8 @@ class Study:
         )
         installed.use(self._platform)
         self._config = self._platform.publish()
+        self._stand_in = StandIn(always=fake_model)
+        self._stand_in.use(self._config, activity_log.warn)
         next_step_at = own_cells.OwnCells(self._platform, FUNCTIONS["next_step"]).handler
         app = App({**FUNCTIONS, "next_step": next_step_at}, activity_log.warn, origins)
         site = self._authority.context("localhost", HOST, *sorted(TLS_NAMES)) if self._authority else None
@@ -107,12 +112,14 @@ class Study:
         if self._names is not None:
             self._names.close()
         self._platform.close()
+        self._stand_in.close()
         self._activity_log.close()
         self._activity_log.show(f"Ended. The data are in {self._data}.")
 
     def _published(self, changed: Config) -> None:
         self._activity_log.set_steps(step.key for step in changed.steps)
         installed.use(self._platform)  # the functions forget the pages that they have cached
+        self._stand_in.use(changed, self._activity_log.warn)
         if not changed.project.live:
             self._activity_log.warn(_NOT_LIVE)
 

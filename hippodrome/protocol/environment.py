@@ -67,6 +67,9 @@ LLM_KEY = "LLM_KEY"
 """A secret: the key of the language model that `trial.llm` names. On AWS the task definition says where Fargate reads
 it; on one machine it is in the environment of `hippodrome run`."""
 
+LLM_URL = "LLM_URL"
+"""On one machine: the address of a stand-in for the language model, which takes the place of `trial.llm.url`."""
+
 # For tests and slow agents
 
 IDLE_SECONDS = "IDLE_SECONDS"
@@ -90,7 +93,7 @@ ASSIGNMENT_SECONDS = "ASSIGNMENT_SECONDS"
 """Seconds after which a server without participants looks again for the document that names them (its handover, or its
 session's document); 20 by default."""
 
-SECRETS = (TOKEN, CREDENTIAL)
+SECRETS = (TOKEN, CREDENTIAL, LLM_KEY)
 PARTICIPANT = (USER_ID, GROUP)
 
 

@@ -95,6 +95,10 @@ class TrialSettings:
     recordings_first_seconds: float = 120.0
     stop_seconds: float = 30.0
     credential: str = field(default="", repr=False)
+    llm_key: str = field(default="", repr=False)
+    """The key of the language model; empty if it needs none, or on a server without one."""
+    llm_url: str = ""
+    """The address of a stand-in for the language model; empty for `trial.llm.url`."""
     warm_server_seconds: float = 20.0
     plain_origins: frozenset[str] = frozenset()
     """The origins whose pages need no token (plainClients)."""
@@ -106,6 +110,11 @@ class TrialSettings:
         A warm server and a session's server without members learn it later.
         """
         return not self.warm_server and (not self.session or bool(self.members))
+
+    @property
+    def asks_model(self) -> bool:
+        """Whether some game of the study may ask a language model."""
+        return self.trial.llm is not None or (self.has_assignment and bool(self.llm_key or self.llm_url))
 
     @property
     def seats(self) -> Mapping[str, int]:
@@ -179,6 +188,8 @@ class TrialSettings:
             stop_seconds=max(15.0, _number(env, variables.STOP_SECONDS, 30.0)),
             warm_server_seconds=_number(env, variables.ASSIGNMENT_SECONDS, 20.0),
             plain_origins=frozenset() if warm_server or session else frozenset(origins),
+            llm_key=env.get(variables.LLM_KEY, "").strip(),
+            llm_url=env.get(variables.LLM_URL, "").strip(),
             credential=_required(env, variables.CREDENTIAL) if "://" in store else "",
         )
 

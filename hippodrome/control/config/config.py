@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -89,6 +89,13 @@ class Config:
     def game_steps(self) -> tuple[StepFiles, ...]:
         """The steps that take place on the participant's server: game steps."""
         return tuple(step for step in self.steps if step.type.on_server)
+
+    @property
+    def models(self) -> list[Mapping[str, Any]]:
+        """The sections `llm` of the study's games, at all levels; empty if no game has a language model."""
+        own = [section.trial for step in self.design.steps for section in step.sections]
+        given = (section.get("llm") for section in (self.trial.registered(), *own))
+        return [section for section in given if section]
 
     @property
     def groups(self) -> int:

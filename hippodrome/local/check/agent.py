@@ -24,6 +24,7 @@ from hippodrome.local.check import waiting
 from hippodrome.local.check.agent_report import AgentReport
 from hippodrome.local.check.earlier_answers import EarlierAnswers
 from hippodrome.local.inherited import inherited_environment
+from hippodrome.local.stand_in import StandIn
 from hippodrome.protocol import environment as variables
 from hippodrome.protocol.handover import Handover
 from hippodrome.trial.server import process_group
@@ -70,9 +71,14 @@ def _try(
     """Let the agent play in one group. Return its report and the exit status of its process."""
     environment = _environment(folder, config, place, seconds, group)
     environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
+    stand_in = StandIn(always=True, env=environment)
+    stand_in.use(config)
     code = layout.agent_folder(folder).resolve()
     report_now = partial(AgentReport, folder, config, place, seconds, group)
-    status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
+    try:
+        status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
+    finally:
+        stand_in.close()
     return report_now(), status
 
 

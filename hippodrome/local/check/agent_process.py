@@ -26,12 +26,15 @@ from hippodrome.protocol import handover
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.session import MAX_PLAYERS, SessionDocument, is_session_id
 from hippodrome.protocol.trial import TrialSection
+from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.trial.agent import environments, match
 from hippodrome.trial.agent.agent import AgentAdapter, AgentError
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.agent.starting import start
 from hippodrome.trial.core.players import Player, who_plays
+from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
+from hippodrome.trial.llm.ledger import Ledger, Moment
 from hippodrome.trial.pictures import assets
 from hippodrome.trial.pictures.assets import Assets
 from hippodrome.trial.pictures.reader import PictureReader
@@ -70,6 +73,8 @@ def _try(report: Path, deadline: Deadline) -> None:
     folder = Path(os.environ[variables.AGENT_DIR])
     config = trial_section(json.loads(os.environ[variables.TRIAL]))
     progress = AgentProgress(report, folder, _EarlyEnviron.lines, deadline)
+    if config.llm is not None:
+        _ask_stand_in(config.llm)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
     given = _handover()
     group = given.group if given else _group()
@@ -120,6 +125,13 @@ def _try(report: Path, deadline: Deadline) -> None:
         _note_idle(joint, players, config, progress)
         if game.begin_each(games[1:], set_game) and game.close():
             progress.over()
+
+
+def _ask_stand_in(section: LlmSection) -> None:
+    """Let the agent reach the stand-in for the language model as it reaches the model on a server."""
+    endpoint = Endpoint("", os.environ.get(variables.LLM_URL, ""))
+    endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), Moment))
+    os.environ.update(endpoint.environment())
 
 
 def _match(adapter: AgentAdapter, question: dict[str, Any], progress: AgentProgress) -> None:

@@ -17,7 +17,7 @@ import typer
 from hippodrome.console.arguments import StudyFolder
 from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
 from hippodrome.local import requirements
-from hippodrome.local.check import agent, agent_file
+from hippodrome.local.check import agent, agent_file, model_cost
 from hippodrome.local.check.project import check_project
 from hippodrome.local.study_folder import must_hold_study
 
@@ -55,6 +55,8 @@ def command(
         _print(tried)
         found += tried
     sys.stdout.write(f"{_summary(found, config)}\n")
+    if config and (cost := model_cost.sentence(config)):
+        sys.stdout.write(f"{cost}\n")
     if strict and found and not _mistakes(found):
         sys.stdout.write("With --strict, remarks count as mistakes.\n")
     raise typer.Exit(1 if _mistakes(found) or (strict and found) else 0)

@@ -135,7 +135,9 @@ def _bar(console: Console, bots: int) -> Iterator[Callable[[Sequence[BotReport]]
 
 
 @contextlib.contextmanager
-def _running(folder: Path, data: Path, changed: bool, console: Console) -> Iterator[StudyProcess]:
+def _running(
+    folder: Path, data: Path, changed: bool, console: Console, *, real_llm: bool = False
+) -> Iterator[StudyProcess]:
     """Run the study, or a copy of it in which bots can end the game if `changed`. Nothing runs afterwards."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
         place = Path(temporary)
@@ -143,7 +145,7 @@ def _running(folder: Path, data: Path, changed: bool, console: Console) -> Itera
         if changed and (changes := copy_of(folder, project)):
             words = " and ".join(changes)
             console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
-        study = StudyProcess(project, data, log=place / "local.log")
+        study = StudyProcess(project, data, log=place / "local.log", real_llm=real_llm)
         try:
             study.start()
             yield study
@@ -267,6 +269,10 @@ def command(
     url: Annotated[
         str | None, typer.Option(help="The link of a study that runs already, on this machine only.")
     ] = None,
+    real_llm: Annotated[
+        bool,
+        typer.Option("--real-llm", help="Ask the study's language model, which costs money, instead of a stand-in."),
+    ] = False,
 ) -> None:
     """Send simulated participants through the whole study, and check that everything that they do arrives.
 
@@ -286,7 +292,8 @@ def command(
         place = data if link else _data_of_bots(folder, config.project.id, data)
         if ends and not place:
             raise StudyNotStarted("With --url, --ends also needs --data: it reads there which cell a bot got.")
-        with _running(folder, place, play > 0, console) if place and not link else contextlib.nullcontext() as study:
+        running = _running(folder, place, play > 0, console, real_llm=real_llm) if place and not link else None
+        with running or contextlib.nullcontext() as study:
             fine = _rehearse_and_report(
                 folder,
                 config,

@@ -61,7 +61,9 @@ class StudyProcess:
     If this process ends in whatever way, the study ends, too.
     """
 
-    def __init__(self, folder: Path, data: Path, *, log: Path | None = None) -> None:
+    def __init__(self, folder: Path, data: Path, *, log: Path | None = None, real_llm: bool = False) -> None:
+        """With `real_llm`, the study asks its language model if there is a key, and no stand-in."""
+        self._model = [] if real_llm else ["--fake-model"]
         self.folder, self.data = folder.resolve(), data.resolve()
         self.log = log or data.resolve().parent / f"{data.name}.log"
         self.link = ""
@@ -78,7 +80,16 @@ class StudyProcess:
         with self.log.open("ab") as log:
             begin = log.tell()
             self._process = self._begin(
-                [str(self.folder), "--port", "0", "--data", str(self.data), "--starter", str(os.getpid())],
+                [
+                    str(self.folder),
+                    "--port",
+                    "0",
+                    "--data",
+                    str(self.data),
+                    "--starter",
+                    str(os.getpid()),
+                    *self._model,
+                ],
                 env={**places.for_child(os.environ), "PYTHONUNBUFFERED": "1", "COLUMNS": "200"},
                 stdout=log,
                 stderr=subprocess.STDOUT,

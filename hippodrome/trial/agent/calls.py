@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from hippodrome.trial.agent.agent import AgentAdapter, StepResult
@@ -21,6 +22,7 @@ from hippodrome.trial.core.effects import (
 from hippodrome.trial.core.ended import Episode
 from hippodrome.trial.core.message_log import Word
 from hippodrome.trial.core.players import ACTION_MASK, PLAYER, View
+from hippodrome.trial.llm.ledger import Moment
 from hippodrome.trial.recordings import recording
 
 log = logging.getLogger("trial")
@@ -40,6 +42,8 @@ class Calls:
         self._record_observations = record_observations
         self.callbacks: Callbacks | None = None
         """The agent's callbacks, if it has any."""
+        self.moment = Moment()
+        """When in the game the agent is now. Any thread may read it."""
         self._warned_of: set[str] = set()
         self._cut = False  # whether a value of an info was too large in the previous line
 
@@ -49,12 +53,15 @@ class Calls:
         Raises what the researcher's code raises, and Diverged if a replay differs from the recording.
         """
         if isinstance(call, StepCall):
-            return self._step(call)
+            taken = self._step(call)
+            self._stepped()
+            return taken
         if isinstance(call, FeedbackCall):
             return self._end(call)
         if isinstance(call, ResetCall):
             if self.callbacks:
                 self.callbacks.session_begins()
+            self.moment = Moment(call.episode)
             return self._reset(call)
         assert isinstance(call, ReplayCall)
         return self._replay(call)
@@ -72,15 +79,21 @@ class Calls:
         """Give the agent a word of feedback. Return the player whose human sent it."""
         raise NotImplementedError
 
+    def _stepped(self) -> None:
+        """Note that a step is over, also for whatever the agent has called in it."""
+        self.moment = replace(self.moment, step=self.moment.step + 1)
+
     def _replay(self, call: ReplayCall) -> Replayed:
-        if not self.callbacks:
-            return self._take_again(call)
-        self.callbacks.session_begins()
-        self.callbacks.replaying = True
+        if self.callbacks:
+            self.callbacks.session_begins()
+            self.callbacks.replaying = True
+        self.moment = Moment(call.unfinished.number, replaying=True)
         try:
             return self._take_again(call)
         finally:
-            self.callbacks.replaying = False
+            self.moment = replace(self.moment, replaying=False)
+            if self.callbacks:
+                self.callbacks.replaying = False
 
     def _give_feedback(self, call: FeedbackCall) -> None:
         for word in call.feedback:
@@ -203,6 +216,7 @@ class AgentCalls(Calls):
                 raise Diverged("the environment plays differently now")
             if self.callbacks:
                 self._tell_step(action, result)
+            self._stepped()
             info = result.info
         return Replayed(self._agent.render(), self._view(info))
 

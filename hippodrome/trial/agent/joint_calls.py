@@ -179,6 +179,7 @@ class JointCalls(Calls):
                 raise Diverged("the environment plays differently now")
             if self.callbacks:
                 self._tell_step(taken, joint)
+            self._stepped()
             observed.add(number, joint)
             self._ended = _ended(joint)
         return Replayed(self._agent.pictures(), self._view(joint), observed.by_player)

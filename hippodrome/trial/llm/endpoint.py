@@ -43,6 +43,13 @@ class Tape(Protocol):
         """Add a record, on any thread."""
 
 
+class NoTape:
+    """A tape that keeps nothing."""
+
+    def add(self, record: dict[str, Any]) -> None:
+        """Forget the record."""
+
+
 @dataclass(slots=True)
 class Game:
     """The game whose calls are made now. `now` says when in the game it is."""

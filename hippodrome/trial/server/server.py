@@ -32,6 +32,7 @@ from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import AgentTimeout
 from hippodrome.trial.core.messages import BadMessage, CloseConnection, CommandRefused, NotAMessage
 from hippodrome.trial.core.players import PlayersError
+from hippodrome.trial.llm.endpoint import Endpoint
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.recordings.spool import Spool, store_file
 from hippodrome.trial.recordings.store import Store, open_store, short_error
@@ -90,6 +91,7 @@ class TrialServer:
         self._admission: Admission
         self._connections: dict[Connection, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._endpoint = Endpoint(settings.llm_key, settings.llm_url) if settings.asks_model else None
         self._watchers = watch.Watchers()
         self._watching = 0  # the number of programs that watch
 
@@ -97,6 +99,8 @@ class TrialServer:
         """Serve until the last trial is over, no participant comes, the deadline passes, or `end` is called."""
         settings = self.settings
         log.addFilter(IdFilter(lambda: self.settings.private))
+        if self._endpoint is not None:
+            os.environ.update(self._endpoint.environment())  # before agent.py is imported
         self._lifetime = Lifetime(settings, saving=self._is_saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
@@ -142,7 +146,10 @@ class TrialServer:
         for task in self._tasks:
             task.cancel()
         self._listener.close("the trial is done" if reason == "done" else "the server is going away")
-        await asyncio.gather(*(each.close(self.settings.stop_seconds - STORE_MARGIN) for each in self._trials))
+        seconds = self.settings.stop_seconds - STORE_MARGIN
+        if self._endpoint is not None and reason != "done":  # otherwise the next server would pay again for these calls
+            self._in_background(asyncio.to_thread(self._endpoint.close, seconds - TAPE_SECONDS))
+        await asyncio.gather(*(each.close(seconds) for each in self._trials))
         if not self._agent_ready.done():
             self._agent_ready.cancel()
         if not self._worker.busy:
