@@ -44,6 +44,8 @@ from hippodrome.trial.core.messages import Message
 from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
 from hippodrome.trial.core.trial import Trial
+from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
+from hippodrome.trial.llm.ledger import Ledger
 from hippodrome.trial.policies.places import Places
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.recordings.recorder import Recorder
@@ -72,9 +74,13 @@ class TrialLoop:
         store: Store,
         spool: Spool,
         watchers: Watchers,
+        endpoint: Endpoint | None = None,
         assets: Sequence[Mapping[str, Any]] = (),
     ) -> None:
-        """`assets` describe the images of a game that is drawn by objects (`Assets.table`)."""
+        """`assets` describe the images of a game that is drawn by objects (`Assets.table`).
+
+        `endpoint`: the way to the language model, if some game of the study may ask one.
+        """
         self.core = Trial(
             settings, step, trial_id=uuid.uuid4().hex, new_seed=lambda: secrets.randbelow(2**31), assets=assets
         )
@@ -87,6 +93,7 @@ class TrialLoop:
         self._worker = worker
         self._watchers = watchers
         self._store = store
+        self._endpoint = endpoint
         self._recorder = Recorder(settings, step, self.core.id, store, spool)
         self._calls: Calls
         self._callbacks = TrialCallbacks(
@@ -206,6 +213,7 @@ class TrialLoop:
         by_player = {player: given[user_id] for user_id, player in playing.places.items()}
         earlier = by_player if self.settings.session else given[self.settings.user_id]
         self._calls = self._calls_of(started, playing, earlier)
+        self._use_model()
         self._action_starts = started.agent.action_starts
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
         self._use_callbacks(started, playing.players, earlier)
@@ -320,6 +328,16 @@ class TrialLoop:
 
     def _call(self, call: Call) -> None:
         self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._call_ended, call))
+
+    def _use_model(self) -> None:
+        """Let the agent ask the game's language model from now on, if the game has one."""
+        if self._endpoint is None:
+            return
+        section = self.settings.trial.llm
+        if section is None:
+            self._endpoint.play(None)
+            return
+        self._endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), lambda: self._calls.moment))
 
     def _use_callbacks(self, started: StartedAgent, players: Sequence[Player], earlier: Mapping[str, Any]) -> None:
         """If the agent has callbacks, call them from now on."""

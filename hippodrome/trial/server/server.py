@@ -147,8 +147,9 @@ class TrialServer:
             task.cancel()
         self._listener.close("the trial is done" if reason == "done" else "the server is going away")
         seconds = self.settings.stop_seconds - STORE_MARGIN
-        if self._endpoint is not None and reason != "done":  # otherwise the next server would pay again for these calls
-            self._in_background(asyncio.to_thread(self._endpoint.close, seconds - TAPE_SECONDS))
+        if self._endpoint is not None and reason != "done":  # or the next server would pay for the same calls again
+            await asyncio.to_thread(self._endpoint.close, seconds / 2)
+            seconds /= 2
         await asyncio.gather(*(each.close(seconds) for each in self._trials))
         if not self._agent_ready.done():
             self._agent_ready.cancel()
@@ -373,6 +374,7 @@ class TrialServer:
             store=self._store,
             spool=self._spool,
             watchers=self._watchers,
+            endpoint=self._endpoint,
             assets=self._drawing.assets.table(),
         )
         self._trials.append(trial)
