@@ -13,7 +13,7 @@ from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol.keys import NAME
 from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.trial_llm import LlmSection
-from hippodrome.protocol.trial_sections import SceneSection, Ui
+from hippodrome.protocol.trial_sections import ChatSection, SceneSection, Ui, chat
 from hippodrome.protocol.values import KeyPath, Plain, number_in, show
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
@@ -416,6 +416,16 @@ class TrialSection(Section):
         kind="section of your own keys",
         example="{difficulty: 3}",
     )
+    chat: ChatSection | None = keyed.key(
+        chat,
+        None,
+        "Participants talk to each other, or to your agent; see [talk.md](talk.md). `chat: true` is all defaults.",
+        {"anyOf": [{"type": "boolean"}, {"$ref": "#/$defs/ChatSection"}]},
+        section=ChatSection,
+        kind="section, or `true`",
+        otherwise="nobody talks",
+        example="{with: [ai]}",
+    )
 
     @property
     def between_seconds(self) -> float:
@@ -505,9 +515,9 @@ class TrialSection(Section):
         return keyed.document(self)
 
     def registered(self) -> dict[str, Any]:
-        """Return the section as a registration stores it: as `document`, without SESSION_KEYS and `llm` if they have
-        their default values, since ECS limits the length of a server's variables."""
-        defaults, left_out = TrialSection().document(), (*SESSION_KEYS, "llm")
+        """Return the section as a registration stores it: as `document`, without SESSION_KEYS, `chat` and `llm` if they
+        have their default values, since ECS limits the length of a server's variables."""
+        defaults, left_out = TrialSection().document(), (*SESSION_KEYS, "chat", "llm")
         return {key: each for key, each in self.document().items() if key not in left_out or each != defaults[key]}
 
 

@@ -12,6 +12,7 @@ from hippodrome.protocol import values
 from hippodrome.protocol.players import GYM_PLAYER
 from hippodrome.protocol.similar import did_you_mean
 from hippodrome.protocol.trial import TrialSection
+from hippodrome.protocol.trial_sections import AI
 from hippodrome.protocol.values import SectionProblem
 
 
@@ -108,6 +109,27 @@ def _model(trial: TrialSection) -> Iterator[SectionProblem]:
             yield SectionProblem(("llm", key), f"missing; write {example}", ("llm",))
 
 
+def _chat(trial: TrialSection) -> Iterator[SectionProblem]:
+    """Participants can say something, each phrase may be said, and who is `first` talks."""
+    chat = trial.chat
+    if chat is None:
+        return
+    if not chat.typing and not chat.phrases:
+        sentence = "nobody could say anything: write phrases too, or leave typing out"
+        yield SectionProblem(("chat", "typing"), sentence, ("chat",))
+    for index, phrase in enumerate(chat.phrases):
+        if len(phrase) > chat.max_length:
+            sentence = f"has {len(phrase)} characters, and maxLength is {chat.max_length}"
+            yield SectionProblem(("chat", "phrases", index), sentence, ("chat",))
+    players = trial.named_players()
+    talk = (*players, *(chat.partners or (AI,)))
+    if chat.first is not None and (players or chat.partners) and chat.first not in talk:
+        hint = did_you_mean(chat.first, talk) or f"; there are {values.printable(', '.join(talk), 100)}"
+        yield SectionProblem(
+            ("chat", "first"), f"nobody is called {values.show(chat.first)}{hint}", ("chat", "players")
+        )
+
+
 RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _frame_rates,
     _criterion,
@@ -117,4 +139,5 @@ RULES: tuple[Callable[[TrialSection], Iterator[SectionProblem]], ...] = (
     _programs,
     _substitute,
     _model,
+    _chat,
 )

@@ -1,4 +1,4 @@
-"""The sections `ui` and `scene` in `trial` of config.yml: the page's controls, and how a game is drawn by objects."""
+"""Sections in `trial` of config.yml: `ui`, the page's controls; `scene`, a game drawn by objects; `chat`, who talks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol import values
-from hippodrome.protocol.section_keys import Section
+from hippodrome.protocol.section_keys import Section, map_of
 from hippodrome.protocol.values import MAX_NAME, KeyPath, SectionProblem, checked, is_blank
 
 RESERVED_CONTROLS = frozenset({"toggle", "faster", "slower", "requestUI"})
@@ -128,4 +128,78 @@ class SceneSection(Section):
     pixel_art: bool = keyed.flag(False, "Whether images keep hard edges when they are made larger.")
     assets: str = keyed.text(
         "assets", "The project's folder with the images that sprites show.", _folder, kind="a folder of the project"
+    )
+
+
+MAX_LINE = 1000
+"""The most characters of a line that a participant says, whatever the project allows."""
+MAX_PHRASES = 100
+AI = "ai"
+"""The name for which the agent speaks, unless `with` has another that no participant plays."""
+
+_names_shown = map_of(str, values.text("what participants read", MAX_NAME), MAX_PHRASES)
+_SPEAKER = values.text("the name of a player, or of who speaks for the agent", MAX_NAME)
+
+
+def chat(value: object) -> object:
+    """Check that this is the section `chat`; `true` is a section with the default of each key, and `false` is none."""
+    try:
+        return {} if values.flag(value) else None
+    except ValueError:
+        return values.section("with: [ai]")(value)
+
+
+@dataclass(frozen=True, slots=True)
+class ChatSection(Section):
+    """The section `chat`: what participants type, and read, beside the game (docs/talk.md)."""
+
+    partners: tuple[str, ...] = keyed.items(
+        "name",
+        20,
+        _SPEAKER,
+        (),
+        "To whom participants talk: players of the environment, or another name, for which your agent "
+        "speaks. Two participants read each other if one of them is named.",
+        name="with",
+        single=True,
+        kind="list of names",
+        otherwise="the other participants; `ai` if there are none",
+        example="[ai]",
+    )
+    max_length: int = keyed.whole(1, MAX_LINE, 500, "The most characters of a participant's line.", example="200")
+    turns: str = keyed.choice(
+        ("free", "alternate"),
+        "`free`: everybody speaks at any time. `alternate`: one after the other, one line each.",
+        example="alternate",
+    )
+    typing: bool = keyed.flag(
+        True, "Whether participants may type. If not, they have the `phrases` alone.", example="false"
+    )
+    phrases: tuple[str, ...] = keyed.items(
+        "phrase",
+        MAX_PHRASES,
+        values.text("a phrase", MAX_LINE),
+        (),
+        "Lines that have a button.",
+        kind="list of texts",
+        otherwise="none",
+        example='["Need onions", "Wait!"]',
+    )
+    first: str | None = keyed.key(
+        _SPEAKER,
+        None,
+        "Who speaks first. If it is the agent's name, its [`reply`](callbacks.md#talk) is asked for a "
+        'first line, with the text `""`.',
+        {"type": "string"},
+        kind="a name of `with`, or a player",
+        otherwise="with `alternate` the first player, else anybody",
+        example="ai",
+    )
+    names: dict[str, str] = keyed.texts(  # noqa: RUF009 - it returns a field
+        "ai: Robo",
+        "What participants read instead of these names.",
+        _names_shown,
+        kind="a map: the name and a text of at most 64 letters",
+        otherwise="`playerNames`, or the names",
+        example="{ai: Robo}",
     )

@@ -80,14 +80,14 @@ def test_without_players_the_environment_says_who_plays() -> None:
 
 def test_a_registration_leaves_out_what_only_games_of_several_need_if_it_has_its_default_value() -> None:
     assert accepted().registered() == {
-        key: value for key, value in accepted().document().items() if key not in (*SESSION_KEYS, "llm")
+        key: value for key, value in accepted().document().items() if key not in (*SESSION_KEYS, "chat", "llm")
     }
     given = {"substitute": "random", "absent": 31, "gather": 121, "afterAbsent": "policy", "countdown": 4}
     given |= {"maxPing": 1, "pingSamples": 6, "playerNames": {"red": "The red one"}}
     assert set(given) == set(SESSION_KEYS)
     registered = accepted(**given).registered()
     assert {key: registered[key] for key in given} == given
-    assert set(registered) | {"llm"} == set(accepted().document())
+    assert set(registered) == set(accepted().document()) - {"chat", "llm"}
 
 
 # Controls

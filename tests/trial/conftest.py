@@ -169,6 +169,10 @@ class Client(TakesMessages):
         self.scene = SceneDecoder()
         self.assets: dict[int, bytes] = {}
         self.jpegs: list[dict[str, Any]] = []
+        self.lines: dict[int, dict[str, Any]] = {}
+        self.turn: str | None = None
+        self.typing: dict[str, bool] = {}
+        self.refused: list[dict[str, Any]] = []
 
     async def say(self, **message: Any) -> None:
         await self.websocket.send(json.dumps(message))
@@ -212,9 +216,21 @@ class Client(TakesMessages):
             self.done = message
         elif "frame" in message:
             self.jpegs.append(message)
+        elif "lines" in message:
+            self.lines |= {line["n"]: line for line in message["lines"]}
+            self.turn = message.get("turn", self.turn)
+        elif "typing" in message:
+            self.typing |= message["typing"]
+        elif "refused" in message:
+            self.refused.append(message["refused"])
         else:
             self.state = message
             self.states.append(message["state"])
+
+    async def read(self, count: int) -> list[tuple[str, str]]:
+        """Take messages until `count` lines are said and complete; return who said what."""
+        await self.until(lambda: len(self.lines) >= count and not any(line.get("more") for line in self.lines.values()))
+        return [(self.lines[n]["by"], self.lines[n]["text"]) for n in sorted(self.lines)]
 
     async def wait_until_heard(self) -> None:
         """Return when the server has read all messages so far. The picture after the next one shows a later step."""

@@ -18,7 +18,7 @@ import numpy as np
 from hippodrome.protocol import server_modules
 from hippodrome.protocol.similar import nearest
 from hippodrome.trial.agent import callbacks, environments, import_path, signatures
-from hippodrome.trial.agent.callback_names import FEEDBACK
+from hippodrome.trial.agent.callback_names import FEEDBACK, TALK
 from hippodrome.trial.agent.hippo_config import hippo_config
 from hippodrome.trial.agent.signatures import Signature, UnfitSignature
 from hippodrome.trial.core.players import PLAYER
@@ -200,6 +200,11 @@ class AgentAdapter:
     def callbacks(self) -> Mapping[str, Callable[..., Any]]:
         """The callbacks that the agent has, once it has started."""
         return callbacks.listening(self._agent)
+
+    @property
+    def talk(self) -> Mapping[str, Callable[..., Any]]:
+        """The methods `reply` and `moderate` that the agent has, once it has started."""
+        return callbacks.listening(self._agent, TALK)
 
     @property
     def env(self) -> Any:

@@ -12,6 +12,10 @@ JOIN = "on_join"
 LEAVE = "on_leave"
 RETURN = "on_return"
 FORM = "on_form"
+REPLY = "reply"
+MODERATE = "moderate"
+TALK = (REPLY, MODERATE)
+"""Methods for what is said (`replies.py`). They run on threads of their own."""
 NAMES = (
     SESSION_START,
     SESSION_END,

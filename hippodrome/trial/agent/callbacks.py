@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from hippodrome.trial.agent.callback_names import (
     SESSION_START,
     TICK,
 )
+from hippodrome.trial.agent.replies import NoChat, TalkOfAgent
 from hippodrome.trial.core.players import PLAYER
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recorded_values import text_of
@@ -78,6 +79,19 @@ class Session:
     env: Any
     record: Record
     """`record(name, value)` writes the value into the recording, under this name."""
+    options: Mapping[str, Any]
+    """The section `options` of the trial, with its factors filled in."""
+    say: Callable[..., None]
+    """`say(text, to=None, by=None)` says a line to all, or to the players `to`; `by` is the name of who says it."""
+    ask: Callable[..., str]
+    """`ask(text, **parameters)` asks the model of `llm`, and returns its answer."""
+    _lines: Callable[[], list[dict[str, Any]]] = field(repr=False)
+
+    @property
+    def talk(self) -> list[dict[str, Any]]:
+        """The lines so far, in order, each with `by`, `text`, `episode` and `step`; in `reply`, those that the player
+        has read, the last of which is the line to answer."""
+        return self._lines()
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +122,9 @@ class _EpisodeState:
     scores: dict[str, float] = field(default_factory=dict)
 
 
-def listening(agent: Any) -> dict[str, Callable[..., Any]]:
-    """Return the callbacks that an agent (an object or a module) has."""
-    found = {name: getattr(agent, name, None) for name in NAMES}
+def listening(agent: Any, names: Collection[str] = NAMES) -> dict[str, Callable[..., Any]]:
+    """Return the callbacks of these names that an agent (an object or a module) has."""
+    found = {name: getattr(agent, name, None) for name in names}
     return {name: method for name, method in found.items() if callable(method)}
 
 
@@ -133,8 +147,12 @@ class Callbacks:
         failed: Callable[[str, BaseException], None],
         hide: Callable[[str], str] = str,
         late: Callable[[int], None] = lambda recorded: None,
+        talk: TalkOfAgent | None = None,
     ) -> None:
+        """`talk`: what the agent needs to talk, if anybody talks in this game."""
         self._found = found
+        self._talks = talk is not None
+        self._talk = talk or TalkOfAgent()
         self.facts = facts
         self._env = env
         self._seconds = seconds
@@ -148,7 +166,7 @@ class Callbacks:
         """The name of the first callback that took longer than `seconds`."""
 
     def __bool__(self) -> bool:
-        return bool(self._found)
+        return bool(self._found) or self._talks
 
     @property
     def busy(self) -> bool:
@@ -242,13 +260,25 @@ class Callbacks:
         if arguments and len(self.facts.humans) > 1:  # the callback is about one of several participants
             where["player"] = arguments[0]
         call = _Call(self._notes, name, where)
-        session = self._session(call)
+        session = self._session(call, None)
         returned = self._thread.run(name, lambda: call.run(method, session, arguments), self._seconds)
         if not returned and self.first_late is None:
             self.first_late = name
 
-    def _session(self, call: _Call) -> Session:
-        facts, now = self.facts, self._now
+    def session_of(self, name: str, player: str) -> Session:
+        """Return the session for a call of `reply` or `moderate` about a player's line. For any thread."""
+        now = self._now
+        where = {"episode": now.episode, "step": now.ticks}
+        return self._session(_Call(self._notes, name, where, lambda: self._late(self.recorded)), player)
+
+    def talk_failed(self, name: str, error: Exception) -> None:
+        """Record and log the error of `reply` or `moderate`. For the event loop's thread."""
+        self._notes.failed(name, error, episode=self._now.episode, step=self._now.ticks)
+        self._late(self.recorded)
+
+    def _session(self, call: _Call, player: str | None) -> Session:
+        """Return the session for a call. `player`: whose talk it has; None for all."""
+        facts, now, talk = self.facts, self._now, self._talk
         return Session(
             trial=facts.trial,
             step=facts.step,
@@ -269,6 +299,10 @@ class Callbacks:
             answers=facts.answers,
             env=self._env(),
             record=_discard if self.replaying else call.record,
+            options=talk.options,
+            say=_discard if self.replaying else talk.say or _nobody,
+            ask=talk.ask,
+            _lines=lambda: talk.lines(player),
         )
 
 
@@ -287,6 +321,7 @@ class _Notes:
         self._lines: deque[bytes] = deque()
         self._taken = 0
         self._warnings: set[str] = set()
+        self._adding = threading.Lock()  # several threads record
         self.recorded = 0
         self.skipped = 0
 
@@ -296,9 +331,11 @@ class _Notes:
         return [self._lines.popleft() for _ in range(count)]
 
     def add(self, **fields: Any) -> None:
-        if len(self._lines) < _MAX_WAITING:
-            self._lines.append(recording.line("callback", **self._stamp(), **fields))
-            self.recorded += 1
+        line = recording.line("callback", **self._stamp(), **fields)
+        with self._adding:
+            if len(self._lines) < _MAX_WAITING:
+                self._lines.append(line)
+                self.recorded += 1
 
     def once(self, text: str) -> bool:
         """Return whether this text is new. After MAX_VALUES different texts, no text counts as new."""
@@ -318,8 +355,12 @@ class _Notes:
 class _Call:
     """One call of a callback, and the values that it records."""
 
-    def __init__(self, notes: _Notes, name: str, where: Mapping[str, Any]) -> None:
+    def __init__(
+        self, notes: _Notes, name: str, where: Mapping[str, Any], recorded: Callable[[], None] = lambda: None
+    ) -> None:
+        """`recorded` is called after each value."""
         self._notes = notes
+        self._recorded = recorded
         self._name = name
         self._where = where
         self._bytes_left = recording.MAX_EXTRA_BYTES
@@ -354,6 +395,7 @@ class _Call:
             text = "what %s records as %r is too large for the recording (%d bytes); its size is recorded instead"
             log.warning(text, self._name, name, size)
         notes.add(**self._where, name=name, callback=self._name, value=kept[name])
+        self._recorded()
 
 
 @dataclass(slots=True, eq=False)
@@ -400,8 +442,12 @@ class _Thread:
                 self._late()
 
 
-def _discard(name: str, value: Any) -> None:
-    """Record nothing, while steps of an earlier server are taken again."""
+def _discard(*arguments: Any, **named: Any) -> None:
+    """Record and say nothing, while steps of an earlier server are taken again."""
+
+
+def _nobody(*arguments: Any, **named: Any) -> None:
+    raise NoChat("nobody talks in this game: write chat: true in the section trial of config.yml")
 
 
 def _message_of(error: BaseException) -> str:

@@ -95,6 +95,11 @@ class JointAdapter:
         return self._adapter.callbacks
 
     @property
+    def talk(self) -> Mapping[str, Callable[..., Any]]:
+        """The methods `reply` and `moderate` that the agent has."""
+        return self._adapter.talk
+
+    @property
     def agent(self) -> Any:
         """The researcher's agent, once it has started."""
         return self._adapter.agent

@@ -8,10 +8,11 @@ from typing import Any
 
 from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.core import messages
-from hippodrome.trial.core.effects import Close, Effect, Pictures, SendMessage, SendPicture, SendState
+from hippodrome.trial.core.effects import Close, Effect, Pictures, SendMessage, SendPicture, SendState, SendTalk
 from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.participants import Participants
 from hippodrome.trial.core.progress import TrialProgress
+from hippodrome.trial.core.talk import Talk
 from hippodrome.trial.core.timing import StateTimes, Timing
 
 REPLACED = "the game was opened in another tab or device, and goes on there"
@@ -69,6 +70,8 @@ class Clients:
         """The pictures that clients show now; None before the first ones."""
         self.frame_id = 0
         """The id of these pictures."""
+        self.talk: Talk | None = None
+        """The talk of the trial; None if nobody talks."""
         self._members: Hashable = None
         """The last value of `TrialSession.session_version`; None if one participant plays."""
 
@@ -119,7 +122,14 @@ class Clients:
     def send_controls(self, client: Client, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send a client the message with everything about the game and its controls (`messages.controls`)."""
         times = self._timing.state_times(progress, now, participants.session_fields(now))
-        self.send(client, _controls_text(progress, client.player, times, self._scene))
+        chat = {} if self.talk is None else {"chat": self.talk.fields(client.player)}
+        self.send(client, _controls_text(progress, client.player, times, self._scene, chat))
+
+    def send_talk(self, player: str, fields: Mapping[str, Any]) -> None:
+        """Send the client of this player, if there is one, a message about talk."""
+        for client in self.by_human.values():
+            if client.player == player:
+                self._emit(SendTalk(client.connection, fields))
 
     def send_state(self, progress: TrialProgress, participants: Participants, now: float) -> None:
         """Send each client the state of its trial, if one of the values in it has changed."""
@@ -176,8 +186,17 @@ def _state_arguments(progress: TrialProgress, player: str, times: StateTimes) ->
     return arguments
 
 
-def _controls_text(progress: TrialProgress, player: str, times: StateTimes, scene: Mapping[str, Any] | None) -> str:
-    """Build the message about the game and its controls for this player's client. `scene` is from `_scene_fields`."""
+def _controls_text(
+    progress: TrialProgress,
+    player: str,
+    times: StateTimes,
+    scene: Mapping[str, Any] | None,
+    chat: Mapping[str, Any],
+) -> str:
+    """Build the message about the game and its controls for this player's client.
+
+    `scene` is from `_scene_fields`. `chat` has the field about talk, if there is talk.
+    """
     config, action_space = progress.config, progress.players[player].action_space
     return messages.controls(
         ui=config.ui.shown(),
@@ -196,7 +215,7 @@ def _controls_text(progress: TrialProgress, player: str, times: StateTimes, scen
         player=player,
         players=tuple(progress.players),
         scene=scene,
-        input_of_project=_input_fields(config, player),
+        input_of_project={**_input_fields(config, player), **chat},
         **_state_arguments(progress, player, times),
     )
 

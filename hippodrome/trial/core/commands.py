@@ -53,6 +53,8 @@ class Commands:
         """Raise CommandRefused if the project does not offer what the message asks for. It is not recorded then."""
         if message.hidden is not None and isinstance(participants, Alone):
             raise CommandRefused("unknown field 'hidden'")
+        if (message.say is not None or message.typing is not None) and self._config.chat is None:
+            raise CommandRefused("nobody talks in this game")
         if message.frame_rate is not None and not self._config.allow_frame_rate_change:
             raise CommandRefused("the frame rate of this game is fixed")
         missing = not_offered(message, self._offered)

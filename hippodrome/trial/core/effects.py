@@ -46,6 +46,14 @@ class SendState:
     frame_rate: int
 
 
+@dataclass(frozen=True, slots=True)
+class SendTalk:
+    """Send lines, or who types: the fields of a message about talk. None of them may be lost."""
+
+    connection: Hashable
+    fields: Mapping[str, Any]
+
+
 class SendPicture(NamedTuple):
     """Send a picture; it replaces a picture that still waits to be sent."""
 
@@ -145,6 +153,35 @@ class TellAgent:
     callback: Literal["on_join", "on_leave", "on_return", "on_form"]
     player: str
     fields: Mapping[str, Any] | None = None  # of the form
+
+
+@dataclass(frozen=True, slots=True)
+class AskReply:
+    """Ask the agent's `reply`, after earlier lines. The shell answers with `Trial.reply_grows` and `reply_ended`.
+
+    `n` is the number of the line; None if the agent is to speak first.
+    """
+
+    ask_id: int
+    player: str
+    text: str
+    n: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Moderate:
+    """Ask the agent's `moderate` about a line that is not said yet. The shell answers with `Trial.moderated`."""
+
+    ask_id: int
+    player: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RecordTalk:
+    """Add this record to the tape of the talk, stamped with the time."""
+
+    fields: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,11 +318,15 @@ class LogAgentError:
 Effect = (
     SendMessage
     | SendState
+    | SendTalk
     | SendPicture
     | SendDone
     | Close
     | Call
     | TellAgent
+    | AskReply
+    | Moderate
+    | RecordTalk
     | AskPolicy
     | ResetPolicy
     | OpenRecording

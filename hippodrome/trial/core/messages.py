@@ -21,7 +21,9 @@ DECODABLE = frozenset({"deflate", "jpeg", "objects"})
 """What a client may name in `decodes` of its first message (docs/wire.md)."""
 _DECODED_BY_DEFAULT = frozenset({"deflate"})
 
-_FIELDS = frozenset({"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden", "form"})
+_FIELDS = frozenset(
+    {"command", "action", "key", "held", "changeFrameRate", "ack", "asset", "hidden", "form", "say", "typing"}
+)
 FORM_PAGES = ("instructions", "betweenEpisodes")
 """The keys of `trial` that name the pages whose fields a client sends."""
 MAX_FORM, MAX_FORM_FIELDS = 100_000, 200
@@ -76,6 +78,18 @@ class Form:
 
 
 @dataclass(frozen=True, slots=True)
+class Say:
+    """A line that a participant says. `id` counts the lines of the participant from 1.
+
+    `typed`: milliseconds from the first key until the line was sent; None if the client does not say it.
+    """
+
+    id: int
+    text: str
+    typed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Message:
     """One later message. Fields it left out are None."""
 
@@ -97,9 +111,12 @@ class Message:
     hidden: bool | None = None
     """Whether the participant looks at another tab or application. Only clients of a session send it."""
     form: Form | None = None
+    say: Say | None = None
+    typing: bool | None = None
+    """Whether the participant types a line."""
 
     def record(self) -> dict[str, Any]:
-        """Return the fields for the recording: all but `ack`, `asset`, `hidden` and the command `requestUI`."""
+        """Return the fields for the recording: all but `ack`, `asset`, `hidden`, the command `requestUI`, and talk."""
         fields: dict[str, Any] = {}
         if self.command is not None and self.command != "requestUI":
             fields["command"] = self.command
@@ -212,8 +229,10 @@ def message_of(value: Mapping[str, Any], words: Collection[str] = ()) -> Message
         ack=_ack(value["ack"]) if "ack" in value else None,
         key=key,
         asset=_asset(value["asset"]) if "asset" in value else None,
-        hidden=_hidden(value["hidden"]) if "hidden" in value else None,
+        hidden=_bool("hidden", value["hidden"]) if "hidden" in value else None,
         form=_form(value["form"]) if "form" in value else None,
+        say=_say(value["say"]) if "say" in value else None,
+        typing=_bool("typing", value["typing"]) if "typing" in value else None,
     )
 
 
@@ -253,9 +272,24 @@ def _is_answer(value: Any) -> bool:
     return isinstance(value, str) or (isinstance(value, list) and all(isinstance(part, str) for part in value))
 
 
-def _hidden(value: Any) -> bool:
+def _say(value: Any) -> Say:
+    if not isinstance(value, dict) or not {"id", "text"} <= value.keys() <= {"id", "text", "typed"}:
+        raise BadMessage("say must have id and text, and may have typed")
+    number, text, typed = value["id"], value["text"], value.get("typed")
+    if not _is_whole(number) or number < 1 or not isinstance(text, str):
+        raise BadMessage("the id of a line must be a whole number from 1, and its text a text")
+    if typed is not None and not _is_whole(typed):
+        raise BadMessage("typed must be a whole number of milliseconds")
+    return Say(number, text, typed)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
+
+
+def _bool(name: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise BadMessage("hidden must be true or false")
+        raise BadMessage(f"{name} must be true or false")
     return value
 
 

@@ -72,6 +72,11 @@ class Alone:
 
     # ---- what follows
 
+    @property
+    def silent(self) -> frozenset[str]:
+        """The players who cannot speak, since their participants are away for good: none."""
+        return frozenset()
+
     def attend(self, now: float, seconds: float) -> None:
         """Do nothing: commands alone decide whether the game is held or goes on."""
 

@@ -225,6 +225,11 @@ class TrialSession:
 
     # ---- what follows
 
+    @property
+    def silent(self) -> set[str]:
+        """The players who cannot speak: those without a member, and those whose members are absent or refused."""
+        return {*self._vacant, *(player for player in self.presence.players if self.presence.over(player))}
+
     def attend(self, now: float, seconds: float) -> None:
         """Hold the game, let it go on, or end it, depending on who is here; tell the members for whom it is over.
 

@@ -9,6 +9,7 @@ Events in:
   already_played, start, agent_failed    an earlier server has played the step; the agent has started, or cannot
   connect, disconnect, receive           clients; each connection belongs to a human
   advise                                 a program suggests or chooses an action
+  reply_grows, reply_ended, agent_says   what the agent says; `moderated`: what it thinks of a line
   round_trip, member_saved               a member's browser has answered a ping; a member's answer is stored
   call_returned, call_failed             the agent's thread has finished the call that it was given
   policy_acted, policy_failed            a player's policy has answered
@@ -31,6 +32,7 @@ This module decides what comes next, and passes each event to the part that it c
   agent_call                             which call the agent has now, one at a time
   participants, session, presence        who is connected, and whether the game goes on, is held or ends
   beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
+  talk                                   who says what to whom
   recording, records, message_log        what is recorded, and what the answer holds
   clients, messages                      what is sent to clients
 
@@ -71,6 +73,7 @@ from hippodrome.trial.core.progress import TrialProgress
 from hippodrome.trial.core.recording import Recordings, words_of
 from hippodrome.trial.core.session import TrialSession
 from hippodrome.trial.core.steps import Stepper
+from hippodrome.trial.core.talk import Talk
 from hippodrome.trial.core.timing import Due, Timing
 from hippodrome.trial.core.unfinished import RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.settings import TrialSettings
@@ -135,6 +138,8 @@ class Trial:
         self._steps = Stepper(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
         self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
         self._participants: Participants = Alone(self.progress, trial_id)
+        self.talk: Talk | None = None
+        """What participants and the agent say; None if they do not talk, and before the start."""
         self._failed_words: str | None = None
         self._earlier_answers: Mapping[str, Any] | None = None
         self._have_come: set[str] = set()  # players whose participants have connected at least once
@@ -221,6 +226,16 @@ class Trial:
             )
         else:
             self._participants = Alone(self.progress, self.id)
+        if self.config.chat is not None:
+            people = {*places.values(), *vacant, *erased} if places else {self.progress.first}
+            self.talk = self._clients.talk = Talk(
+                self.config.chat,
+                [name for name in self.progress.players if name in people],
+                self.config.player_names,
+                where=lambda: (self.progress.episode, self.progress.steps),
+                send=self._clients.send_talk,
+                emit=self._emit,
+            )
         if recorded is not None:
             self.progress.resume(recorded.ended)
             self._beginning.unfinished = recorded.unfinished
@@ -255,6 +270,8 @@ class Trial:
             words = EPISODE_BEGINS_AGAIN
         if words is not None:
             self._clients.send(client, messages.error(words))
+        if self.talk is not None:
+            self.talk.connected(player)
         if participants.has_answered(human):
             self._send_done(human, client)
         self._clients.show_again(client)
@@ -284,6 +301,11 @@ class Trial:
         accepted = self._commands.receive(client, message, self.progress, self._participants, now)
         if accepted and message.form is not None:
             self._tell("on_form", client.player, message.form.fields)
+        if accepted and self.talk is not None and not self.progress.over:
+            if message.say is not None:
+                self.talk.say(client.player, message.say, now)
+            elif message.typing is not None:
+                self.talk.typing(client.player, message.typing)
         return self.advance(now)
 
     def advise(self, action: int, player: str | None, now: float) -> list[Effect]:
@@ -295,6 +317,32 @@ class Trial:
             raise messages.CommandRefused("no game is going on")
         self.progress.choices.advise(action, player)
         return self.advance(now) if self.progress.turns is not None else []
+
+    # ---- events: talk
+
+    def reply_grows(self, ask_id: int, text: str, now: float) -> list[Effect]:
+        """Show what the agent's `reply` has yielded so far, in answer to the `AskReply` of this id."""
+        if self.talk is not None and not self.done:
+            self.talk.reply_grows(ask_id, text)
+        return self._take_effects()
+
+    def reply_ended(self, ask_id: int, text: str | None, now: float) -> list[Effect]:
+        """Say what the agent's `reply` has returned; None if it says nothing."""
+        if self.talk is not None and not self.done:
+            self.talk.reply_ended(ask_id, text)
+        return self._take_effects()
+
+    def moderated(self, ask_id: int, result: str | bool | None, now: float) -> list[Effect]:
+        """Say a line, another text instead of it, or nothing (False), as the agent's `moderate` has decided."""
+        if self.talk is not None and not self.done:
+            self.talk.moderated(ask_id, result)
+        return self._take_effects()
+
+    def agent_says(self, text: str, to: Sequence[str] | None, by: str | None, now: float) -> list[Effect]:
+        """Say a line of the agent, to these players or to all, under this name or its own."""
+        if self.talk is not None and not self.done and not self.talk.agent_says(text, to, by, now):
+            self._emit(WriteLog(logging.WARNING, "the agent says too many lines; some are dropped"))
+        return self._take_effects()
 
     # ---- events: the agent
 
@@ -415,6 +463,8 @@ class Trial:
         Only a trial that is over has an answer.
         """
         self._commands.closed = self._ending.closing = True
+        if self.talk is not None:
+            self.talk.close()
         if self._agent.call is not None:
             self._agent.give_up_at = now + LAST_CALL_SECONDS
         if self.phase is Phase.STARTING:
@@ -436,6 +486,8 @@ class Trial:
         progress, closing = self.progress, self._ending.closing
         if not closing:
             self._participants.attend(self._now, self._timing.seconds)
+            if self.talk is not None and self.talk.alternates:
+                self.talk.silence(self._participants.silent)
             if self._commands.waiting:
                 self._commands.carry_out_waiting(progress, self._participants, self._timing)
             if progress.ended:
@@ -505,6 +557,8 @@ class Trial:
         self._note("disconnected", client)
         self._participants.go(client.player, self._now, closing=self._ending.closing)
         self._tell("on_leave", client.player)
+        if self.talk is not None:
+            self.talk.disconnected(client.player)
 
     def _tell(
         self,

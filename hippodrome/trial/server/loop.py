@@ -11,21 +11,26 @@ from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from hippodrome.trial.agent.callback_names import MODERATE, REPLY
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.calls import AgentCalls, Calls
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.agent.joint_calls import JointCalls
+from hippodrome.trial.agent.replies import Mouth, Replies, TalkOfAgent
 from hippodrome.trial.agent.tracebacks import report, without
 from hippodrome.trial.agent.worker import Worker
 from hippodrome.trial.core.effects import (
+    AskReply,
     Call,
     Close,
     CloseRecording,
     Effect,
     FeedbackCall,
     LogAgentError,
+    Moderate,
     OpenRecording,
     RecordLine,
+    RecordTalk,
     ReplayCall,
     ResetCall,
     ResetPolicy,
@@ -35,6 +40,7 @@ from hippodrome.trial.core.effects import (
     SendMessage,
     SendPicture,
     SendState,
+    SendTalk,
     StepCall,
     TellAgent,
     WriteLine,
@@ -104,6 +110,7 @@ class TrialLoop:
             is_over=lambda: self.core.done,
         )
         self._places = Places(self._acted)
+        self._replies: Replies | None = None
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -115,6 +122,10 @@ class TrialLoop:
             **dict.fromkeys((StepCall, FeedbackCall, ResetCall, ReplayCall), self._call),
             SendMessage: lambda effect: effect.connection.send(effect.text),
             SendState: self._send_state,
+            SendTalk: lambda effect: effect.connection.send_talk(effect.fields),
+            AskReply: self._ask_agent,
+            Moderate: self._ask_agent,
+            RecordTalk: self._record_talk,
             SendPicture: lambda effect: effect.connection.show(effect.picture, effect.frame_id),
             SendDone: self._send_done,
             Close: lambda effect: effect.connection.close(effect.code, effect.text),
@@ -134,7 +145,7 @@ class TrialLoop:
     @property
     def stuck(self) -> bool:
         """Whether a callback of the agent or a policy has not returned, and may never."""
-        return self._places.busy or self._callbacks.busy
+        return self._places.busy or self._callbacks.busy or (self._replies is not None and self._replies.busy)
 
     def begin(self, agent_ready: Awaitable[StartedAgent | None]) -> asyncio.Future[None]:
         """Begin the trial once the agent is ready. If `agent_ready` returns None, the agent cannot be started.
@@ -226,6 +237,9 @@ class TrialLoop:
             erased=playing.erased,
             answered=answered,
         )
+        if self.core.talk is not None and self._replies is not None:
+            self.core.talk.replies = self._replies.reply is not None
+            self.core.talk.moderates = self._replies.moderate is not None
         self._apply(effects)
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
@@ -318,6 +332,8 @@ class TrialLoop:
             self._done.set_result(None)
             self._callbacks.close()
             self._places.close()
+            if self._replies is not None:
+                self._replies.close()
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if core.wake_at is None else self._loop.call_at(core.wake_at, self._wake)
@@ -340,12 +356,14 @@ class TrialLoop:
         self._endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), lambda: self._calls.moment))
 
     def _use_callbacks(self, started: StartedAgent, players: Sequence[Player], earlier: Mapping[str, Any]) -> None:
-        """If the agent has callbacks, call them from now on."""
+        """If the agent has callbacks, or somebody talks, call them from now on."""
         settings, agent = self.settings, started.agent
-        if not started.callbacks:
+        talks = settings.trial.chat is not None
+        if not started.callbacks and not talks:
             return
-        self.core.callbacks = True
-        self._calls.callbacks = Callbacks(
+        self.core.callbacks = bool(started.callbacks)
+        mouth = Mouth(lambda: self.core.talk, partial(self._do, self.core.agent_says))
+        callbacks = self._calls.callbacks = Callbacks(
             started.callbacks,
             TrialFacts(
                 self.core.id,
@@ -365,8 +383,30 @@ class TrialLoop:
             ),
             hide=self._hide,
             late=self._callbacks.late,
+            talk=TalkOfAgent(settings.trial.options, mouth.lines, mouth.say) if talks else None,
         )
-        self._callbacks.begin(self._calls.callbacks)
+        self._callbacks.begin(callbacks)
+        if talks:
+            methods = agent.talk
+            self._replies = Replies(
+                methods.get(REPLY),
+                methods.get(MODERATE),
+                callbacks.session_of,
+                grows=partial(self._do, self.core.reply_grows),
+                ended=partial(self._do, self.core.reply_ended),
+                moderated=partial(self._do, self.core.moderated),
+                failed=callbacks.talk_failed,
+            )
+
+    def _ask_agent(self, effect: AskReply | Moderate) -> None:
+        assert self._replies is not None
+        if isinstance(effect, AskReply):
+            self._replies.ask(effect)
+        else:
+            self._replies.check(effect)
+
+    def _record_talk(self, effect: RecordTalk) -> None:
+        """Add a line of the talk to the tape."""
 
     def _record_line(self, effect: RecordLine) -> None:
         fields = effect.fields

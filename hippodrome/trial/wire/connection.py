@@ -8,8 +8,9 @@ import logging
 import math
 import socket
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
+from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
@@ -23,6 +24,7 @@ from hippodrome.trial.pictures.picture import Picture
 from hippodrome.trial.pictures.scene import Scene
 from hippodrome.trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
 from hippodrome.trial.settings import STALLED_SECONDS
+from hippodrome.trial.wire.pending_talk import PendingTalk
 
 log = logging.getLogger("trial")
 
@@ -77,6 +79,7 @@ class Connection:
         self._wanted: deque[tuple[int, int]] = deque()  # assets to send: the number, and the offset of the next part
         self._sharpen_at = math.inf  # when rows that make the last picture exact may be sent
         self._texts: deque[str] = deque()
+        self._talk = PendingTalk()
         self._state: str | None = None
         self._picture: tuple[int, Picture] | None = None
         self._sent = 0, False  # the id of the last picture, and whether it is large
@@ -94,6 +97,13 @@ class Connection:
         """Send the trial's state, which replaces a state that still waits."""
         self._state = text
         self._wake.set()
+
+    def send_talk(self, fields: Mapping[str, Any]) -> None:
+        """Send a message about talk. However slow the client is, no line is dropped, and of a line only its newest text
+        waits. Clients without our subprotocol do not talk."""
+        if self.binary:
+            self._talk.add(fields)
+            self._wake.set()
 
     def show(self, picture: Picture, picture_id: int) -> None:
         """Send a picture, after the messages that wait. It replaces a picture that still waits.
@@ -143,6 +153,8 @@ class Connection:
                 if self._state is not None:
                     text, self._state = self._state, None
                     await self.websocket.send(text)
+                while self._talk:
+                    await self.websocket.send(self._talk.take())
                 if self._closing is not None:
                     await self._end(*self._closing)
                     return
@@ -158,7 +170,7 @@ class Connection:
 
     async def _until_due(self) -> None:
         """Wait until there is something to send."""
-        seconds = 0.0 if self._wanted else self._picture_in()
+        seconds = 0.0 if self._wanted or self._talk else self._picture_in()
         if seconds > 0.0:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(seconds if seconds < math.inf else None):

@@ -1,6 +1,6 @@
 """`python -m tests.control.config.tables`: write what the documentation says of each key, from its declaration.
 
-That is docs/config.schema.json, and the tables of keys in docs/config.md and docs/objects.md. The rows of a table keep
+That is docs/config.schema.json, and the tables of keys in docs/config.md, docs/objects.md and docs/talk.md. The rows of a table keep
 their order; the row of a new key comes after the row of the key that is declared before it.
 """
 
@@ -16,7 +16,7 @@ from hippodrome.control.config.project_keys import SECTIONS
 from hippodrome.protocol.section_keys import Key, Section, keys
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGES = (DOCS / "config.md", DOCS / "objects.md")
+PAGES = (DOCS / "config.md", DOCS / "objects.md", DOCS / "talk.md")
 SCHEMA = DOCS / "config.schema.json"
 TABLE = re.compile(r"(?<=<!-- the keys of )(\S+)(, made by .* -->\n\n)((?:\|.*\n)+)")
 HEAD = ("key", "meaning", "type", "default", "example")

@@ -94,6 +94,18 @@ KEYS: dict[str, st.SearchStrategy[Any]] = {
             "price": st.sampled_from([{"input": 1, "output": 0.5}, {"input": 1}, {"input": -1, "output": 1}, 3]),
         },
     ),
+    "chat": FLAGS
+    | st.fixed_dictionaries(
+        {},
+        optional={
+            "with": st.lists(st.sampled_from(["ai", "player_0", "", 3]), max_size=2),
+            "maxLength": st.sampled_from([0, 1, 1000, 1001]),
+            "typing": FLAGS,
+            "phrases": NAMES,
+            "first": st.sampled_from(["ai", "player_0", "x", 3]),
+            "names": st.dictionaries(PLAYERS, st.sampled_from(["Red", "", 3, "x" * 65]), max_size=2),
+        },
+    ),
     "options": st.dictionaries(st.sampled_from(["a", "b"]), st.integers() | st.text(max_size=3)),
 }
 SECTIONS = st.fixed_dictionaries({"game": st.just("x/Y-v0")}, optional={key: each | ODD for key, each in KEYS.items()})

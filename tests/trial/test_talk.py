@@ -1,0 +1,67 @@
+"""Participants and the agent talk, on a real trial server."""
+
+from __future__ import annotations
+
+import asyncio
+
+from tests.trial.conftest import grid_agent
+from tests.trial.sessions import launch_formed, member
+
+TALKS = """
+    def reply(self, session, player, text):
+        return f"{player} says {text}"
+"""
+STREAMS = """
+    def reply(self, session, player, text):
+        for word in ("well", ", ", "yes"):
+            import time; time.sleep(0.15)
+            yield word
+"""
+
+
+async def say(client, number, text):
+    await client.say(say={"id": number, "text": text})
+
+
+async def test_two_participants_talk_also_before_the_game_and_each_line_is_said_once(launch):
+    server = launch_formed(launch, trial={"chat": True, "playerNames": {"left": "Red"}})
+    async with member(server, "anna") as anna:
+        chat = anna.controls["chat"]
+        assert (chat["me"], chat["with"], chat["names"], chat["maxLength"]) == ("left", ["right"], {"left": "Red"}, 500)
+        await say(anna, 1, "Hello?")
+        assert await anna.read(1) == [("left", "Hello?")]
+        async with member(server, "bert") as bert:
+            await anna.say(typing=True)
+            await bert.until(lambda: bert.typing.get("left"))
+            await say(anna, 2, "  Are you\x07 there? <b>&amp;</b> ")
+            await say(anna, 2, "Are you there?")
+            await bert.read(2)
+            await say(bert, 1, "Yes\r\nI am")
+            expected = [("left", "Hello?"), ("left", "Are you there? <b>&amp;</b>"), ("right", "Yes\nI am")]
+            assert await bert.read(3) == expected
+            assert await anna.read(3) == expected
+            assert not bert.typing["left"]
+            assert [line.get("id") for line in anna.lines.values()] == [1, 2, None]
+            await anna.say(command="stop")
+            await asyncio.gather(anna.closed(), bert.closed())
+
+
+async def test_the_agent_answers_a_participant(launch, open_client):
+    server = launch(agent=grid_agent() + TALKS, trial={"chat": True})
+    async with open_client(server.address) as client:
+        await client.enter()
+        assert client.controls["chat"]["with"] == ["ai"]
+        await say(client, 1, "Hi")
+        assert await client.read(2) == [("player_0", "Hi"), ("ai", "player_0 says Hi")]
+        assert not client.typing.get("ai")
+    async with open_client(server.address) as again:
+        await again.enter()
+        assert await again.read(2) == [("player_0", "Hi"), ("ai", "player_0 says Hi")]
+
+
+async def test_what_the_agent_yields_grows(launch, open_client):
+    server = launch(agent=grid_agent() + STREAMS, trial={"chat": {"first": "ai"}})
+    async with open_client(server.address) as client:
+        await client.enter()
+        await client.until(lambda: client.lines.get(1, {}).get("more"))
+        assert await client.read(1) == [("ai", "well, yes")]
