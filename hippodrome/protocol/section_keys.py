@@ -210,7 +210,7 @@ def _value(key: Key, value: Any, path: KeyPath) -> tuple[Any, list[SectionProble
         return None if wrong else tuple(item for item, _ in read), wrong
     if key.entries:
         return key.entries(value, path)
-    return check_section(key.section, value, path) if key.section else (value, [])
+    return check_section(key.section, value, path) if key.section and value is not None else (value, [])
 
 
 def document(section: Section) -> dict[str, Any]:
