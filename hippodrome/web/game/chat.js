@@ -111,9 +111,8 @@ function hearLines(message) {
   }
   if ("turn" in message) writer = message.turn;
   if (isHistory) {
-    // Lines that are not among these have not been heard: they are sent again, as the newest.
     open = true;
-    for (const each of unsent) Object.assign(each, { id: nextId(), sent: false });
+    for (const each of unsent) each.sent = false; // those that are not among these lines are sent again, with their ids
     setText(note, "");
   }
   keep();
