@@ -105,3 +105,75 @@ async def test_a_study_without_a_model_leaves_the_agents_own_variables_alone(
         await client.stop()
     (first, *_) = lines_of(server, "step")
     assert first["info"]["imported"]["OPENAI_API_KEY"] == "own"
+
+
+async def say(client: Any, number: int, text: str) -> None:
+    await client.say(say={"id": number, "text": text})
+
+
+async def test_a_model_answers_by_itself_with_the_prompt_and_all_lines(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel, tmp_path: Any
+) -> None:
+    (tmp_path / "agent" / "prompts").mkdir(parents=True)
+    (tmp_path / "agent" / "prompts" / "warm.txt").write_text("Be warm.\nAlways.\n")
+    llm = {"system": "prompts/warm.txt", "parameters": {"temperature": 0.2}}
+    server = launch(agent=grid(), trial={**trial_of(model, **llm), "chat": True})
+    async with open_client(server.address) as client:
+        await client.enter()
+        await say(client, 1, "Hi")
+        assert await client.read(2) == [("player_0", "Hi"), ("ai", reply_to("Hi"))]
+        await say(client, 2, "And now?")
+        await client.read(4)
+    _, request, _ = model.requests[1]
+    assert request["messages"] == [
+        {"role": "system", "content": "Be warm.\nAlways."},
+        {"role": "user", "content": "Hi"},
+        {"role": "assistant", "content": reply_to("Hi")},
+        {"role": "user", "content": "And now?"},
+    ]
+    assert (request["temperature"], request["stream"]) == (0.2, True)
+
+
+async def test_a_model_speaks_first(launch: Any, open_client: Any, grid: Any, model: FakeModel) -> None:
+    server = launch(agent=grid(), trial={**trial_of(model), "chat": {"first": "ai"}})
+    async with open_client(server.address) as client:
+        await client.enter()
+        ((by, _),) = await client.read(1)
+    assert by == "ai"
+
+
+async def test_a_model_that_cannot_answer_says_the_fallback(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel
+) -> None:
+    model.behaviour = {"refuse": 1}
+    server = launch(agent=grid(), trial={**trial_of(model, fallback="One moment."), "chat": True}, LLM_KEY=KEY)
+    async with open_client(server.address) as client:
+        await client.enter()
+        await say(client, 1, "something private")
+        assert await client.read(2) == [("player_0", "something private"), ("ai", "One moment.")]
+    assert "ModelRefused" in server.log_text()
+    assert "something private" not in server.log_text()
+    assert KEY not in server.log_text()
+
+
+async def test_a_callback_asks_the_model_also_in_a_game_without_talk(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel
+) -> None:
+    hears = "\n    def on_episode_start(self, session):\n        return session.ask('A hint?', temperature=1)\n"
+    server = launch(agent=grid() + hears, trial=trial_of(model, system="Be brief."))
+    async with open_client(server.address) as client:
+        await client.play(3)
+        await client.stop()
+    (line,) = lines_of(server, "callback")
+    assert line["value"] == reply_to("A hint?")
+    assert model.requests[0][1]["messages"][0] == {"role": "system", "content": "Be brief."}
+    assert model.requests[0][1]["temperature"] == 1
+
+
+async def test_without_its_prompt_no_game_begins(launch: Any, open_client: Any, grid: Any, model: FakeModel) -> None:
+    server = launch(agent=grid(), trial=trial_of(model, system="prompts/none.txt"))
+    async with open_client(server.address) as client:
+        await client.hello()
+        await client.closed()
+    assert server.wait() != 0
+    assert "the prompt prompts/none.txt cannot be read (FileNotFoundError)" in server.log_text()

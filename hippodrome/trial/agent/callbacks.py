@@ -149,9 +149,9 @@ class Callbacks:
         late: Callable[[int], None] = lambda recorded: None,
         talk: TalkOfAgent | None = None,
     ) -> None:
-        """`talk`: what the agent needs to talk, if anybody talks in this game."""
+        """`talk`: what the agent needs to talk, and to ask the game's language model."""
         self._found = found
-        self._talks = talk is not None
+        self._talks = talk is not None and talk.say is not None
         self._talk = talk or TalkOfAgent()
         self.facts = facts
         self._env = env

@@ -51,6 +51,7 @@ class TalkOfAgent:
     lines: Callable[[str | None], list[dict[str, Any]]] = lambda player: []
     """Returns the lines that a player has read or said; with None, all lines."""
     say: Callable[..., None] | None = None
+    """None if nobody talks in this game."""
     ask: Callable[..., str] = _no_model
 
 
@@ -119,6 +120,8 @@ class Replies:
         self.moderate = moderate
         self.fallbacks = 0
         """The number of lines that the fallback has answered."""
+        self.answering: int | None = None
+        """The number of the line that `reply` answers now; None if it answers none. For any thread."""
         self._session = session
         self._grows = grows
         self._ended = ended
@@ -141,6 +144,7 @@ class Replies:
         said: list[str] = []
 
         def ended(text: str | None, error: Exception | None) -> None:
+            self.answering = None
             if error is not None:
                 self._failed("reply", error)
                 text = "".join(said)
@@ -153,6 +157,7 @@ class Replies:
 
     def _reply(self, reply: Reply, effect: AskReply, said: list[str]) -> str | None:
         """Call `reply` on its thread; collect in `said` what it yields."""
+        self.answering = effect.n
         result = reply(self._session("reply", effect.player), effect.player, effect.text)
         if result is None or isinstance(result, str):
             return None if result is None else result[: 2 * MAX_SAID]

@@ -8,6 +8,7 @@ import logging
 import secrets
 import uuid
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -51,7 +52,8 @@ from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
-from hippodrome.trial.llm.ledger import Ledger
+from hippodrome.trial.llm.ledger import Ledger, Moment
+from hippodrome.trial.llm.partner import NoPrompt, Partner, prompt_of
 from hippodrome.trial.policies.places import Places
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.recordings.recorder import Recorder
@@ -111,6 +113,7 @@ class TrialLoop:
         )
         self._places = Places(self._acted)
         self._replies: Replies | None = None
+        self._partner: Partner | None = None
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -224,7 +227,12 @@ class TrialLoop:
         by_player = {player: given[user_id] for user_id, player in playing.places.items()}
         earlier = by_player if self.settings.session else given[self.settings.user_id]
         self._calls = self._calls_of(started, playing, earlier)
-        self._use_model()
+        try:
+            self._use_model()
+        except NoPrompt as error:
+            log.error("%s", error)
+            self._apply(self.core.agent_failed(self._loop.time()))
+            return
         self._action_starts = started.agent.action_starts
         self._places.fill(playing.players, playing.policies, playing.stand_ins, playing.seats)
         self._use_callbacks(started, playing.players, earlier)
@@ -346,19 +354,25 @@ class TrialLoop:
         self._callbacks.on_agent(partial(self._calls.run, call), call.limit, partial(self._call_ended, call))
 
     def _use_model(self) -> None:
-        """Let the agent ask the game's language model from now on, if the game has one."""
+        """Let the agent ask the game's language model from now on, if the game has one. Raises NoPrompt."""
         if self._endpoint is None:
             return
         section = self.settings.trial.llm
         if section is None:
             self._endpoint.play(None)
             return
-        self._endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), lambda: self._calls.moment))
+        self._partner = Partner(section, prompt_of(section, self.settings.agent_dir))
+        self._endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), self._moment))
+
+    def _moment(self) -> Moment:
+        """Return when in the game the agent is now. May be called on any thread."""
+        line = None if self._replies is None else self._replies.answering
+        return replace(self._calls.moment, line=line)
 
     def _use_callbacks(self, started: StartedAgent, players: Sequence[Player], earlier: Mapping[str, Any]) -> None:
         """If the agent has callbacks, or somebody talks, call them from now on."""
-        settings, agent = self.settings, started.agent
-        talks = settings.trial.chat is not None
+        settings, agent, partner = self.settings, started.agent, self._partner
+        talks, model = settings.trial.chat is not None, settings.trial.llm
         if not started.callbacks and not talks:
             return
         self.core.callbacks = bool(started.callbacks)
@@ -383,19 +397,25 @@ class TrialLoop:
             ),
             hide=self._hide,
             late=self._callbacks.late,
-            talk=TalkOfAgent(settings.trial.options, mouth.lines, mouth.say) if talks else None,
+            talk=TalkOfAgent(
+                settings.trial.options,
+                mouth.lines,
+                mouth.say if talks else None,
+                **({"ask": partner.ask} if partner else {}),
+            ),
         )
         self._callbacks.begin(callbacks)
         if talks:
             methods = agent.talk
             self._replies = Replies(
-                methods.get(REPLY),
+                methods.get(REPLY) or (partner.reply if partner else None),
                 methods.get(MODERATE),
                 callbacks.session_of,
                 grows=partial(self._do, self.core.reply_grows),
                 ended=partial(self._do, self.core.reply_ended),
                 moderated=partial(self._do, self.core.moderated),
                 failed=callbacks.talk_failed,
+                fallback=None if model is None else model.fallback,
             )
 
     def _ask_agent(self, effect: AskReply | Moderate) -> None:
