@@ -50,7 +50,7 @@ FAILURES = (
     ("AWS_ACCESS_KEY_ID=AKIAWRONG {plan}", "AWS does not accept these credentials."),
     ("make plan DOMAIN=lab.example.net", "This account has no public hosted zone for …"),
     (
-        "AWS_REGION=eu-south-1 {deploy}",
+        "AWS_REGION=me-south-1 {deploy}",
         "region: Hippodrome cannot be installed in …: not every service that it needs is there.",
     ),
     ("make status", "There is no stack named … in …"),

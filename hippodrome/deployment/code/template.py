@@ -12,11 +12,13 @@ import yaml
 
 from hippodrome import places
 from hippodrome.console.problem import Problem
+from hippodrome.deployment.aws import regions
 from hippodrome.deployment.code.build import Function
 
 PATH = places.ROOT / "infra" / "template.yml"
 
 _CORRECT = "Correct infra/template.yml, or take it from the repository again."
+_BUDGET = re.compile(r"^  Budget:\n(?:(?:   .*)?\n)*", re.MULTILINE)
 _KEY = re.compile(r"(\bS3Key:\s*)([\"']?)([A-Za-z0-9_]+)\.zip\2(?=[\s,}]|$)")
 
 
@@ -36,6 +38,10 @@ class Template:
                 f"{path.name} cannot be read: {error.strerror}.",
                 "Look at the file's permissions, or take it from the repository again.",
             ) from None
+
+    def for_region(self, region: str) -> Template:
+        """Return the template for this region: without the budget, if CloudFormation knows none there."""
+        return Template(_BUDGET.sub("", self.text)) if region in regions.WITHOUT_BUDGETS else self
 
     def with_code(self, functions: Iterable[Function]) -> Template:
         """Replace each `<function>.zip` in the template by the key of its zip, and return the result.

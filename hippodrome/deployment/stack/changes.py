@@ -15,6 +15,7 @@ from botocore.exceptions import ClientError
 
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
+from hippodrome.deployment.aws import regions
 from hippodrome.deployment.aws.account import Account, parameters_of
 from hippodrome.deployment.aws.resource_names import TAG
 from hippodrome.deployment.code import build
@@ -91,9 +92,12 @@ def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
     """
     stack, bucket = Stack(account, name), CodeBucket(account, name)
     found = stack.describe()
-    source = Template.read()
+    source = Template.read().for_region(account.region)
     parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name, _subnets(found))
-    if wrong := [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]:
+    wrong = [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]
+    if account.region in regions.WITHOUT_BUDGETS and parameters.get("MonthlyBudget", "0") != "0":
+        wrong.append(f"--budget must be 0 in {account.region}: make it in the console, Billing and Cost Management")
+    if wrong:
         raise Problem("The installation cannot be made like this.", "Correct the options that are named.", wrong)
     functions = build.functions(Target.from_env())
     template = source.with_code(functions)

@@ -182,10 +182,10 @@ def test_of_an_existing_installation_only_changes_are_checked(world: World) -> N
 
 
 def test_a_region_without_a_needed_service_is_a_problem(world: World, capsys: Capsys) -> None:
-    world.account.region = "eu-south-2"
+    world.account.region = "ap-southeast-7"
     found = only([one for one in findings(world) if one.mark is Mark.BAD])
-    assert "cannot be installed in eu-south-2" in found.text
-    assert "eu-central-1" in found.advice
+    assert "cannot be installed in ap-southeast-7" in found.text
+    assert "ap-southeast-1" in found.advice
 
 
 def test_the_root_user_is_a_remark(world: World) -> None:
@@ -229,6 +229,17 @@ def test_a_study_without_a_game_needs_no_servers(world: World, tmp_path: Path) -
     config.write_text(config.read_text().replace("2: game, 3: thanks", "2: thanks").partition("trial:")[0])
     world.limits.quotas |= {quotas.SPOT: 0, quotas.ON_DEMAND: 0}
     assert findings(world, game=project_folder.read(folder)) == []
+
+
+def test_a_budget_is_refused_where_cloudformation_makes_none(world: World) -> None:
+    world.text = world.text.replace("Parameters:\n", "Parameters:\n  MonthlyBudget: {Type: Number, Default: 0}\n")
+    prepare(world.account, "hippodrome", StackSettings(domain=DOMAIN, budget=50))
+    world.account.region = "eu-north-1"
+    with pytest.raises(Problem, match="cannot be made like this") as refused:
+        prepare(world.account, "hippodrome", StackSettings(domain=DOMAIN, budget=50))
+    assert refused.value.details == (
+        "--budget must be 0 in eu-north-1: make it in the console, Billing and Cost Management",
+    )
 
 
 def test_a_used_up_quota_of_vpcs_is_a_problem(world: World) -> None:

@@ -180,7 +180,7 @@ def _version(account: Account, stack: str) -> Iterator[Finding]:
     from hippodrome.deployment.code.template import Template  # noqa: PLC0415 - YAML, which only this check needs
 
     present = Stack(account, stack).template()
-    if present and _plain(present) != _plain(Template.read().text):
+    if present and _plain(present) != _plain(Template.read().for_region(account.region).text):
         yield look(
             "version",
             "The stack was made by another version of this command.",
