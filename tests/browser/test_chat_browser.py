@@ -81,7 +81,7 @@ def write(tab: Any, text: str) -> None:
 def test_lines_of_both_sides_stand_in_their_order(talking: TalkingWorld, tab: Any, width: int, height: int) -> None:
     tab.set_viewport_size({"width": width, "height": height})
     talking.open(tab)
-    tab.wait_for_selector("#overlay-title:text('Ready?')")
+    tab.wait_for_selector(f"#overlay-title:text('{ENGLISH['ready']}')")
     shot(tab, f"{width}-chat-ready")
     tell(talking.world, state="playing")
     talking.say(lines=[{"n": 1, "by": "ai", "text": "Hello! Shall I take the left half?"}])
@@ -277,7 +277,7 @@ def test_a_line_that_is_written_offline_is_kept_over_a_reload_and_sent_once(talk
     # The connection is lost before the echo comes; the server has heard the line.
     world.state = {**world.state, "url": NOWHERE}
     world.connections[-1].close(1011)
-    tab.wait_for_selector("#overlay-title:text('Connection lost')")
+    tab.wait_for_selector(f"#overlay-title:text('{ENGLISH['lost']}')")
     write(tab, "second")
     tab.wait_for_selector(f"#chat-note:text('{ENGLISH['messageKept']}')")
     shot(tab, "360-chat-offline")
@@ -323,12 +323,12 @@ def test_two_tabs_of_a_participant_lose_and_double_no_line(talking: TalkingWorld
     second.wait_for_selector("#chat:visible")
     until(lambda: len(world.connections) == 2)
     world.connections[0].close(4409)
-    tab.wait_for_selector("#overlay-title:text('The game was opened in another tab')")
+    tab.wait_for_selector(f"#overlay-title:text('{ENGLISH['elsewhere']}')")
     write(second, "from the second tab")
     said = talking.said(2)[1]
     talking.history = [{"n": 1, "by": "red", "text": said["text"], "id": said["id"]}]
     second.close()
-    tab.click("text=Play here instead")
+    tab.click(f"text={ENGLISH['playHere']}")
     again = talking.said(3)[2]
     assert again == first
     assert first["id"] < said["id"]
@@ -345,7 +345,7 @@ def test_length_is_told_in_words_and_counts_characters(talking: TalkingWorld, ta
     assert tab.inner_text("#chat-room") == "40 characters left"
     write(tab, "🙂" * 103)
     assert tab.inner_text("#chat-room") == "3 characters too many"
-    assert tab.inner_text("#chat-note") == "Your message is too long: it may have 100 characters."
+    assert tab.inner_text("#chat-note") == "Your message is too long. The limit is 100 characters."
     shot(tab, "360-chat-too-long")
     assert tab.input_value("#chat-field") == "🙂" * 103
     write(tab, "🙂" * 100)
@@ -376,7 +376,7 @@ def test_lines_go_no_faster_than_the_server_takes_them(talking: TalkingWorld, st
     ("why", "words", "kept"),
     [
         ("tooFast", ENGLISH["tooManyMessages"], "Hi"),
-        ("tooLong", "Your message is too long: it may have 100 characters.", "Hi"),
+        ("tooLong", "Your message is too long. The limit is 100 characters.", "Hi"),
         ("notYourTurn", ENGLISH["messageRefused"], "Hi"),
         ("held", ENGLISH["messageHeld"], ""),
         ("somethingNew", ENGLISH["messageRefused"], "Hi"),

@@ -314,52 +314,82 @@ _TALK = {
     "newMessages": "New messages",
     "charactersLeft": "{number} characters left",
     "charactersOver": "{number} characters too many",
-    "messageTooLong": "Your message is too long: it may have {number} characters.",
-    "tooManyMessages": "You are writing faster than your messages can be sent. Please wait a moment.",
-    "messageKept": "No connection. Your message is kept, and sent as soon as there is one.",
+    "messageTooLong": "Your message is too long. The limit is {number} characters.",
+    "tooManyMessages": "You are sending messages too quickly. Please wait a moment.",
+    "messageKept": "No connection. Your message is saved here and will be sent when the connection is back.",
     "messageHeld": "Your message was not passed on.",
     "messageRefused": "Your message could not be sent. Please try again.",
     "talkTitle": "Conversation",
     "talkWaiting": "Waiting for the conversation",
-    "talkGettingReady": "Your conversation is getting ready",
+    "talkGettingReady": "Preparing your conversation",
     "talkStartingAlone": (
-        "We are starting a computer for you alone. You need not do anything: the conversation appears on this page by "
-        "itself."
+        "We are starting a server just for you. Please wait: the conversation will appear on this page automatically."
     ),
     "talkStartingTogether": (
-        "We are starting a computer for your conversation. You need not do anything: the conversation appears on this "
-        "page by itself."
+        "We are starting the server for your conversation. Please wait: the conversation will appear on this "
+        "page automatically."
     ),
     "talkLoading": "Loading the conversation…",
     "talkEnd": "End the conversation",
-    "talkEndConfirm": "End the conversation now? You cannot go on with it afterwards.",
-    "talkEndForAll": "End the conversation for everybody",
+    "talkEndConfirm": "End the conversation now? You will not be able to return to it.",
+    "talkEndForAll": "End the conversation for everyone",
     "endRound": "End this round",
     "roundOf": "Round {game} of {games}",
     "roundOver": "Round {game} of {games} is over",
-    "nextRoundIn": "The next round begins in {time}.",
+    "nextRoundIn": "The next round starts in {time}.",
     "nextRound": "Next round",
     "toTalk": "Go to the conversation",
     "backToTalk": "Back to the conversation",
     "talkSaving": "Saving your conversation…",
     "talkOver": "The conversation is over",
     "thanksForTalking": "Thank you for taking part!",
-    "talkSaved": "Your conversation is saved. One moment, please…",
-    "talkBegins": "The conversation begins",
-    "talkGoesOn": "The conversation goes on",
+    "talkSaved": "Your conversation is saved. Just a moment…",
+    "talkBegins": "The conversation is starting",
+    "talkGoesOn": "The conversation is about to continue",
     "talkLobbyOther": (
-        "Two people talk with each other. You need not do anything: the conversation begins on this page by itself. "
-        "Please stay on this page."
+        "This is a conversation between two people. Please stay on this page: it will start automatically."
     ),
     "talkLobbyOthers": (
-        "{players} people talk with each other. You need not do anything: the conversation begins on this page by "
-        "itself. Please stay on this page."
+        "This is a conversation between {players} people. Please stay on this page: it will start automatically."
     ),
     "talkPreparedTitle": "Your conversation is being prepared – {study}",
     "talkPrepared": "Your conversation is being prepared.",
     "talkPreparedHeading": "Your conversation is being prepared",
     "talkWith": "You talk with {people}.",
     "talkEnded": "The conversation has ended",
+    "talkElsewhere": "The conversation is open in another tab or on another device",
+    "talkLost": (
+        "Your conversation is safe. Please stay on this page; it will continue automatically. If this lasts "
+        "more than a few minutes, try another network or contact the researchers who invited you."
+    ),
+    "talkBeginsWithAll": "The conversation will start as soon as everyone is here.",
+    "talkGoesOnWithAll": "The conversation will continue as soon as everyone is here.",
+    "talkTheyRead": "They are still reading. The conversation will start in {time} at the latest.",
+    "talkAbsentEnds": "If they are not here within {time}, the conversation will end for everyone.",
+    "talkOtherSees": (
+        "The other participant can see that you are away, and will wait for a short time. What you have said "
+        "so far is saved. Please stay on this page. If this lasts, try another network."
+    ),
+    "talkOthersSee": (
+        "The other participants can see that you are away, and will wait for a short time. What you have "
+        "said so far is saved. Please stay on this page. If this lasts, try another network."
+    ),
+    "talkYouLeft": (
+        "You were away for too long, so the conversation has ended. What you have said so far is saved. "
+        "Please continue with the study."
+    ),
+    "talkOtherLeft": (
+        "The other participant left, so the conversation has ended. This is not your fault. Please continue "
+        "with the study."
+    ),
+    "talkSomeLeft": (
+        "Another participant left, so the conversation has ended. This is not your fault. Please continue "
+        "with the study."
+    ),
+    "talkSavedOffline": (
+        "Your conversation is saved. No connection. Trying again… Please stay on this page; it will continue "
+        "automatically. If this lasts more than a few minutes, try another network."
+    ),
 }
 IN_TALK = {
     "game": "talkTitle",
@@ -391,6 +421,18 @@ IN_TALK = {
     "preparedHeading": "talkPreparedHeading",
     "playWith": "talkWith",
     "hasEnded": "talkEnded",
+    "elsewhere": "talkElsewhere",
+    "lostNote": "talkLost",
+    "beginsWithAll": "talkBeginsWithAll",
+    "goesOnWithAll": "talkGoesOnWithAll",
+    "theyRead": "talkTheyRead",
+    "absentEnds": "talkAbsentEnds",
+    "otherSees": "talkOtherSees",
+    "othersSee": "talkOthersSee",
+    "youLeft": "talkYouLeft",
+    "otherLeft": "talkOtherLeft",
+    "someLeft": "talkSomeLeft",
+    "savedOffline": "talkSavedOffline",
 }
 """By the name of a text on the page of a game: that of the text that stands there if the game is `talk`."""
 NOT_IN_TALK = ("yourScore", "totalScore", "orArrow")

@@ -131,7 +131,7 @@ def test_a_page_of_talk_speaks_of_rounds_and_a_conversation_and_not_of_a_score()
     assert texts["reset"] == "Schluss"
     assert texts["gameOver"] == "Round {game} of {games} is over"
     assert texts["yourScore"] == ""
-    assert Texts({})["gameOver"] == "Game {game} of {games} is over"
+    assert Texts({})["gameOver"] == ENGLISH["gameOver"]
     for name, own in IN_TALK.items():
         assert set(places(ENGLISH[own])) == set(places(ENGLISH[name])), name
 
