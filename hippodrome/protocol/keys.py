@@ -88,6 +88,11 @@ def handover_key(project_id: str, server_name: str) -> str:
     return f"{handovers_folder(project_id)}{server_name}.json"
 
 
+def tape_key(folder: str, step: str, number: int) -> str:
+    """Return the key of a piece of the tape of a game step, in the folder of a server's recordings; the first is 1."""
+    return f"{folder}/{step}-talk-{number:04d}.json"
+
+
 def with_number(key: str, number: int) -> str:
     """Return the key with a number before its suffix, for a recording whose own key is taken.
 

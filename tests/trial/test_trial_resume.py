@@ -138,7 +138,7 @@ async def test_an_episode_whose_replay_differs_begins_again(launch, open_client,
     await play(first, open_client, 20)
     second = launch(agent=grid(None) + DICE, trial=trial, SERVER="a-2")
     client = await play(second, open_client, 5, stop=True)
-    assert [words for words in client.errors if "begins again" in words]
+    assert [words for words in client.errors if "starts again" in words]
     (lines,) = second.recordings(server="a-2").values()
     assert [line["kind"] for line in lines[:2]] == ["header", "reset"]
     assert lines[1]["episode"] == 1

@@ -2,9 +2,9 @@
 
 Servers run researchers' code and have no rights on AWS. With presigned requests a server may read the certificate, its
 handover document if it is a warm server, and the recordings of its participant's earlier servers. It may create its
-own recordings, create and read the answers of its game steps, and read those of the steps that `answers` names. The
-credential is derived from the installation's secret (`secret.py`). It is not the token, which the participant's
-browser knows.
+own recordings and the pieces of its tapes, create and read the answers of its game steps, and read those of the steps
+that `answers` names. The credential is derived from the installation's secret (`secret.py`). It is not the token, which
+the participant's browser knows.
 
 A session's server may also read the session's document. Its answers are the answers of the members whom that document
 names, and its recordings are the session's. With `matching: match`, as long as it has no members, it may read the
@@ -58,9 +58,11 @@ MAX_BODY = 32 * 1024  # bytes
 MAX_ANSWER = 64 * 1024  # bytes
 MAX_RECORDING = 5 * 1024**3  # bytes; S3 takes no more in one PUT
 MAX_RECORDED = 20 * 1024**3  # bytes of all recordings of one server: the size of a Fargate task's disk
-MAX_RECORDINGS = 2_000  # the most recordings of one server
+MAX_RECORDINGS = 6_000  # the most recordings of one server, with the pieces of its tapes: one for 2 s of talk at most
 
-_RECORDING = re.compile(r"([A-Za-z0-9_-]{1,64})-(?:trial|episode-[0-9]{4,6})(?:-[1-9][0-9]?)?\.jsonl\.gz")
+_RECORDING = re.compile(
+    r"([A-Za-z0-9_-]{1,64})-(?:(?:trial|episode-[0-9]{4,6})(?:-[1-9][0-9]?)?\.jsonl\.gz|talk-[0-9]{4,5}\.json)"
+)
 
 
 class Presigned(NamedTuple):

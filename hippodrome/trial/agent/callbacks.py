@@ -265,19 +265,20 @@ class Callbacks:
         if not returned and self.first_late is None:
             self.first_late = name
 
-    def session_of(self, name: str, player: str) -> Session:
-        """Return the session for a call of `reply` or `moderate` about a player's line. For any thread."""
+    def session_of(self, name: str, player: str, n: int | None) -> Session:
+        """Return the session for a call of `reply` or `moderate` about a player's line; `n` is the number of the line
+        to answer. For any thread."""
         now = self._now
         where = {"episode": now.episode, "step": now.ticks}
-        return self._session(_Call(self._notes, name, where, lambda: self._late(self.recorded)), player)
+        return self._session(_Call(self._notes, name, where, lambda: self._late(self.recorded)), player, n)
 
     def talk_failed(self, name: str, error: Exception) -> None:
         """Record and log the error of `reply` or `moderate`. For the event loop's thread."""
         self._notes.failed(name, error, episode=self._now.episode, step=self._now.ticks)
         self._late(self.recorded)
 
-    def _session(self, call: _Call, player: str | None) -> Session:
-        """Return the session for a call. `player`: whose talk it has; None for all."""
+    def _session(self, call: _Call, player: str | None, n: int | None = None) -> Session:
+        """Return the session for a call. `player`: whose talk it has; None for all. `n`: the line to answer."""
         facts, now, talk = self.facts, self._now, self._talk
         return Session(
             trial=facts.trial,
@@ -302,7 +303,7 @@ class Callbacks:
             options=talk.options,
             say=_discard if self.replaying else talk.say or _nobody,
             ask=talk.ask,
-            _lines=lambda: talk.lines(player),
+            _lines=lambda: talk.lines(player, n),
         )
 
 

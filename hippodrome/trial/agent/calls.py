@@ -44,6 +44,8 @@ class Calls:
         """The agent's callbacks, if it has any."""
         self.moment = Moment()
         """When in the game the agent is now. Any thread may read it."""
+        self.repeat: Callable[[Moment], None] = lambda moment: None
+        """Called while steps are taken again, after the reset and after each step: it answers lines again."""
         self._warned_of: set[str] = set()
         self._cut = False  # whether a value of an info was too large in the previous line
 
@@ -82,6 +84,8 @@ class Calls:
     def _stepped(self) -> None:
         """Note that a step is over, also for whatever the agent has called in it."""
         self.moment = replace(self.moment, step=self.moment.step + 1)
+        if self.moment.replaying:
+            self.repeat(self.moment)
 
     def _replay(self, call: ReplayCall) -> Replayed:
         if self.callbacks:
@@ -206,6 +210,7 @@ class AgentCalls(Calls):
             raise Diverged("the environment takes no seed")
         if self.callbacks:
             self.callbacks.episode_began(unfinished.number, {PLAYER: first}, {PLAYER: info})
+        self.repeat(self.moment)
         for step in unfinished.steps:
             for word in step.feedback:
                 self._feedback(word)

@@ -164,6 +164,7 @@ class JointCalls(Calls):
             raise Diverged("the environment takes no seed")
         if self.callbacks:
             self.callbacks.episode_began(unfinished.number, joint.observations, joint.infos)
+        self.repeat(self.moment)
         self._ended = frozenset()
         observed = _Observations(unfinished)
         observed.add(0, joint)

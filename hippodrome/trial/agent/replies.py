@@ -48,8 +48,9 @@ class TalkOfAgent:
 
     options: Mapping[str, Any] = field(default_factory=dict)
     """The section `options` of the trial, filled in."""
-    lines: Callable[[str | None], list[dict[str, Any]]] = lambda player: []
-    """Returns the lines that a player has read or said; with None, all lines."""
+    lines: Callable[[str | None, int | None], list[dict[str, Any]]] = lambda player, n: []
+    """Returns the lines that a player may read; with None, all lines. With the number of the line to answer, without
+    what came after it, and with that line as the last one."""
     say: Callable[..., None] | None = None
     """None if nobody talks in this game."""
     ask: Callable[..., str] = _no_model
@@ -64,15 +65,11 @@ class Mouth:
         self._loop = asyncio.get_running_loop()
         self._room = threading.Semaphore(_MAX_UNSAID)
 
-    def lines(self, player: str | None) -> list[dict[str, Any]]:
+    def lines(self, player: str | None, n: int | None) -> list[dict[str, Any]]:
         """Return the lines so far, as `TalkOfAgent.lines` says. For any thread."""
         talk = self._talk()
-        lines = [] if talk is None else list(talk.lines)
-        return [
-            {"by": line.by, "text": line.text, "episode": line.episode, "step": line.step}
-            for line in lines
-            if player is None or line.read_by(player)
-        ]
+        lines = [] if talk is None else talk.lines_of(player, n)
+        return [{"by": line.by, "text": line.text, "episode": line.episode, "step": line.step} for line in lines]
 
     def say(self, text: str, to: str | Sequence[str] | None = None, by: str | None = None) -> None:
         """Say a line to these players, or to all. For any thread. Raises ValueError and TypeError."""
@@ -99,15 +96,15 @@ class Mouth:
 class Replies:
     """Asks `reply` and `moderate`.
 
-    `session` makes, on any thread, the session for a call of this name about a player. `grows`, `ended` and `moderated`
-    are told what they say. `failed` gets the name and the error of a call that raised or was given up.
+    `session` makes, on any thread, the session for a call of this name about a player's line. `grows`, `ended` and
+    `moderated` are told what they say. `failed` gets the name and the error of a call that raised or was given up.
     """
 
     def __init__(
         self,
         reply: Reply | None,
         moderate: Reply | None,
-        session: Callable[[str, str], Any],
+        session: Callable[[str, str, int | None], Any],
         *,
         grows: Callable[[int, str], None],
         ended: Callable[[int, str | None], None],
@@ -155,10 +152,10 @@ class Replies:
 
         self._replies.add(lambda: self._reply(reply, effect, said), ended)
 
-    def _reply(self, reply: Reply, effect: AskReply, said: list[str]) -> str | None:
+    def _reply(self, reply: Reply, effect: AskReply, said: list[str], *, grows: bool = True) -> str | None:
         """Call `reply` on its thread; collect in `said` what it yields."""
         self.answering = effect.n
-        result = reply(self._session("reply", effect.player), effect.player, effect.text)
+        result = reply(self._session("reply", effect.player, effect.n), effect.player, effect.text)
         if result is None or isinstance(result, str):
             return None if result is None else result[: 2 * MAX_SAID]
         length, grown = 0, 0.0
@@ -171,11 +168,26 @@ class Replies:
             length += len(said[-1])
             if length >= MAX_SAID:
                 break
-            if time.monotonic() - grown >= _GROW_SECONDS:
+            if grows and time.monotonic() - grown >= _GROW_SECONDS:
                 grown = time.monotonic()
                 with contextlib.suppress(RuntimeError):  # the loop has ended
                     self._loop.call_soon_threadsafe(self._grows, effect.ask_id, "".join(said))
         return "".join(said)
+
+    def repeat(self, effect: AskReply) -> None:
+        """Call `reply` again for a line that an earlier server's agent has answered, and drop what it says.
+
+        For the agent's thread, while steps are taken again.
+        """
+        if self.reply is None:
+            return
+        try:
+            self._reply(self.reply, effect, [], grows=False)
+        except Exception as error:  # noqa: BLE001 - the researcher's code may raise anything
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._failed, "reply", error)
+        finally:
+            self.answering = None
 
     def check(self, effect: Moderate) -> None:
         """Ask `moderate` about a line, after the lines before."""
@@ -188,7 +200,7 @@ class Replies:
             self._moderated(effect.ask_id, result)
 
         def call() -> str | bool | None:
-            result = moderate(self._session("moderate", effect.player), effect.player, effect.text)
+            result = moderate(self._session("moderate", effect.player, None), effect.player, effect.text)
             if result is None or result is False or isinstance(result, str):
                 return result
             raise TypeError(f"moderate returns None, a text or False, not {type(result).__name__}")

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -136,6 +136,55 @@ class Talk:
         self._ask_id = 0  # of the last question to the agent
         self._begun: set[int] = set()
         self._circles = self._make_circles()
+        self._answered: set[int] = set()  # lines that earlier servers' agents have answered
+        self._unanswered: list[Line] = []  # lines that they have not
+
+    def restore(self, records: Iterable[Mapping[str, Any]]) -> None:
+        """Take over what earlier servers have recorded, before anything is said."""
+        answered: set[int] = set()
+        for record in records:
+            kind = record["kind"]
+            if kind == "answered":
+                answered.add(record["n"])
+            elif kind == "line" and record.get("held"):
+                self._said[record["by"], record["id"]] = None
+            elif kind == "line":
+                self._restore_line(record)
+        answered |= {line.fields["answers"] for line in self.lines if "answers" in line.fields}
+        self._unanswered = [line for line in self.lines if self._is_for_agent(line) and line.n not in answered]
+        self._answered = answered
+
+    def _restore_line(self, record: Mapping[str, Any]) -> None:
+        n, by, text, to = record["n"], record["by"], record["text"], record.get("to")
+        fields = {"answers": record["answers"]} if "answers" in record else {}
+        where = record["episode"], record["step"]
+        line = Line(n, by, text, None if to is None else tuple(to), record.get("id"), *where, fields=fields)
+        self.lines.append(line)
+        self._n = max(self._n, line.n)
+        if line.id is not None:
+            self._said[line.by, line.id] = line
+        for circle in self._all_circles():
+            if line.by in circle.speakers and any(line.read_by(name) for name in circle.speakers if name != line.by):
+                circle.at = circle.speakers.index(line.by)
+                circle.pass_on(())
+
+    def _is_for_agent(self, line: Line) -> bool:
+        agent = self.agents[:1]
+        return line.by in self.people and bool(agent) and (line.to is None or agent[0] in line.to)
+
+    def repeats(self, episode: int) -> list[tuple[int, AskReply]]:
+        """Return what earlier servers have asked the agent in this episode and it has answered, after the step."""
+        asked = [
+            (line.step, AskReply(0, line.by, line.text, line.n))
+            for line in self.lines
+            if line.episode == episode and self._is_for_agent(line) and line.n in self._answered
+        ]
+        greetings = [
+            (line.step, AskReply(0, line.to[0] if line.to else self.people[0], "", None))
+            for line in self.lines
+            if line.episode == episode and line.fields.get("answers") == 0
+        ]
+        return sorted([*greetings, *asked], key=lambda repeat: repeat[0])
 
     # ---- who talks to whom
 
@@ -207,6 +256,9 @@ class Talk:
         if id(circle) in self._begun:
             return
         self._begun.add(id(circle))
+        for line in self._unanswered:
+            if line.by in circle.speakers and (not self.alternates or circle.turn in self.agents):
+                self._ask(line.by, line.text, line, self._answer_readers(line))
         if self.alternates and circle.turn in self.agents and not self.replies:
             self._next_turn(circle, None)
         agent_is_first = bool(self.agents) and self._chat.first == self.agents[0]
@@ -378,6 +430,8 @@ class Talk:
         if line is not None:
             line.text, line.more = text or line.text, False
             self._emit(RecordTalk(line.record()))
+        elif asked[1] is not None:
+            self._emit(RecordTalk({"kind": "answered", "n": asked[1].n}))
         if not self._asked:
             self._types(self.agents[0], False)
         circle = self._circles[asked[0]]
@@ -389,7 +443,7 @@ class Talk:
 
     def _answer_of(self, ask_id: int, text: str) -> Line:
         _, line, to = self._asked[ask_id]
-        return self._append(self.agents[0], text, to, fields={} if line is None else {"answers": line.n})
+        return self._append(self.agents[0], text, to, fields={"answers": 0 if line is None else line.n})
 
     def agent_says(self, text: str, to: Sequence[str] | None, by: str | None, now: float) -> bool:
         """Say a line of the agent. Return False if it was dropped, because there are too many."""
@@ -441,15 +495,27 @@ class Talk:
         self.lines.append(line)
         return line
 
+    def lines_of(self, player: str | None, n: int | None) -> list[Line]:
+        """Return the lines that a player may read, all with None. For any thread.
+
+        If the agent is to answer line `n`: without what people said after it, and without what the agent said after its
+        answer, which there is if steps are taken again; and with line `n` as the last one.
+        """
+        lines = [line for line in list(self.lines) if player is None or line.read_by(player)]
+        if n is None:
+            return lines
+        end = next((line.n for line in lines if line.fields.get("answers") == n), self._n + 1)
+        before = [line for line in lines if (line.n < n if line.by in self.people else line.n < end)]
+        return before + [line for line in lines if line.n == n]
+
     def said_by(self, player: str) -> int:
         """Return the number of lines that the player has said."""
         return sum(line.by == player for line in self.lines)
 
     def close(self) -> None:
-        """Record the lines that the agent has not finished, because the server must end."""
+        """Record the lines that the agent has not finished, because the server must end. The next server asks again."""
         for line in self._growing.values():
-            line.more = False
-            self._emit(RecordTalk({**line.record(), "cut": True}))
+            self._emit(RecordTalk({**line.record(), "kind": "cut"}))
         self._growing.clear()
         self._asked.clear()
 

@@ -43,7 +43,7 @@ connection belongs to a human, and each human plays one player.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from enum import Enum, auto
 from typing import Any, Literal
 
@@ -199,12 +199,15 @@ class Trial:
         vacant: Sequence[str] = (),
         erased: Sequence[str] = (),
         answered: Mapping[str, Mapping[str, Any]] | None = None,
+        said: Iterable[Mapping[str, Any]] = (),
     ) -> list[Effect]:
         """Begin the game with the environment's `players`, after what earlier servers have `recorded`.
 
         In a session: `places` is the player that each member plays, by the member's id. `vacant` are the players
         without a member, whom policies play. `erased` are the players of members whose data were erased, and who never
         come. `answered` holds the answers of this step that some members have already, by their ids.
+
+        `said` are the records of the talk on earlier servers.
         """
         if self.phase is not Phase.STARTING:
             return []
@@ -236,6 +239,7 @@ class Trial:
                 send=self._clients.send_talk,
                 emit=self._emit,
             )
+            self.talk.restore(said)
         if recorded is not None:
             self.progress.resume(recorded.ended)
             self._beginning.unfinished = recorded.unfinished

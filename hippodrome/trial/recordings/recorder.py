@@ -20,6 +20,7 @@ from hippodrome.trial.recordings.recording import Recording
 from hippodrome.trial.recordings.resume import load_recorded
 from hippodrome.trial.recordings.spool import Spool, retry_forever, store_file
 from hippodrome.trial.recordings.store import Store, short_error
+from hippodrome.trial.recordings.tape import Tape
 from hippodrome.trial.settings import TrialSettings
 
 log = logging.getLogger("trial")
@@ -42,6 +43,8 @@ class Recorder:
         self._flushing: asyncio.Task[None] | None = None
         self._uploads: set[asyncio.Task[None]] = set()
         self._hurried = asyncio.Event()
+        self.tape = Tape(settings, step, store, kept=not spool.local_only)
+        """The tape of what is said."""
 
     # ---- before
 
@@ -184,11 +187,12 @@ class Recorder:
 
     @property
     def storing(self) -> bool:
-        """Whether a recording is closed and not stored yet."""
-        return any(not task.done() for task in self._uploads)
+        """Whether a recording is closed, or something was said, and it is not stored yet."""
+        return self.tape.storing or any(not task.done() for task in self._uploads)
 
     async def stored(self) -> None:
-        """Wait until all closed recordings are stored."""
+        """Wait until all closed recordings, and what was said, are stored."""
+        await self.tape.stored()
         if self._uploads:
             await asyncio.wait(self._uploads)
 

@@ -30,16 +30,19 @@ def load_recorded(store: Store, folder: str, server: str, step: str) -> Recorded
     `folder` has the recordings of the participant or session. `server` is this server's name, which ends in the number
     of its attempt. Blocks; raises the store's errors.
     """
-    match = _ATTEMPT.fullmatch(server)
-    if match is None:
-        return None
     recorded = RecordedTrial()
     found = False
-    for attempt in range(1, int(match[2])):
-        for lines in _recordings(store, f"{folder}/{match[1]}-{attempt}/{step}", recorded):
+    for name in earlier_servers(server):
+        for lines in _recordings(store, f"{folder}/{name}/{step}", recorded):
             found = True
             add_lines(recorded, lines)
     return recorded if found else None
+
+
+def earlier_servers(server: str) -> list[str]:
+    """Return the names of the servers before this one, whose name ends in the number of its attempt."""
+    match = _ATTEMPT.fullmatch(server)
+    return [] if match is None else [f"{match[1]}-{attempt}" for attempt in range(1, int(match[2]))]
 
 
 def _recordings(store: Store, prefix: str, recorded: RecordedTrial) -> Iterable[list[dict[str, Any]]]:

@@ -51,7 +51,8 @@ from hippodrome.trial.core.messages import Message
 from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
 from hippodrome.trial.core.trial import Trial
-from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
+from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.llm.endpoint import Endpoint, Game
 from hippodrome.trial.llm.ledger import Ledger, Moment
 from hippodrome.trial.llm.partner import NoPrompt, Partner, prompt_of
 from hippodrome.trial.policies.places import Places
@@ -220,7 +221,7 @@ class TrialLoop:
         given = await self._answers_given(answered)
         started = await agent_ready
         playing = None if started is None else await self._players_of(started)
-        if started is None or playing is None or given is None:
+        if started is None or playing is None or given is None or not await self._read_tape():
             self._apply(self.core.agent_failed(self._loop.time()))
             return
         recorded = await self._recorder.recorded()
@@ -244,11 +245,38 @@ class TrialLoop:
             vacant=playing.vacant,
             erased=playing.erased,
             answered=answered,
+            said=self._recorder.tape.earlier,
         )
-        if self.core.talk is not None and self._replies is not None:
-            self.core.talk.replies = self._replies.reply is not None
-            self.core.talk.moderates = self._replies.moderate is not None
+        self._use_talk(recorded)
         self._apply(effects)
+
+    async def _read_tape(self) -> bool:
+        """Read what was said on earlier servers. Return False if that fails, which is logged.
+
+        Then another server replaces this one: without the tape, lines would be lost and calls paid for again.
+        """
+        config = self.settings.trial
+        if config.chat is not None or config.llm is not None:
+            try:
+                await self._recorder.tape.load()
+            except Exception as error:  # noqa: BLE001 - the store may raise anything
+                log.error("cannot read what was said before (%s)", short_error(error))
+                return False
+        return True
+
+    def _use_talk(self, recorded: RecordedTrial | None) -> None:
+        """Let the agent answer and look at lines from now on, and, while steps are taken again, lines of before."""
+        talk, replies = self.core.talk, self._replies
+        if talk is None or replies is None:
+            return
+        talk.replies, talk.moderates = replies.reply is not None, replies.moderate is not None
+        repeats = talk.repeats(recorded.unfinished.number) if recorded is not None and recorded.unfinished else []
+
+        def repeat(moment: Moment) -> None:
+            while repeats and repeats[0][0] <= moment.step:
+                replies.repeat(repeats.pop(0)[1])
+
+        self._calls.repeat = repeat
 
     async def _earlier(self) -> tuple[Mapping[str, Any] | None, Mapping[str, Any]]:
         """Return the stored answer if the step is over, else None; and the answers of some members if it is not over.
@@ -362,7 +390,8 @@ class TrialLoop:
             self._endpoint.play(None)
             return
         self._partner = Partner(section, prompt_of(section, self.settings.agent_dir))
-        self._endpoint.play(Game(section, Ledger.of(section, ()), NoTape(), self._moment))
+        ledger = Ledger.of(section, self._recorder.tape.earlier)
+        self._endpoint.play(Game(section, ledger, self._recorder.tape, self._moment))
 
     def _moment(self) -> Moment:
         """Return when in the game the agent is now. May be called on any thread."""
@@ -414,9 +443,17 @@ class TrialLoop:
                 grows=partial(self._do, self.core.reply_grows),
                 ended=partial(self._do, self.core.reply_ended),
                 moderated=partial(self._do, self.core.moderated),
-                failed=callbacks.talk_failed,
+                failed=self._talk_failed,
                 fallback=None if model is None else model.fallback,
             )
+
+    def _talk_failed(self, name: str, error: Exception) -> None:
+        """Record that `reply` or `moderate` has raised, or took too long."""
+        assert self._calls.callbacks is not None
+        self._calls.callbacks.talk_failed(name, error)
+        moment = self._calls.moment
+        where = {"episode": moment.episode, "step": moment.step}
+        self._recorder.tape.add({"kind": "error", "method": name, "name": type(error).__name__, **where})
 
     def _ask_agent(self, effect: AskReply | Moderate) -> None:
         assert self._replies is not None
@@ -427,6 +464,7 @@ class TrialLoop:
 
     def _record_talk(self, effect: RecordTalk) -> None:
         """Add a line of the talk to the tape."""
+        self._recorder.tape.add(dict(effect.fields))
 
     def _record_line(self, effect: RecordLine) -> None:
         fields = effect.fields
@@ -467,11 +505,20 @@ class TrialLoop:
 
     async def _save_all(self, effect: SaveAnswer) -> None:
         """Store the answers after the recordings. Also wait until the answers of earlier `SaveMember` are stored."""
-        await self._recorder.save(effect.answers)
+        await self._recorder.save(None if effect.answers is None else self._with_talk(effect.answers))
         for human, answers in effect.by_human.items():
             self._save_member(SaveMember(human, answers))
         if self._saving_members:
             await asyncio.wait(self._saving_members)
+
+    def _with_talk(self, answers: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Add to an answer how much the participant has said, if people talk."""
+        talk = self.core.talk
+        if talk is None:
+            return answers
+        fallbacks = self._replies.fallbacks if self._replies is not None else 0
+        said = talk.said_by(str(answers.get("player", talk.people[0])))
+        return {**answers, "talk": {"lines": said, "fallbacks": fallbacks}}
 
     def _saved(self, task: asyncio.Task[None]) -> None:
         if task.cancelled():
@@ -482,7 +529,8 @@ class TrialLoop:
             self._do(self.core.answer_saved)
 
     def _save_member(self, effect: SaveMember) -> None:
-        task = asyncio.create_task(self._recorder.save_member(effect.human, effect.answers, effect.later))
+        answers = self._with_talk(effect.answers)
+        task = asyncio.create_task(self._recorder.save_member(effect.human, answers, effect.later))
         self._saving_members.add(task)
 
         def saved(task: asyncio.Task[None]) -> None:

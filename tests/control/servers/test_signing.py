@@ -110,6 +110,8 @@ def put(key: str, size: int | None = 9) -> dict[str, Any]:
         put(f"{TRIALS}/3-episode-0001-2.jsonl.gz"),
         put(f"{TRIALS}/3-episode-12345.jsonl.gz"),
         put(f"{TRIALS}/3-trial.jsonl.gz"),
+        put(f"{TRIALS}/3-talk-0001.json"),
+        put(f"{TRIALS}/3-talk-12345.json"),
     ],
     ids=str,
 )
@@ -141,7 +143,7 @@ OTHER = ids.server_name(ids.server_label(PROJECT, BOB), 1)
         put(f"{FOLDER}/answers/3.json/x"), put(f"{FOLDER}/answers/3"), put(f"/{ANSWER}"), put(f"{ANSWER} "),
         put(f"{FOLDER}/answers/../answers/3.json"), put(f"{FOLDER}/answers/3.JSON"),
         put(ANSWER, None), put(ANSWER, -1), put(ANSWER, MAX_ANSWER + 1), put(f"{TRIALS}/3-trial.jsonl.gz", 5 * 1024**3 + 1),
-        put(f"{TRIALS}/4-trial.jsonl.gz"), put(f"{TRIALS}/3-trial.jsonl.gz.part"), put(f"{TRIALS}/3-trial-0.jsonl.gz"),
+        put(f"{TRIALS}/4-trial.jsonl.gz"), put(f"{TRIALS}/3-trial.jsonl.gz.part"), put(f"{TRIALS}/3-talk-1.json"), put(f"{TRIALS}/4-talk-0001.json"), put(f"{TRIALS}/3-trial-0.jsonl.gz"),
         put(f"{TRIALS}/3-trial-100.jsonl.gz"), put(f"{TRIALS}/x/3-trial.jsonl.gz"), put(f"{TRIALS}/3-episode-1.jsonl.gz"),
         put(f"{TRIALS}/3-trial.jsonl.gz\n"), put(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"), put(f"{FOLDER}/trials/3-trial.jsonl.gz"),
         get(f"{TRIALS}/3-trial.jsonl.gz"), get(f"{FOLDER}/trials/{NAME[:-1]}2/3-trial.jsonl.gz"),
@@ -240,8 +242,8 @@ def test_the_size_of_a_servers_documents_is_limited(world: World, monkeypatch: p
     assert world.ask(put(ANSWER))[0] == 200, "its answer has room in any case"
 
 
-def test_a_server_may_store_2000_recordings_of_20_gib_in_all(world: World) -> None:
-    assert (MAX_RECORDED, MAX_RECORDINGS) == (20 * 1024**3, 2_000)
+def test_a_server_may_store_6000_recordings_of_20_gib_in_all(world: World) -> None:
+    assert (MAX_RECORDED, MAX_RECORDINGS) == (20 * 1024**3, 6_000)
 
 
 # When
