@@ -6,6 +6,8 @@
   const MOST = 250_000; // bytes of the encoded form; the server refuses forms over 256 KiB
   const SLOW = 10_000; // ms until we say that sending takes long
   const GIVE_UP = 20_000; // ms until the button works again
+  const MOST_MS = 2 ** 31 - 1; // setTimeout takes no more
+  const SOON = 600; // seconds: if the page can be answered later than that, it says when
   const KEEP = 2 * 24 * 3600 * 1000; // ms that a draft outlives its page: participants may share a device
   const UNKEPT = new Set(["password", "hidden", "file", "submit", "image", "button", "reset"]);
 
@@ -90,7 +92,7 @@
   const status = inForm(".status:last-of-type").at(0);
   let sending = false;
   let warnedOffline = false;
-  const shownAt = performance.now();
+  const shownAt = Date.now(); // goes on while a laptop sleeps
   let timers = [];
 
   function say(text, warn = false) {
@@ -129,16 +131,27 @@
     return Math.ceil(number / unit) * unit;
   }
 
+  // The server takes no answers before.
+  function secondsLeft() {
+    return Number(page.least ?? 0) - (Date.now() - shownAt) / 1000;
+  }
+
+  function sayWhen(warn) {
+    const left = secondsLeft();
+    const style = { weekday: "long", day: "numeric", month: "long", hour: "numeric", minute: "numeric" };
+    const time = new Date(Date.now() + left * 1000).toLocaleString(TEXT.language, style);
+    idle(left > SOON ? TEXT.opensAt(time) : TEXT.tooSoon(Math.ceil(left)), warn);
+    timers = [setTimeout(say, Math.min(left * 1000, MOST_MS), "")];
+  }
+
   function onSubmit(event) {
     if (sending) {
       event.preventDefault();
       return;
     }
-    const left = Number(page.least ?? 0) - (performance.now() - shownAt) / 1000; // the server takes no answers before
-    if (left > 0) {
+    if (secondsLeft() > 0) {
       event.preventDefault();
-      idle(TEXT.tooSoon(Math.ceil(left)), true);
-      timers = [setTimeout(say, left * 1000, "")];
+      sayWhen(true);
       return;
     }
     const submitter = event.submitter?.name ? event.submitter : undefined;
@@ -243,5 +256,6 @@
   listen("change", onInput);
   listen("submit", onSubmit);
   listen("invalid", onInvalid, true);
+  if (secondsLeft() > SOON) sayWhen(false);
   window.addEventListener("pageshow", (event) => { if (event.persisted) idle(); });
 })();

@@ -63,6 +63,20 @@ LOOKS: Mapping[str, object] = {
     "events": Events(start_server_step="about", stop_server_step="debrief"),
 }
 """A game and a page that are repeated in an order of the participant's own."""
+DAY = 86_400.0
+SITTINGS: Mapping[str, object] = {
+    "conditions": CONDITIONS,
+    "steps": [
+        Step("consent", "consent"),
+        Step("ready", "ready"),
+        Step("game", "game", sections=SECTIONS),
+        Step("tomorrow", "tomorrow", min_seconds=DAY),
+        Step("again", "game", sections=SECTIONS),
+        Step("debrief", "debrief"),
+    ],
+    "events": Events(start_server_step="ready", stop_server_step="debrief"),
+}
+"""Two sittings a day apart, with a game in each."""
 PAY: Mapping[str, object] = {
     "conditions": (Factor("pay", {"equal": "equal", "best": "best"}),),
     "steps": [

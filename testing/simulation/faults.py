@@ -16,7 +16,19 @@ from hippodrome.protocol.keys import answer_key
 from testing.port_faults import FaultAt, PortFault
 from testing.simulation import design_checks, session_checks
 from testing.simulation.conditions import AUTHORITY, Conditions
-from testing.simulation.designs import LOOKS, PAGES, PAY, SOUP, TOGETHER, WRONG, Designed, DesignedMember, Ways
+from testing.simulation.designs import (
+    DAY,
+    LOOKS,
+    PAGES,
+    PAY,
+    SITTINGS,
+    SOUP,
+    TOGETHER,
+    WRONG,
+    Designed,
+    DesignedMember,
+    Ways,
+)
 from testing.simulation.members import Habits, SimulatedMember
 from testing.simulation.people import SimulatedParticipant, SimulatedVisit
 from testing.simulation.world import PROJECT, SimulatedWorld
@@ -44,6 +56,7 @@ class SimulatedJourney:
     project: Mapping[str, object] = field(default_factory=dict)  # other keys of the project
     ways: Sequence[Ways] = ()  # instead of `person` and `others`: participants of a study with a design
     ends: Sequence[str | None] = ()  # of each of them, the end that is reached without a fault; None: the last step
+    horizon: float = HORIZON
 
     def people(self, world: SimulatedWorld) -> list[SimulatedParticipant]:
         """Make all participants of the journey. They come at the same time, but take different times to read."""
@@ -252,6 +265,21 @@ JOURNEYS_OF_DESIGNS = (
         ],
         ends=["left by themselves"],
     ),
+    SimulatedJourney(
+        "two sittings a day apart",
+        project=SITTINGS,
+        ways=[
+            Ways(pauses={"tomorrow": DAY}, reloads=["tomorrow"]),
+            Ways(pauses={"tomorrow": DAY / 2 + 600}, tabs=True),
+        ],
+        horizon=DAY + HORIZON,
+    ),
+    SimulatedJourney(
+        "a pair plays again a day later",
+        project={**SITTINGS, "players": 2, "patience": 120.0},
+        ways=[Ways(pauses={"tomorrow": DAY}), Ways(pauses={"tomorrow": DAY})],
+        horizon=DAY + HORIZON,
+    ),
     SimulatedJourney("a pair is assigned together", project=PAY, ways=[Ways(tabs=True), Ways(back=True)]),
     SimulatedJourney(
         "a pair plays several games in one order, and a third comes late",
@@ -321,7 +349,7 @@ def run(
     people = journey.people(world)
     for person in people:
         world.clock.spawn(person.walk, delay=journey.comes)
-    world.settle(HORIZON)
+    world.settle(journey.horizon)
     documents = world.platform.documents.kept
     lost = [s for p in people for s in p.answered if answer_key(world.project.id, p.visit.user, s) not in documents]
     first, *others = [person.visit for person in people]

@@ -14,8 +14,11 @@ import pytest
 
 from hippodrome.control import registry
 from hippodrome.control.config import read_project
+from hippodrome.control.model import server
 from hippodrome.control.model.design import latin_rows
 from hippodrome.control.model.project import step_key
+from hippodrome.control.model.records import to_json
+from hippodrome.control.model.server import Reason, Server
 from hippodrome.control.ports import Conflict, Topic
 from testing.designed import DesignedStudy, write
 from testing.fake_platform import FakePlatform
@@ -57,6 +60,20 @@ trial: {game: kitchen, maxEpisodes: 5}
 """
 
 
+SITTINGS = """
+project:
+  id: days
+  live: true
+  steps:
+    - consent
+    - game
+    - tomorrow: {minSeconds: 86400}
+    - game2: {maxEpisodes: 2}
+    - debrief
+trial: {game: kitchen}
+"""
+
+
 @pytest.fixture
 def platform() -> FakePlatform:
     from hippodrome.functions import installed
@@ -78,6 +95,15 @@ def heading(page: str) -> str:
     found = re.search(r"<h1[^>]*>(.*?)</h1>", page)
     assert found, page
     return found[1]
+
+
+def started(study: DesignedStudy, user: str, attempt: int, before: Server | None = None) -> Server:
+    """Store the record of a server that is being started."""
+    platform = study.platform
+    made = server.new_attempt(study.project, user, attempt, settings=platform.settings, now=platform.now())
+    record = server.replacing(server.close(before, Reason.ENDED, platform.now()), made) if before else made
+    platform.documents.put(server.key(record.label), to_json(record))
+    return record
 
 
 def topics(platform: FakePlatform) -> list[Topic]:
@@ -439,6 +465,50 @@ def test_a_page_has_a_least_and_a_longest_time(tmp_path: Path, platform: FakePla
     platform.wait(seconds=31)
     assert heading(alice.get()) == "Thanks"
     assert times.answers("alice")["rate"] == {"outcome": "timeOver"}
+
+
+def test_two_sittings_a_day_apart_have_a_server_each(tmp_path: Path, platform: FakePlatform) -> None:
+    pages = PAGES | {"tomorrow": "<h1>Until tomorrow</h1><button>Go on</button>"}
+    days = DesignedStudy(write(tmp_path / "study", SITTINGS, pages), platform)
+    alice = days.visitor("alice")
+    alice.answer(alice.get(), agree="yes")
+    alice.get()
+    first = started(days, "alice", 1)
+    days.play("alice", "game")
+    page = alice.get()
+    assert 'data-least="86400"' in page
+    platform.wait(minutes=11)
+    days.platform.documents.put(server.key(first.label), to_json(server.close(first, Reason.ENDED, platform.now())))
+    alice.answer(page)
+    assert 'data-least="85740"' in alice.get(), "the time runs while the page is closed"
+    platform.wait(hours=24)
+    page = alice.get()
+    assert "data-least" not in page
+    alice.answer(page)
+    before = len(platform.bus.sent)
+    game = json.loads(alice.send(accept="application/json")["body"])
+    (sent,) = platform.bus.sent[before:]
+    assert (sent[0], sent[1]["attempt"]) == (Topic.START, 2)
+    assert (game["state"], game["attempt"], game["step"]) == ("queued", 2, "game2")
+    alice.query += "&poll=game2&attempt=2"
+    assert json.loads(alice.get(accept="application/json"))["state"] == "queued", "its record is not there yet"
+    started(days, "alice", 2, first)
+    assert json.loads(alice.get(accept="application/json"))["state"] == "starting"
+
+
+def test_who_waits_for_the_second_sitting_still_counts_in_their_cell(tmp_path: Path, platform: FakePlatform) -> None:
+    pages = PAGES | {"tomorrow": "<button>Go on</button>"}
+    config = SITTINGS.replace("  steps:", "  conditions: {pay: [low, high]}\n  steps:", 1)
+    days = DesignedStudy(write(tmp_path / "study", config, pages), platform)
+    for number in range(20):
+        person = days.visitor(f"P{number}")
+        person.answer(person.get(), agree="yes")
+        person.get()
+        platform.wait(hours=1)
+    conditions = Counter(days.stored(f"P{number}", "assignment")["condition"]["pay"] for number in range(20))
+    assert conditions == {"low": 10, "high": 10}
+    cells = json.loads(platform.documents.kept["_cells/days.json"][0])
+    assert cells["people"] == {"low": 10, "high": 10}
 
 
 def test_time_runs_out_between_the_tries_of_a_check_too(tmp_path: Path, platform: FakePlatform) -> None:

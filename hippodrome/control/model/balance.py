@@ -22,7 +22,7 @@ from hippodrome.control.model.records import Record
 
 T = TypeVar("T")
 LEFT_AFTER = timedelta(minutes=60)
-"""Who does nothing for so long has left, and their place in the cell is free."""
+"""Who does nothing for so long has left, and their place in the cell is free: see `left_after`."""
 SETTLED_AT_ONCE = 5
 """The most participants who are looked up in one assignment; each costs a listing."""
 
@@ -30,6 +30,11 @@ SETTLED_AT_ONCE = 5
 def cells_key(project_id: str) -> str:
     """Return the key of the document with a study's cells."""
     return f"_cells/{project_id}.json"
+
+
+def left_after(project: Project) -> timedelta:
+    """Return for how long somebody may do nothing before they count as having left: longer if a page keeps them."""
+    return LEFT_AFTER + timedelta(seconds=max(step.min_seconds for step in project.steps))
 
 
 class Outcome(Enum):
@@ -58,9 +63,9 @@ class Cells(Record, frozen=True):
     rows: Mapping[str, Sequence[int]] = msgspec.field(default_factory=dict)
     drawn: Mapping[str, Draw] = msgspec.field(default_factory=dict)
 
-    def unsettled(self, now: datetime) -> list[str]:
-        """Return the participants to look up: the oldest of those who have done nothing for `LEFT_AFTER`."""
-        old = [user for user, draw in self.drawn.items() if now - draw.at > LEFT_AFTER]
+    def unsettled(self, now: datetime, most: timedelta = LEFT_AFTER) -> list[str]:
+        """Return the participants to look up: the oldest of those who have done nothing for longer than `most`."""
+        old = [user for user, draw in self.drawn.items() if now - draw.at > most]
         return sorted(old, key=lambda user: self.drawn[user].at)[:SETTLED_AT_ONCE]
 
     def settled(self, user_id: str, outcome: Outcome, last: datetime) -> Cells:
@@ -137,16 +142,20 @@ def _least(uses: Mapping[T, int]) -> list[T]:
 
 
 def outcome_of(
-    steps: Iterable[str], answered: Mapping[str, datetime], has_ended: bool, now: datetime
+    steps: Iterable[str],
+    answered: Mapping[str, datetime],
+    has_ended: bool,
+    now: datetime,
+    most: timedelta = LEFT_AFTER,
 ) -> tuple[Outcome, datetime]:
     """Return what became of a participant who has answered these steps, and the time of the last answer.
 
-    `steps` are the keys of their path without the last step.
+    `steps` are the keys of their path without the last step. Who has done nothing for longer than `most` has left.
     """
-    last = max(answered.values(), default=now - 2 * LEFT_AFTER)
+    last = max(answered.values(), default=now - 2 * most)
     if all(step in answered for step in steps):
         return Outcome.COMPLETE, last
-    is_active = not has_ended and now - last <= LEFT_AFTER
+    is_active = not has_ended and now - last <= most
     return Outcome.ACTIVE if is_active else Outcome.LEFT, last
 
 

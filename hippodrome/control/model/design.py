@@ -63,7 +63,7 @@ class Step(Record, frozen=True):
 
     @property
     def is_limited(self) -> bool:
-        """Whether the page's form says which try it is, and when it was shown."""
+        """Whether the page's form says which try it is, and since when it is shown."""
         return bool(self.right) or self.min_seconds > 0
 
     @property

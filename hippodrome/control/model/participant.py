@@ -112,6 +112,11 @@ class Progress:
         at = project.index(step.key)
         return self.answered.get(project.steps[at - 1].key) if at else None
 
+    def waited(self, project: Project, step: Step, now: datetime) -> timedelta:
+        """Return for how long the participant has been at `step`; at the first step since their arrival."""
+        reached = self.reached_at(project, step) or self.arrived
+        return max(now - reached, timedelta()) if reached else timedelta()
+
 
 def participant_key(project_id: str, user_id: str) -> str:
     """Return the key of a participant's record."""

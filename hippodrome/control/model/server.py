@@ -289,6 +289,15 @@ def requestable_attempt(record: Server) -> int | None:
     return record.attempt + 1 if record.attempt < MAX_ATTEMPTS else None
 
 
+def attempt_after_pause(record: Server, came: datetime | None) -> int | None:
+    """Return the attempt to start for a participant who `came` to a game after their server had ended; None if none.
+
+    The server had waited for nobody, or its time was over: the study has two sittings, or the participant was slow.
+    """
+    ended_before = came is not None and record.closed is not None and record.closed < came
+    return requestable_attempt(record) if ended_before and record.reason in (Reason.ENDED, Reason.DEADLINE) else None
+
+
 def may_go_without(record: Server) -> bool:
     """Return whether the participant may go on without the game, because no server could run it.
 

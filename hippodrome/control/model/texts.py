@@ -59,6 +59,7 @@ _PAGES = {
     "wrongOne": "One answer is not correct yet.",
     "wrongSome": "{number} answers are not correct yet.",
     "tooSoon": "Please take your time. You can continue in {seconds} s.",
+    "opensAt": "You can continue from {time}.",
     "triesOne": "You have one attempt left.",
     "triesSome": "You have {number} attempts left.",
     "endTitle": "Thank you",

@@ -19,6 +19,7 @@ from hippodrome.control.model.balance import (
     Outcome,
     assignment_of,
     cells_key,
+    left_after,
     most_active,
     outcome_of,
 )
@@ -87,7 +88,7 @@ class Assigning:
             cells = from_json(found.body, Cells) if found else Cells()
             if outcomes is None:
                 outcomes = self._outcomes(project, cells, now)
-            cells, draw = _settled(cells, outcomes, now).draw(project, owner, now, _RANDOM, cell)
+            cells, draw = _settled(project, cells, outcomes, now).draw(project, owner, now, _RANDOM, cell)
             try:
                 self._write(key, found, cells)
                 return draw
@@ -104,7 +105,7 @@ class Assigning:
     def _outcomes(self, project: Project, cells: Cells, now: datetime) -> Outcomes:
         """What became of those who have done nothing for long: whether they have finished, or left."""
         outcomes = {}
-        for owner in cells.unsettled(now):
+        for owner in cells.unsettled(now, left_after(project)):
             users = members_of(self._repository, project.id, owner) if is_session_id(owner) else [owner]
             outcomes[owner] = most_active([self._outcome(project, user_id, now) for user_id in users], now)
         return outcomes
@@ -112,12 +113,12 @@ class Assigning:
     def _outcome(self, project: Project, user_id: str, now: datetime) -> tuple[Outcome, datetime]:
         progress = self._repository.progress(project.id, user_id)
         path = [step.key for step in self._repository.own_project(project, user_id, progress).steps[:-1]]
-        return outcome_of(path, progress.answered, progress.has_ended, now)
+        return outcome_of(path, progress.answered, progress.has_ended, now, left_after(project))
 
 
-def _settled(cells: Cells, outcomes: Outcomes, now: datetime) -> Cells:
+def _settled(project: Project, cells: Cells, outcomes: Outcomes, now: datetime) -> Cells:
     """The cells without those who have finished or left, unless they were settled or drawn anew meanwhile."""
-    for owner in cells.unsettled(now):
+    for owner in cells.unsettled(now, left_after(project)):
         if owner in outcomes:
             cells = cells.settled(owner, *outcomes[owner])
     return cells

@@ -44,14 +44,16 @@ class PostedForm:
     step: str | None = None
     ticket: str | None = None
     action: str | None = None
-    shown: str | None = None  # which try the page showed, and when: see `Showing`
+    shown: str | None = None  # which try the page showed, and since when: see `Showing`
 
 
 class Showing(NamedTuple):
-    """A showing of a page whose tries or time are limited: the number of the try, and the time in seconds."""
+    """A showing of a page whose tries or time are limited: the number of the try, and when the participant came to the
+    step, in seconds.
+    """
 
     number: int
-    at: int
+    since: int
 
     @classmethod
     def read(cls, text: str | None) -> Showing | None:
@@ -60,7 +62,7 @@ class Showing(NamedTuple):
         return cls(int(number), int(at)) if _WHOLE.fullmatch(number) and _WHOLE.fullmatch(at) else None
 
     def __str__(self) -> str:
-        return f"{self.number} {self.at}"
+        return f"{self.number} {self.since}"
 
 
 def read(request: Request) -> PostedForm:

@@ -32,7 +32,7 @@ from hippodrome.control.participants.path import Paths, Stop
 from hippodrome.control.participants.previews import PreviewKind
 from hippodrome.control.participants.steps import HANDLERS
 from hippodrome.control.participants.steps.end import EndPage
-from hippodrome.control.participants.steps.game import UNASSIGNED
+from hippodrome.control.participants.steps.game import ATTEMPT, UNASSIGNED
 from hippodrome.control.participants.steps.services import StepServices
 from hippodrome.control.participants.steps.shared_game import ENDED, SharedGame, StepAnswered
 from hippodrome.control.participants.steps.sources import NeedsAssignment
@@ -216,7 +216,7 @@ class Journey:
         if project.has_sessions:
             return http.as_json(200, self._poll_together(request, project, user_id, step))
         record = self._repository.server_of(project.id, user_id)
-        return http.as_json(200, self._services.state(project, user_id, step, record))
+        return http.as_json(200, self._services.state(project, user_id, step, record, asked=_asked(request)))
 
     def _poll_together(self, request: Request, project: Project, user_id: str, step: Step | None) -> dict[str, Any]:
         """The state of the lobby, or of the session's server. Without a membership, the query must have a ticket."""
@@ -238,7 +238,13 @@ class Journey:
             if found is None:
                 raise PageError.of(Texts(project.texts), 403, "outdated")
             standing = found
-        return self._shared_game.state(project, user_id, step, standing)
+        return self._shared_game.state(project, user_id, step, standing, asked=_asked(request))
+
+
+def _asked(request: Request) -> int | None:
+    """The attempt that was requested when the page that polls was loaded; None if it was the first."""
+    text = request.query_value(ATTEMPT) or ""
+    return int(text) if text.isdecimal() and len(text) < 4 else None
 
 
 def _user_id(request: Request, texts: Texts) -> str | None:

@@ -45,7 +45,8 @@ class StepView:
     action: str  # the address to which the form is sent: the page's own
     final: bool  # whether it is the last step
     answered: bool = False  # whether it is a final step whose form was sent before
-    shown: str = ""  # of a check, or a page with minSeconds: which try it is, and when it was shown
+    shown: str = ""  # of a check, or a page with minSeconds: which try it is, and since when
+    least: int = 0  # seconds before which no answers are taken
     wrong: tuple[str, ...] = ()  # of a check: the fields that were not right
     tries_left: int = 0  # of a check; 0: as many as are needed
     end: str = ""  # of the page of an end: the end's name
@@ -217,8 +218,8 @@ def _done(view: StepView, is_asked: bool) -> Html:
     """The attributes of the body of a page after which nothing is asked any more."""
     if view.end:
         return fill("end", end=view.end)
-    if view.step.min_seconds and not view.final:
-        return fill("least", seconds=f"{view.step.min_seconds:g}")
+    if view.least and not view.final:
+        return fill("least", seconds=str(view.least))
     return Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html()
 
 

@@ -40,11 +40,13 @@ class ServerStates:
         dns: Dns,
         now: datetime,
         since: datetime | None = None,
+        asked: int | None = None,
     ) -> dict[str, Any]:
         """Return the state of the participant's server as JSON data for the game page (docs/pages.md).
 
         `since` is when the participant reached the step. As long as there is no record, the state's `seconds` count
-        from then; after that they count from the server's request.
+        from then; after that they count from the server's request. `asked` is an attempt that was requested after an
+        earlier one had ended (`attempt_after_pause`): before its record is there, it is queued.
         """
         state: dict[str, Any] = {
             "state": ServerState.QUEUED,
@@ -56,7 +58,9 @@ class ServerStates:
             "userId": user_id,
             "step": step.key if step else next(iter(project.game_steps), None),
         }
-        if record is not None:
+        if record is not None and record.is_closed and asked is not None and record.attempt < asked:
+            state["attempt"] = asked
+        elif record is not None:
             since = record.requested
             state.update(state=record.state, attempt=record.attempt, reason=record.reason, replaces=_replaces(record))
             if record.is_closed:

@@ -13,7 +13,14 @@ from hippodrome.control.model import ids, participant, server
 from hippodrome.control.model.design import Step
 from hippodrome.control.model.messages import StartServer, StopServer, to_message
 from hippodrome.control.model.project import Project
-from hippodrome.control.model.server import Server, ServerState, may_go_without, next_attempt, requestable_attempt
+from hippodrome.control.model.server import (
+    Server,
+    ServerState,
+    attempt_after_pause,
+    may_go_without,
+    next_attempt,
+    requestable_attempt,
+)
 from hippodrome.control.participants import frame, pages
 from hippodrome.control.participants.forms import PostedForm
 from hippodrome.control.participants.steps.services import StepServices
@@ -26,6 +33,8 @@ ASK_AGAIN = timedelta(seconds=30)  # if there is no server after this time, the 
 STUCK = timedelta(minutes=3)  # if a server is still starting after this time, the next GET requests it again
 UNASSIGNED = "unassigned"
 """In the query of a lobby's polls: the page does not know the participant's path yet, and is loaded again then."""
+ATTEMPT = "attempt"
+"""In the query of polls: the attempt that was requested when the page was loaded, if it is not the first."""
 RESTART, WITHOUT = "restart", "without"
 """The values of `hippodrome-action` in the forms by which a participant asks for another server, and goes on without
 the game."""
@@ -62,7 +71,9 @@ class GameStep:
             step=step,
             user_id=visit.user_id,
             state=state,
-            poll=request.url(poll=step.key, **proof),
+            poll=request.url(
+                poll=step.key, **proof, **({ATTEMPT: str(state["attempt"])} if state["attempt"] > 1 else {})
+            ),
             page=request.url(),
             ticket=ticket,
             sources=self._services.platform.settings.game_sources or state.get("url", "").rstrip("/"),
@@ -122,7 +133,8 @@ class GameStep:
             stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # after that, another may be requested
             self._services.platform.bus.publish(Topic.STOP, to_message(stop))
         since = visit.progress.reached_at(visit.project, visit.step)
-        return self._services.state(visit.project, visit.user_id, visit.step, record, since)
+        asked = attempt_after_pause(record, since) if record else None
+        return self._services.state(visit.project, visit.user_id, visit.step, record, since, asked=asked)
 
     def _state_together(self, visit: Visit) -> dict[str, Any]:
         """The state of the lobby, or of the session's server. Raises `StepAnswered` if the participant is unmatched."""
@@ -134,7 +146,9 @@ class GameStep:
             raise NeedsAssignment
         if standing.session is not None:
             self._request_if_overdue(visit, standing.session, standing.record, standing.players)
-        return self._shared.state(project, user_id, step, standing, visit.progress.reached_at(project, step))
+        since = visit.progress.reached_at(project, step)
+        asked = attempt_after_pause(standing.record, since) if standing.record else None
+        return self._shared.state(project, user_id, step, standing, since, asked=asked)
 
     def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
         """Send a lost start message again. `owner`: the id of the participant, or of a session of `players` members."""
@@ -143,9 +157,10 @@ class GameStep:
             self._request_server(visit.project, owner, attempt, players)
 
     def _overdue_attempt(self, visit: Visit, record: Server | None) -> int | None:
-        """The attempt to request again, because it is overdue; None if none is.
+        """The attempt to request, because it is overdue; None if none is.
 
-        Its message was lost, or came while the study was closed, or the project was full and may have a slot now.
+        Its message was lost, or came while the study was closed, or the project was full and may have a slot now. Or
+        the server had ended before the participant came to this game.
         """
         project, step, now = visit.project, visit.step, self._services.platform.now()
         if not participant.may_have_server(project, step):
@@ -153,6 +168,9 @@ class GameStep:
         if record is None:
             since = visit.progress.reached_at(project, step)  # None: at the first step, each load sends the message
             return 1 if since is not None and now - since > ASK_AGAIN else None
+        after_pause = attempt_after_pause(record, visit.progress.reached_at(project, step))
+        if after_pause is not None:
+            return after_pause
         full = server.found_no_slot(record, record.attempt)
         if record.closed is not None and now - record.closed > ASK_AGAIN:
             return record.attempt if full else next_attempt(record)

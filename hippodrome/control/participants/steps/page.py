@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from hippodrome.control import http
 from hippodrome.control.http import Response
 from hippodrome.control.model import ids
@@ -24,8 +26,9 @@ class PageStep:
         """Return the page, filled in for this participant; for a program, the researcher's part of it as JSON."""
         project, step = visit.project, visit.step
         source = source_of(self._services, visit, step)
-        now = int(self._services.platform.now().timestamp())
-        shown = str(Showing(visit.number, now)) if step.is_limited else ""
+        now = self._services.platform.now()
+        waited = visit.progress.waited(project, step, now)
+        shown = str(Showing(visit.number, int((now - waited).timestamp()))) if step.is_limited else ""
         view = pages.StepView(
             project=project,
             step=step,
@@ -36,6 +39,7 @@ class PageStep:
             shown=shown,
             wrong=visit.wrong,
             tries_left=max(0, step.tries - visit.number + 1),
+            least=max(0, math.ceil(step.min_seconds - waited.total_seconds())),
             action=visit.request.url(),
             files=f"/steps/{project.id}/",
             final=step.key == project.final.key,
@@ -56,12 +60,12 @@ class PageStep:
         Answers that come before `minSeconds` are over are not stored, and the page is shown again.
         """
         showing = Showing.read(form.shown)
-        if step.min_seconds and (showing is None or self._seconds_since(showing) < step.min_seconds):
+        if step.min_seconds and (showing is None or self._seconds_at(showing) < step.min_seconds):
             return
         if step.right and showing is not None:
             self._services.answers.store_try(project, user_id, step, showing.number, form.answers)
         elif not step.right:
             self._services.answers.store(project, user_id, step, form.answers)
 
-    def _seconds_since(self, showing: Showing) -> float:
-        return self._services.platform.now().timestamp() - showing.at
+    def _seconds_at(self, showing: Showing) -> float:
+        return self._services.platform.now().timestamp() - showing.since

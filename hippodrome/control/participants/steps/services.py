@@ -27,8 +27,15 @@ class StepServices:
     waiting: ServerStates
 
     def state(
-        self, project: Project, user_id: str, step: Step | None, record: Server | None, since: datetime | None = None
+        self,
+        project: Project,
+        user_id: str,
+        step: Step | None,
+        record: Server | None,
+        since: datetime | None = None,
+        *,
+        asked: int | None = None,
     ) -> dict[str, Any]:
         """Return the state of the participant's server as JSON data (docs/pages.md); see `ServerStates.state`."""
         dns, now = self.platform.dns, self.platform.now()
-        return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since)
+        return self.waiting.state(project, user_id, step, record, dns=dns, now=now, since=since, asked=asked)

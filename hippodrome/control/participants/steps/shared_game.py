@@ -103,13 +103,20 @@ class SharedGame:
             self._lobby.leave(project, user_id)
 
     def state(
-        self, project: Project, user_id: str, step: Step | None, standing: Standing, since: datetime | None = None
+        self,
+        project: Project,
+        user_id: str,
+        step: Step | None,
+        standing: Standing,
+        since: datetime | None = None,
+        *,
+        asked: int | None = None,
     ) -> dict[str, Any]:
         """Return the state of the lobby, or of the session's server, as JSON data for the game page (docs/pages.md).
 
         A member's page gets the member's own token, never the server's.
         """
-        state = self._services.state(project, user_id, step, standing.record, since)
+        state = self._services.state(project, user_id, step, standing.record, since, asked=asked)
         found = standing.found
         if isinstance(found, LobbyState):
             return state | {
