@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange
 MAX_EPISODES = 1_000_000
 MAX_BREAK = 600
 """Seconds."""
+TALK = "talk"
+"""The built-in game in which participants only talk."""
 HIGHEST_RATE = 240
 """The highest frame rate of any project, in frames per second."""
 
@@ -170,7 +173,8 @@ class TrialSection(Section):
         values.text("the name of an environment"),
         None,
         "The name of the environment; your agent's `start()` receives it. If another package "
-        "registers it with Gymnasium, its module stands before it: `minigrid:MiniGrid-Empty-5x5-v0`.",
+        "registers it with Gymnasium, its module stands before it: `minigrid:MiniGrid-Empty-5x5-v0`. "
+        "`talk` is a built-in game in which people [only talk](talk.md#words-alone).",
         {"type": "string"},
         otherwise="needed if there is a game step",
         example="ALE/Pong-v5",
@@ -426,6 +430,13 @@ class TrialSection(Section):
         otherwise="nobody talks",
         example="{with: [ai]}",
     )
+
+    def as_talk(self) -> TrialSection:
+        """Return the section of the game `talk`, with its defaults: one episode, a step each second, and `chat`."""
+        rate = self.starting_frame_rate if self.given("startingFrameRate") else 1
+        episodes = self.max_episodes if self.given("maxEpisodes") else 1
+        chat = self.chat or ChatSection()
+        return dataclasses.replace(self, starting_frame_rate=rate, max_episodes=episodes, chat=chat)
 
     @property
     def between_seconds(self) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 from hippodrome.protocol import trial_rules, values
 from hippodrome.protocol.section_keys import UNKNOWN_KEY, check_section
-from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, TrialSection
+from hippodrome.protocol.trial import RATE_CHANGE, RATE_CHANGE_MISSPELT, TALK, TrialSection
 from hippodrome.protocol.values import SectionProblem, checked, is_blank
 
 
@@ -30,6 +30,7 @@ def check(section: object) -> tuple[TrialSection, list[SectionProblem]]:
     problems += [problem for problem in wrong if problem.sentence != UNKNOWN_KEY]
     wrong_keys = {path[0] for path, _, _ in problems}
     trial = trial.without(wrong_keys)
+    trial = trial.as_talk() if trial.game == TALK else trial
     between_keys = [problem for rule in trial_rules.RULES for problem in rule(trial)]
     return trial, problems + [problem for problem in between_keys if wrong_keys.isdisjoint(problem.compared)]
 

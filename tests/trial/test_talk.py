@@ -65,3 +65,49 @@ async def test_what_the_agent_yields_grows(launch, open_client):
         await client.enter()
         await client.until(lambda: client.lines.get(1, {}).get("more"))
         assert await client.read(1) == [("ai", "well, yes")]
+
+
+TALK_ALONE = """
+class Agent:
+    def reply(self, session, player, text):
+        return f"{session.options['persona']}: {len(session.talk)}"
+"""
+
+
+async def test_a_game_of_words_alone_needs_no_environment_and_no_picture(launch, open_client):
+    trial = {"game": "talk", "episodeSeconds": 3, "options": {"persona": "warm"}}
+    server = launch(agent=TALK_ALONE, trial=trial)
+    async with open_client(server.address) as client:
+        await client.start()
+        await say(client, 1, "Hi")
+        assert await client.read(2) == [("player_0", "Hi"), ("ai", "warm: 1")]
+        assert client.controls["chat"]["with"] == ["ai"]
+        assert client.controls["frameRate"] == 1
+        assert await client.closed() == 1000
+    answers = server.answer()["answers"]
+    assert (answers["episodes"], answers["frames"], answers["talk"]["lines"]) == (1, 3, 1)
+
+
+async def test_two_participants_talk_without_an_agent(launch):
+    players = {"buyer": "human", "seller": "human"}
+    trial = {
+        "game": "talk",
+        "episodeSeconds": 60,
+        "players": players,
+        "chat": {"turns": "alternate", "first": "seller"},
+    }
+    server = launch_formed(launch, agent=None, trial=trial)
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await anna.until(lambda: anna.turn == "seller")
+        await say(anna, 1, "I begin")
+        await anna.until(lambda: anna.refused)
+        assert anna.refused == [{"id": 1, "why": "notYourTurn"}]
+        await say(bert, 1, "100?")
+        await anna.until(lambda: anna.turn == "buyer")
+        await say(anna, 2, "50")
+        await say(anna, 3, "please")
+        assert await bert.read(2) == [("seller", "100?"), ("buyer", "50")]
+        await anna.until(lambda: len(anna.refused) == 2)
+        assert anna.turn == "seller"
+        await anna.say(command="stop")
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]

@@ -17,10 +17,12 @@ import numpy as np
 
 from hippodrome.protocol import server_modules
 from hippodrome.protocol.similar import nearest
+from hippodrome.protocol.trial import TALK
 from hippodrome.trial.agent import callbacks, environments, import_path, signatures
-from hippodrome.trial.agent.callback_names import FEEDBACK, TALK
+from hippodrome.trial.agent.callback_names import FEEDBACK, TALK_METHODS
 from hippodrome.trial.agent.hippo_config import hippo_config
 from hippodrome.trial.agent.signatures import Signature, UnfitSignature
+from hippodrome.trial.agent.talk_game import TalkGame
 from hippodrome.trial.core.players import PLAYER
 from hippodrome.trial.pictures.picture import Picture
 from hippodrome.trial.pictures.reader import PictureReader
@@ -97,13 +99,13 @@ class Agent:
         self.env.close()
 
 
-def load(folder: Path) -> Any:
+def load(folder: Path, *, talks: bool = False) -> Any:
     """Return the agent of a project folder.
 
     That is an object of the class `Agent` in the folder's agent.py; or the module agent.py itself, if it has no such
     class but the five functions; or the default agent, if there is no agent.py. agent.py can import the files beside
-    it, and `gym`. Raises AgentError if methods or functions are missing or a file hides a module that servers need, and
-    whatever agent.py itself raises.
+    it, and `gym`. With `talks` the class needs no `start`. Raises AgentError if methods or functions are missing or a
+    file hides a module that servers need, and whatever agent.py itself raises.
     """
     path = folder / "agent.py"
     if not path.is_file():
@@ -126,7 +128,7 @@ def load(folder: Path) -> Any:
     if isinstance(agent_class, type):
         missing = _missing(agent_class)
         misspelt = {name: near for name in missing for near in _similar_methods(name, agent_class)}
-        if misspelt or "start" in missing:
+        if misspelt or ("start" in missing and not talks):
             hint = "".join(f"; is {near} meant to be {name}?" for name, near in misspelt.items())
             raise AgentError(f"Agent in {path.name} has no {', '.join(misspelt or missing)}{hint}")
         return agent_class()
@@ -204,7 +206,7 @@ class AgentAdapter:
     @property
     def talk(self) -> Mapping[str, Callable[..., Any]]:
         """The methods `reply` and `moderate` that the agent has, once it has started."""
-        return callbacks.listening(self._agent, TALK)
+        return callbacks.listening(self._agent, TALK_METHODS)
 
     @property
     def env(self) -> Any:
@@ -221,16 +223,23 @@ class AgentAdapter:
         """The imported agent.py; None if the project has none, or before it is imported."""
         return sys.modules.get("agent") if (self._folder / "agent.py").is_file() else None
 
-    def start(self) -> None:
-        """Load the agent and call its `start`.
+    def start(self, players: Sequence[str] = ()) -> None:
+        """Load the agent and call its `start`. In the game `talk` an agent without `start` gets the built-in game.
 
-        Raises AgentError if the agent lacks a method or a method cannot be called, and whatever its own code raises.
+        `players` are the names in `trial.players`. Raises AgentError if the agent lacks a method or a method cannot be
+        called, and whatever its own code raises.
         """
-        agent = load(self._folder)
-        self._signatures |= _signatures(agent, ("start",), {})
-        config = hippo_config(os.environ)
-        returned = self._signatures["start"].call(agent.start, {signatures.GAME: self._game, signatures.CONFIG: config})
+        agent = load(self._folder, talks=self._game == TALK)
         missing = _missing(agent)
+        if isinstance(agent, Agent) and self._game == TALK:
+            returned = agent.env = TalkGame(players)
+        elif "start" in missing:
+            returned = TalkGame(players)
+            missing.remove("start")
+        else:
+            self._signatures |= _signatures(agent, ("start",), {})
+            given = {signatures.GAME: self._game, signatures.CONFIG: hippo_config(os.environ)}
+            returned = self._signatures["start"].call(agent.start, given)
         if missing:
             returned = environments.playable(returned)
         self._env_methods = _env_methods(missing, returned)

@@ -14,7 +14,7 @@ RETURN = "on_return"
 FORM = "on_form"
 REPLY = "reply"
 MODERATE = "moderate"
-TALK = (REPLY, MODERATE)
+TALK_METHODS = (REPLY, MODERATE)
 """Methods for what is said (`replies.py`). They run on threads of their own."""
 NAMES = (
     SESSION_START,

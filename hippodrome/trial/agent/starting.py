@@ -17,7 +17,7 @@ def start(adapter: AgentAdapter, players: Sequence[str] = ()) -> AgentAdapter | 
     the others itself: its game has one player unless `players` or its own `possible_agents` name several. Raises
     AgentError, and whatever the researcher's code raises.
     """
-    adapter.start()
+    adapter.start(players)
     env = adapter.env
     keys = environments.player_keys(adapter.agent)
     if not keys and (len(players) > 1 or not adapter.steps_itself):
