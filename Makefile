@@ -17,6 +17,7 @@ EMAIL ?=
 ARGS ?=
 MINISTACK := .venv-ministack
 AUDIT := .venv-audit
+DOCS := .venv-docs
 .DEFAULT_GOAL := help
 # With the slash it is a folder, never an id. Without PROJECT= it is the study in this folder, the example.
 STUDY = $(if $(strip $(PROJECT)),"$(PROJECT)/")
@@ -25,7 +26,7 @@ option = $(if $(strip $($(1))),--$(2) "$($(1))")# $(call option,DATA,from) is --
 typed = $(if $(filter command,$(origin $(1))),$(2))
 WHERE = $(call typed,HOST,--host "$(HOST)") $(call typed,TLS,$(if $(filter-out 0,$(TLS)),--tls)) $(call typed,NAMES,--names "$(NAMES)")
 # make itself ignores an unknown variable. AWS_… and HIPPODROME_… reach the commands by the environment.
-KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT WORKERS TIMES SEED WITHIN
+KNOWN := PYTHON VENV BIN PROJECT TEMPLATE DATA USER_ID HOST PORT TLS NAMES BOTS STACK DOMAIN EMAIL ARGS MINISTACK AUDIT DOCS WORKERS TIMES SEED WITHIN
 $(foreach name,$(filter-out $(KNOWN) AWS_% HIPPODROME_%,$(.VARIABLES)),$(if $(filter command,$(origin $(name))),\
 	$(error There is no variable $(name) here, and nothing was run; there are $(KNOWN))))
 
@@ -34,7 +35,7 @@ $(foreach name,PROJECT DATA USER_ID TEMPLATE PORT BOTS STACK DOMAIN EMAIL,$(if $
 	$(error $(name)= has no value, and nothing was run: write one, or leave $(name)= out))))
 # make itself would run the other commands first: `make check ../my-study` would check the example.
 COMMANDS := $(if $(MAKECMDGOALS),$(shell sed -nE 's/^([a-z-]+):.*\#\# .*/\1/p' $(firstword $(MAKEFILE_LIST))))
-$(foreach goal,$(filter-out $(COMMANDS) $(VENV)/% $(MINISTACK)/% $(AUDIT)/%,$(MAKECMDGOALS)),\
+$(foreach goal,$(filter-out $(COMMANDS) $(VENV)/% $(MINISTACK)/% $(AUDIT)/% $(DOCS)/%,$(MAKECMDGOALS)),\
 	$(error There is no command $(goal) here, and nothing was run; `make help` lists the commands. For the study in a folder, \
 	write: make $(or $(firstword $(filter $(COMMANDS),$(MAKECMDGOALS))),run) PROJECT=$(goal)))
 
@@ -112,13 +113,18 @@ audit: $(VENV)/dev $(AUDIT)/ready ## look for known vulnerabilities: bandit in t
 	@$(AUDIT)/bin/bandit -c pyproject.toml -q -ll -r hippodrome lambdas deploy
 	@$(AUDIT)/bin/pip-audit --strict --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 
+.PHONY: docs
+docs: $(DOCS)/ready ## build the documentation's site in dist/docs/; a link that leads nowhere ends it
+	@$(DOCS)/bin/sphinx-build -q -W --keep-going -c docs/site -d dist/doctrees . dist/docs
+	@echo 'Open dist/docs/index.html in a browser.'
+
 .PHONY: format
 format: $(VENV)/dev ## format the code with ruff
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
 
 .PHONY: clean
 clean: ## remove the virtual environments and caches; data/ stays
-	rm -rf $(VENV) $(MINISTACK) $(AUDIT) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots dist
+	rm -rf $(VENV) $(MINISTACK) $(AUDIT) $(DOCS) .pytest_cache .mypy_cache .ruff_cache .hypothesis shots dist
 
 # NEWEST: the newest Python 3 for which all pinned packages have wheels. Intel Macs get older versions of some packages, in
 # copies of the requirement files.
@@ -171,6 +177,12 @@ $(AUDIT)/ready: requirements/audit.txt
 	@echo 'Installing bandit and pip-audit (once) …'
 	@$(PYTHON) -m venv $(AUDIT)
 	@$(AUDIT)/bin/pip install --quiet --disable-pip-version-check -r requirements/audit.txt
+	@touch $@
+
+$(DOCS)/ready: requirements/docs.txt
+	@echo 'Installing Sphinx (once) …'
+	@$(PYTHON) -m venv $(DOCS)
+	@$(DOCS)/bin/pip install --quiet --disable-pip-version-check -r requirements/docs.txt
 	@touch $@
 
 $(VENV)/dev: $(REQUIREMENTS)/dev.txt $(VENV)/deploy

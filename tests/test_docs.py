@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -245,3 +246,10 @@ def test_every_command_that_is_shown_exists_with_its_options() -> None:
             ]
     assert wrong == []
     assert len(seen) > 12
+
+
+def test_the_site_has_every_page_for_some_reader() -> None:
+    """Or `make docs` fails."""
+    readers = runpy.run_path(str(ROOT / "docs" / "site" / "conf.py"))["READERS"]
+    pages = {page.relative_to(ROOT).with_suffix("").as_posix() for page in PAGES} - {"README", "docs/README"}
+    assert pages <= {page for group in readers.values() for page in group}
