@@ -249,7 +249,7 @@ def test_every_command_that_is_shown_exists_with_its_options() -> None:
 
 
 def test_the_site_has_every_page_for_some_reader() -> None:
-    """Or `make docs` fails."""
+    """Or `make docs` fails: name a new page in READERS."""
     readers = runpy.run_path(str(ROOT / "docs" / "site" / "conf.py"))["READERS"]
     pages = {page.relative_to(ROOT).with_suffix("").as_posix() for page in PAGES} - {"README", "docs/README"}
     assert pages <= {page for group in readers.values() for page in group}

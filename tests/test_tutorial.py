@@ -48,7 +48,13 @@ class Reader:
     def type(self, command: str) -> str:
         """Run a command; return what it prints."""
         done = subprocess.run(
-            ["bash", "-c", command], cwd=self.folder, env=self._env, capture_output=True, text=True, timeout=150
+            ["bash", "-c", command],
+            check=False,
+            cwd=self.folder,
+            env=self._env,
+            capture_output=True,
+            text=True,
+            timeout=150,
         )
         assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
         return done.stderr + done.stdout

@@ -50,7 +50,15 @@ autodoc_member_order = "bysource"
 READERS = {
     "Researchers": [
         *("docs/tutorial", "docs/config", "docs/designs", "docs/agent", "docs/site/api", "docs/callbacks"),
-        *("docs/players", "docs/sessions", "docs/lobby", "docs/recruiting", "docs/data", "docs/aws-project"),
+        *(
+            "docs/players",
+            "docs/sessions",
+            "docs/talk",
+            "docs/lobby",
+            "docs/recruiting",
+            "docs/data",
+            "docs/aws-project",
+        ),
         *("docs/gym", "docs/hippo", "docs/interactive-gym"),
     ],
     "Participants' pages": ["docs/pages", "docs/texts", "docs/objects"],
