@@ -46,6 +46,8 @@ class FakeModel:
         self.behaviour = behaviour_of(os.environ.get(VARIABLE, "")) if behaviour is None else behaviour
         self.requests: list[tuple[str, dict[str, Any], dict[str, str]]] = []
         """The path, the body and the headers of each request so far."""
+        self.times: list[float] = []
+        """When each came (`time.monotonic`)."""
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("_Of", (_Handler,), {"model": self}))
         self._server.daemon_threads = True
         threading.Thread(target=self._server.serve_forever, args=(0.1,), name="fake model", daemon=True).start()
@@ -84,6 +86,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         request = json.loads(self.rfile.read(int(self.headers.get("Content-Length") or 0)) or b"{}")
         path = self.path.removeprefix("/v1")
+        self.model.times.append(time.monotonic())
         self.model.requests.append((path, request, dict(self.headers)))
         count, behaviour = len(self.model.requests), self.model.behaviour
         time.sleep(behaviour.get("delay", 0))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from hippodrome.local.fake_model import FakeModel, reply_to
+from tests.trial.two_players import two_players
 
 KEY = "sk-the-key-of-the-study"
 ASKS = """
@@ -177,3 +180,146 @@ async def test_without_its_prompt_no_game_begins(launch: Any, open_client: Any, 
         await client.closed()
     assert server.wait() != 0
     assert "the prompt prompts/none.txt cannot be read (FileNotFoundError)" in server.log_text()
+
+
+# ---- after a server is lost
+
+TICKS = """
+    def on_tick(self, session):
+        if session.ticks % 4 == 0:
+            session.record("hint", session.ask(f"Tick {session.ticks}.", temperature=0))
+"""
+
+
+def asked(model: FakeModel) -> Counter[str]:
+    """Return how often the model was asked each question."""
+    return Counter(request["messages"][-1]["content"] for _, request, _ in model.requests)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4])
+async def test_a_server_that_is_taken_back_repeats_no_call(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel, delay: float
+) -> None:
+    model.behaviour = {"delay": delay}
+    agent = grid() + TICKS + ASKS
+    first = launch(agent=agent, trial=trial_of(model), SERVER="a-1")
+    async with open_client(first.address) as client:
+        await client.start()
+        await client.until(lambda: len(model.requests) >= 5)
+        first.terminate()  # with a delay: in the middle of a call
+        await client.closed()
+    assert first.wait() == 0
+    assert max(asked(model).values()) == 1
+    model.behaviour = {}
+    second = launch(agent=agent, trial=trial_of(model), SERVER="a-2")
+    async with open_client(second.address) as client:
+        await client.play(40)
+        await client.stop()
+    assert client.errors == []
+    assert max(asked(model).values()) == 1
+    before, after = (lines_of(one, "step", name) for one, name in ((first, "a-1"), (second, "a-2")))
+    assert lines_of(second, "resume", "a-2")[0]["steps"] == len(before)
+    said = [step["info"]["said"] for step in (*before, *after) if "said" in step["info"]]
+    assert said == [reply_to(f"Step {5 * number}.") for number in range(1, len(said) + 1)]
+
+
+@pytest.mark.parametrize("rescued", [False, True])  # `run` rescues the recording of a server that was killed
+async def test_a_server_that_is_killed_repeats_only_what_was_not_stored(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel, rescued: bool
+) -> None:
+    agent = grid() + TICKS + ASKS
+    trial = {**trial_of(model), "startingFrameRate": 10}
+    first = launch(agent=agent, trial=trial, SERVER="a-1")
+    async with open_client(first.address) as client:
+        await client.start()
+        await client.until(lambda: len(model.requests) >= 24)  # about five seconds
+        first.process.kill()
+        killed = time.monotonic()
+        await client.closed()
+    first.wait()
+    recent = sum(killed - when < 2.5 for when in model.times)  # two seconds, and some for a busy machine
+    assert recent < len(model.requests)
+    for part in first.store.rglob("*.part") if rescued else ():
+        part.rename(part.with_suffix(""))
+    second = launch(agent=agent, trial=trial, SERVER="a-2")
+    async with open_client(second.address) as client:
+        await client.play(20)
+        await client.stop()
+    assert client.errors == []
+    assert sum(count - 1 for count in asked(model).values()) <= recent
+    assert max(asked(model).values()) <= 2
+    (lines,) = second.recordings(server="a-2").values()
+    assert lines[1]["kind"] == ("resume" if rescued else "reset")
+
+
+async def test_the_next_server_has_the_talk_and_the_cap(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel
+) -> None:
+    trial = {**trial_of(model, maxCalls=2), "chat": True}
+    first = launch(agent=grid(), trial=trial, SERVER="a-1")
+    async with open_client(first.address) as client:
+        await client.play(5)
+        await say(client, 1, "One")
+        await client.read(2)
+        await say(client, 2, "Two")
+        await client.read(4)
+        first.terminate()
+        await client.closed()
+    first.wait()
+    second = launch(agent=grid(), trial=trial, SERVER="a-2")
+    async with open_client(second.address) as client:
+        await client.enter()
+        talk = await client.read(4)
+        assert talk[1::2] == [("ai", reply_to("One")), ("ai", reply_to("Two"))]
+        await say(client, 3, "Three")
+        assert (await client.read(6))[-1] == ("ai", "Sorry, I cannot answer right now.")
+    assert len(model.requests) == 2
+    assert "CapReached" in second.log_text()
+
+
+async def test_an_answer_under_way_when_a_server_is_taken_back_is_paid_for_once(
+    launch: Any, open_client: Any, grid: Any, model: FakeModel
+) -> None:
+    model.behaviour = {"pace": 0.2}
+    trial = {**trial_of(model), "chat": True}
+    first = launch(agent=grid(), trial=trial, SERVER="a-1")
+    async with open_client(first.address) as client:
+        await client.play(5)
+        await say(client, 1, "One")
+        await client.until(lambda: client.lines.get(2, {}).get("more"))
+        first.terminate()
+        await client.closed()
+    assert first.wait() == 0
+    second = launch(agent=grid(), trial=trial, SERVER="a-2")
+    async with open_client(second.address) as client:
+        await client.enter()
+        assert await client.read(2) == [("player_0", "One"), ("ai", reply_to("One"))]
+    assert len(model.requests) == 1
+
+
+POLICY = """
+from hippodrome.llm import ask
+
+class Asks:
+    def act(self, observation, info):
+        ask(f"I see {list(map(int, observation))}.")
+        return 0
+"""
+
+
+async def test_what_policies_asked_is_not_asked_again(launch: Any, open_client: Any, model: FakeModel) -> None:
+    agent = two_players() + POLICY
+    trial = {**trial_of(model), "players": {"left": "human", "right": "agent:Asks"}, "actionSpace": ["a", "b", "c"]}
+    first = launch(agent=agent, trial=trial, SERVER="a-1")
+    async with open_client(first.address) as client:
+        await client.start()
+        await client.until(lambda: len(model.requests) >= 10)
+        first.terminate()
+        await client.closed()
+    first.wait()
+    before = len(model.requests)
+    second = launch(agent=agent, trial=trial, SERVER="a-2")
+    async with open_client(second.address) as client:
+        await client.start()
+        await client.until(lambda: len(model.requests) >= before + 5)
+    assert max(asked(model).values()) == 1

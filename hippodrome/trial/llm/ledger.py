@@ -72,7 +72,7 @@ class Ledger:
     """Calls that were made, by this server and by earlier ones."""
     input: int = 0
     output: int = 0
-    _tape: dict[tuple[int, str], list[Mapping[str, Any]]] = field(default_factory=dict)
+    _tape: dict[str, list[Mapping[str, Any]]] = field(default_factory=dict)  # by hash
     _last_step: dict[int, int] = field(default_factory=dict)  # by episode, of the calls on the tape
     _seen: dict[tuple[int, str], int] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -85,7 +85,7 @@ class Ledger:
             if record.get("kind") != "call":
                 continue
             episode, tokens = int(record.get("episode") or 0), record.get("tokens") or {}
-            ledger._tape.setdefault((episode, str(record.get("hash"))), []).append(record)
+            ledger._tape.setdefault(str(record.get("hash")), []).append(record)
             step = int(record.get("step") or 0)
             ledger._last_step[episode] = max(step, ledger._last_step.get(episode, 0))
             ledger.calls += 1
@@ -103,9 +103,9 @@ class Ledger:
         place = moment.episode, digest
         with self._lock:
             nth = self._seen[place] = self._seen.get(place, 0) + 1
-            recorded = self._tape.get(place)
-            if recorded:
-                return Call(digest, nth, moment, recorded.pop(0))
+            recorded = self._take(digest, moment.episode)
+            if recorded is not None:
+                return Call(digest, nth, moment, recorded)
             # What a lost server had not stored yet comes after all that it had stored. Any other call was never made.
             if moment.replaying and moment.step < self._last_step.get(moment.episode, 0):
                 words = (
@@ -120,6 +120,18 @@ class Ledger:
                 )
             self.calls += 1
         return Call(digest, nth, moment)
+
+    def _take(self, digest: str, episode: int) -> Mapping[str, Any] | None:
+        """Take the first answer to this request off the tape, of this episode or of before the game; None without one.
+
+        Before the game, a line of the last episode may be answered again.
+        """
+        episodes = (0, max(self._last_step, default=0)) if episode == 0 else (0, episode)
+        records = self._tape.get(digest, [])
+        for index, record in enumerate(records):
+            if int(record.get("episode") or 0) in episodes:
+                return records.pop(index)
+        return None
 
     def end(self, tokens: Tokens) -> None:
         """Count what a call has cost that was made."""
