@@ -6,16 +6,17 @@ names, and a link or a heading that does not exist, is a warning, and a warning 
 
 from __future__ import annotations
 
-import sys
+import ast
+import inspect
+import re
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
 
 project = "Hippodrome"
 copyright = "the authors of Hippodrome"
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_parser"]
 root_doc = "README"
 include_patterns = ["*.md", "docs/**.md", "examples/*/README.md"]
 exclude_patterns = [
@@ -41,11 +42,6 @@ suppress_warnings = [
     "myst.header",  # some pages have no heading of a level in between
     "misc.highlighting_failure",  # blocks with … for what is left out
 ]
-default_role = "code"
-# The signatures are enough, so the site needs none of the product's packages.
-autodoc_mock_imports = ["ale_py", "gymnasium", "numpy", "websockets", "msgspec", "PIL", "psutil"]
-autodoc_typehints = "none"
-autodoc_member_order = "bysource"
 
 READERS = {
     "Researchers": [
@@ -72,12 +68,37 @@ READERS = {
 """The pages for each kind of reader, in the order of the site."""
 
 
-def _with_lists_of_pages(app: Any, name: str, source: list[str]) -> None:
-    if name != root_doc:
-        return
-    for reader, pages in {"": ["docs/README"], **READERS}.items():
-        caption = f":caption: {reader}\n" if reader else ""
-        source[0] += "\n```{toctree}\n:hidden:\n" + caption + "\n" + "\n".join(pages) + "\n```\n"
+CLASS = re.compile(r"<!-- class (\S+) (\w+) -->")
+
+
+def _complete(app: Any, name: str, source: list[str]) -> None:
+    if name == root_doc:
+        for reader, pages in {"": ["docs/README"], **READERS}.items():
+            caption = f":caption: {reader}\n" if reader else ""
+            source[0] += "\n```{toctree}\n:hidden:\n" + caption + "\n" + "\n".join(pages) + "\n```\n"
+    source[0] = CLASS.sub(lambda named: _class(ROOT / named[1], named[2]), source[0])
+
+
+def _class(file: Path, name: str) -> str:
+    """What the source says of a class: its docstring, fields and public methods. The source is read, not imported."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    (described,) = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    parts = [f"## {name}", ast.get_docstring(described) or ""]
+    for node, after in zip(described.body, [*described.body[1:], None], strict=True):
+        if isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__init__"):
+            parts += [f"### `{_signature(node, name)}`", ast.get_docstring(node) or ""]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id[0] != "_":
+            said = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
+            parts.append(f"* `{node.target.id}`" + (f": {inspect.cleandoc(str(said))}" if said else ""))
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _signature(node: ast.FunctionDef, name: str) -> str:
+    for argument in ast.walk(node.args):
+        if isinstance(argument, ast.arg):
+            argument.annotation = None
+    given = ast.unparse(node.args).removeprefix("self").removeprefix(", ")
+    return f"{name if node.name == '__init__' else node.name}({given})"
 
 
 def _lead_to_the_readme(app: Any, error: Exception | None) -> None:
@@ -87,5 +108,5 @@ def _lead_to_the_readme(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> None:
-    app.connect("source-read", _with_lists_of_pages)
+    app.connect("source-read", _complete)
     app.connect("build-finished", _lead_to_the_readme)
