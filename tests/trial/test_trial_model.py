@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from hippodrome.local.fake_model import FakeModel, reply_to
+from hippodrome.trial.llm.ledger import text_hash
 from tests.trial.two_players import two_players
 
 KEY = "sk-the-key-of-the-study"
@@ -127,6 +128,18 @@ async def test_a_model_answers_by_itself_with_the_prompt_and_all_lines(
         assert await client.read(2) == [("player_0", "Hi"), ("ai", reply_to("Hi"))]
         await say(client, 2, "And now?")
         await client.read(4)
+        await client.say(command="stop")
+        await client.until(lambda: client.done)
+    talk = server.answer()["answers"]["talk"]
+    assert talk["tokens"]["input"] > talk["tokens"]["output"] > 0
+    assert {**talk, "tokens": None} == {
+        "lines": 2,
+        "fallbacks": 0,
+        "calls": 2,
+        "tokens": None,
+        "model": "small",
+        "prompt": text_hash("Be warm.\nAlways."),
+    }
     _, request, _ = model.requests[1]
     assert request["messages"] == [
         {"role": "system", "content": "Be warm.\nAlways."},

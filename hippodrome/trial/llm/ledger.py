@@ -93,6 +93,10 @@ class Ledger:
             ledger.output += int(tokens.get("output") or 0)
         return ledger
 
+    def summary(self) -> dict[str, Any]:
+        """Return how many calls were made, and their tokens, for the answer."""
+        return {"calls": self.calls, "tokens": {"input": self.input, "output": self.output}}
+
     @property
     def tokens(self) -> int:
         return self.input + self.output

@@ -8,6 +8,7 @@ from typing import Any
 
 from hippodrome.protocol.trial_llm import LlmSection, prompt_file
 from hippodrome.trial.llm import client
+from hippodrome.trial.llm.ledger import text_hash
 
 _BEGIN = "(Nobody has said anything yet. Say your first line.)"
 
@@ -33,6 +34,11 @@ class Partner:
     def __init__(self, section: LlmSection, prompt: str | None) -> None:
         self._section = section
         self._prompt = prompt
+
+    def hashes(self) -> dict[str, str]:
+        """Return what tells the model and the prompt from those of other conditions, for the answer."""
+        prompt = {} if self._prompt is None else {"prompt": text_hash(self._prompt)}
+        return {"model": self._section.model[0], **prompt}
 
     def ask(self, text: str, **parameters: Any) -> str:
         """Ask a question, with the prompt before it, and return the answer. `parameters` as `client.ask`'s.

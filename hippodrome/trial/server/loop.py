@@ -115,6 +115,7 @@ class TrialLoop:
         self._places = Places(self._acted)
         self._replies: Replies | None = None
         self._partner: Partner | None = None
+        self._ledger: Ledger | None = None
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._starting: asyncio.Task[None] | None = None
@@ -390,7 +391,7 @@ class TrialLoop:
             self._endpoint.play(None)
             return
         self._partner = Partner(section, prompt_of(section, self.settings.agent_dir))
-        ledger = Ledger.of(section, self._recorder.tape.earlier)
+        ledger = self._ledger = Ledger.of(section, self._recorder.tape.earlier)
         self._endpoint.play(Game(section, ledger, self._recorder.tape, self._moment))
 
     def _moment(self) -> Moment:
@@ -512,13 +513,17 @@ class TrialLoop:
             await asyncio.wait(self._saving_members)
 
     def _with_talk(self, answers: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Add to an answer how much the participant has said, if people talk."""
-        talk = self.core.talk
-        if talk is None:
-            return answers
-        fallbacks = self._replies.fallbacks if self._replies is not None else 0
-        said = talk.said_by(str(answers.get("player", talk.people[0])))
-        return {**answers, "talk": {"lines": said, "fallbacks": fallbacks}}
+        """Add to an answer how much the participant has said, and what the game's language model was asked, if any."""
+        talk, found = self.core.talk, {}
+        if talk is not None:
+            earlier = self._recorder.tape.earlier
+            fallbacks = sum(record.get("kind") == "error" and record.get("method") == REPLY for record in earlier)
+            fallbacks += self._replies.fallbacks if self._replies is not None else 0
+            said = talk.said_by(str(answers.get("player", talk.people[0])))
+            found = {"lines": said, "fallbacks": fallbacks}
+        if self._ledger is not None and self._partner is not None:
+            found |= {**self._ledger.summary(), **self._partner.hashes()}
+        return {**answers, "talk": found} if found else answers
 
     def _saved(self, task: asyncio.Task[None]) -> None:
         if task.cancelled():
