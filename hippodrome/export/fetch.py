@@ -12,13 +12,13 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hippodrome.export import keys, recording, scrub
+from hippodrome.export import keys, recording, scrub, talk
 from hippodrome.export.interruption import interruption
 from hippodrome.export.keys import Item, KeyKind
 from hippodrome.export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
@@ -30,6 +30,7 @@ from hippodrome.protocol.session import is_session_id
 
 MAX_WAITING = 4 * PARALLEL  # participants and sessions whose files are being fetched
 COMMIT_EVERY = 2  # seconds; after a power cut, the work of these seconds may have to be repeated
+MAX_PIECE = 256 * 1024 * 1024  # bytes; a piece holds what was said, and a model's answers, of two seconds
 MAX_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step accepts answers of 256 KB
 
 
@@ -178,6 +179,8 @@ class Fetcher:
                     file.problems.append(f"no file of Hippodrome: {item.why}")
                 elif item.kind is KeyKind.RECORDING:
                     self._recording(item, owner, file)
+                elif item.kind is KeyKind.TAPE:
+                    self._tape(item, owner, file)
                 else:
                     self._document(item, owner, file)
             except FileGone:
@@ -209,6 +212,26 @@ class Fetcher:
             return
         file.document = found
         file.problems += _doubts(item, found)
+
+    def _tape(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
+        try:
+            body = self._source.read(item.listed.key, MAX_PIECE)
+        except TooLarge:
+            file.problems.append(f"it is larger than {MAX_PIECE:,} bytes and was not read")
+            return
+        if self._wanted.raw:
+            file.raw = self._put(body, f"private/raw/{_folder(owner)}/trials/{item.server}/{item.name}")
+        identities = scrub.identities(owner) if isinstance(owner, ExportedParticipant) else dict(owner.identities)
+        hide = scrub.Scrub(identities if self._wanted.apart else {})
+        attempt = keys.attempt(self._project, item.user, item.server)
+        where: dict[str, Any] = {"step": item.step, "attempt": attempt, "session": None}
+        people: Mapping[int, str] = {}
+        if isinstance(owner, Members):
+            where["session"], people = owner.session, owner.people
+        try:
+            file.document = talk.document(json.loads(body), where, people, hide)
+        except (ValueError, AttributeError, RecursionError):
+            file.problems.append("it is no piece of a tape that this version can read")
 
     def _recording(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
         attempt = keys.attempt(self._project, item.user, item.server)

@@ -19,6 +19,7 @@ ASSIGNED, ENDED = "_assignment", "_end"
 _TRY = re.compile(r"[1-9][0-9]{0,3}")
 _RECORDING = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64}?)-(?P<rest>(?:trial|episode-[0-9]{1,9})(?:-[0-9]{1,4})?)")
 _END = ".jsonl.gz"
+_PIECE = re.compile(r"(?P<step>[A-Za-z0-9_-]{1,64})-talk-[0-9]{4,6}\.json")
 
 
 class KeyKind(StrEnum):
@@ -27,6 +28,7 @@ class KeyKind(StrEnum):
     PARTICIPANT = "participant"
     ANSWER = "answer"
     RECORDING = "recording"
+    TAPE = "tape"  # a piece of what was said in a game
     MEMBERSHIP = "membership"  # names a participant's session
     SESSION = "session"  # a session's document
     FOREIGN = "foreign"  # a file that Hippodrome does not write
@@ -93,7 +95,7 @@ def read(project: str, listed: Listed) -> Item:
             if not NAME.fullmatch(step) or step in RESERVED or (dot and not _TRY.fullmatch(number)):
                 return foreign("no step can have that name")
             return Item(KeyKind.ANSWER, listed, user, f"{step}{dot}{number}")
-        case ["trials", server, name] if name.endswith(_END):
+        case ["trials", server, name] if name.endswith(_END) or _PIECE.fullmatch(name):
             return _recording(listed, user, server, name) or foreign("no recording has that name")
     return foreign("Hippodrome writes no such file")
 
@@ -110,7 +112,7 @@ def _read_session(project: str, listed: Listed) -> Item:
         return Item(KeyKind.SESSION, listed, session)
     elif parts[1:] == ["assignment.json"]:  # each member has a copy
         return Item(KeyKind.ANSWER, listed, session, ASSIGNED)
-    elif len(parts) == 4 and parts[1] == "trials" and parts[3].endswith(_END):
+    elif len(parts) == 4 and parts[1] == "trials" and (parts[3].endswith(_END) or _PIECE.fullmatch(parts[3])):
         if found := _recording(listed, session, parts[2], parts[3]):
             return found
         why = "no recording has that name"
@@ -118,10 +120,11 @@ def _read_session(project: str, listed: Listed) -> Item:
 
 
 def _recording(listed: Listed, user: str, server: str, name: str) -> Item | None:
-    found = _RECORDING.fullmatch(name.removesuffix(_END))
+    piece = _PIECE.fullmatch(name)
+    found = piece or _RECORDING.fullmatch(name.removesuffix(_END))
     if not found or not SERVER_NAME.fullmatch(server):
         return None
-    return Item(KeyKind.RECORDING, listed, user, found["step"], server, found[0])
+    return Item(KeyKind.TAPE if piece else KeyKind.RECORDING, listed, user, found["step"], server, found[0])
 
 
 def attempt(project: str, user: str, server: str) -> int | None:

@@ -126,7 +126,7 @@ def choose(
     everything = False
     for item in sorted(unit.items, key=lambda item: _ORDER.get(item.kind, len(_ORDER))):
         before = known.get(item.listed.key)
-        skipped = item.kind is KeyKind.RECORDING and not wanted.recordings
+        skipped = item.kind in _PLAYED and not wanted.recordings
         same = (
             before is not None
             and before.version == version_of(item, mark)
@@ -153,11 +153,12 @@ def choose(
     return fetch, unchanged
 
 
+_PLAYED = (KeyKind.RECORDING, KeyKind.TAPE)
 _NAMING = (KeyKind.PARTICIPANT, KeyKind.MEMBERSHIP)
 _ORDER = {kind: order for order, kind in enumerate((*_NAMING, KeyKind.SESSION))}
 """Documents of these kinds come first, in this order: the other files are read with their content."""
 
 
 def version_of(item: Item, mark: str) -> str:
-    """Return the version of the exported file: for a recording it also changes with the session's members."""
-    return item.listed.version + (mark if item.kind is KeyKind.RECORDING else "")
+    """Return the version of the exported file: for a recording or a tape it also changes with the session's members."""
+    return item.listed.version + (mark if item.kind in _PLAYED else "")

@@ -22,7 +22,7 @@ import msgspec
 from hippodrome.console import screen
 from hippodrome.console.problem import Problem
 from hippodrome.control.model.project import MASTER_LIST, Project, read_list
-from hippodrome.export import fetch, keys, listing, manifest, runs, table_files, tables
+from hippodrome.export import fetch, keys, listing, manifest, runs, table_files, tables, talk
 from hippodrome.export.answers import StudyAnswers
 from hippodrome.export.fetch import Fetcher
 from hippodrome.export.listing import Tally, Wanted
@@ -214,14 +214,7 @@ def _run(
         if options.long:
             written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), style)
         if options.wanted.recordings:
-            shared = tables.in_sessions(state)
-            written += table_files.write(folder / "episodes", *tables.episodes(state, in_sessions=shared), style)
-            if any(found.get("callbacks") for _, _, found in state.episodes()):
-                lines = tables.callbacks(state, folder, shared)
-                written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)
-            if shared:
-                rows = tables.presence(state, folder)
-                written += table_files.write(folder / "presence", tables.PRESENCE, rows, style)
+            written += _write_games(state, folder, style)
         only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
         found = tables.problems(state, project_id, options.apart)
         written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)
@@ -253,6 +246,24 @@ def _run(
     manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.raw_files()])
     manifest.write(folder / manifest.NAME, about, itertools.chain(made_now, state.converted_files()))
     return {"folder": str(folder), **about, **{"run": asdict(tally)}}
+
+
+def _write_games(state: ExportState, folder: Path, style: table_files.Style) -> list[Path]:
+    """Write the tables of what happened and was said in games, and return their files."""
+    written: list[Path] = []
+    shared = tables.in_sessions(state)
+    written += table_files.write(folder / "episodes", *tables.episodes(state, in_sessions=shared), style)
+    if any(found.get("callbacks") for _, _, found in state.episodes()):
+        lines = tables.callbacks(state, folder, shared)
+        written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)
+    if state.has_tapes():
+        shared_talk = state.has_sessions()
+        said = talk.messages(state, shared_talk)
+        written += table_files.write(folder / "messages", talk.columns(shared_talk), said, style)
+    if shared:
+        rows = tables.presence(state, folder)
+        written += table_files.write(folder / "presence", tables.PRESENCE, rows, style)
+    return written
 
 
 def _datasets(folder: Path, state: ExportState, project_id: str, options: Options) -> list[dict[str, Any]]:
@@ -287,7 +298,8 @@ def _sound_minari(folder: Path) -> bool:
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Remove the tables of an earlier run that this run did not write, and half-written tables."""
-    for name in ("answers", "answers-long", "runs", "runs-*", "tries", "episodes", "callbacks", "presence", "problems"):
+    games = ("episodes", "callbacks", "messages", "presence")
+    for name in ("answers", "answers-long", "runs", "runs-*", "tries", *games, "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:
                 path.unlink()

@@ -38,6 +38,7 @@ CREATE VIEW IF NOT EXISTS people AS
   FROM participants p LEFT JOIN sessions s ON s.owner = p.user;
 CREATE TABLE IF NOT EXISTS episodes (
   key TEXT NOT NULL, place INTEGER NOT NULL, document TEXT NOT NULL, PRIMARY KEY (key, place)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS tapes (key TEXT PRIMARY KEY, document TEXT NOT NULL) WITHOUT ROWID;
 """
 _ANSWERS = "SELECT count(*) FROM answers WHERE instr(step, '.') = 0 AND step NOT IN (?, ?)"
 """Counts the answers: neither tries, whose names have a point, nor assignments and ends (`keys.py`)."""
@@ -277,6 +278,9 @@ class ExportState:
                 self._db.execute(
                     "INSERT OR REPLACE INTO answers VALUES (?, ?, ?)", (user, file.step, _json(file.document))
                 )
+        self._db.execute("DELETE FROM tapes WHERE key=?", (file.key,))
+        if file.kind == "tape" and file.document is not None:
+            self._db.execute("INSERT INTO tapes VALUES (?, ?)", (file.key, _json(file.document)))
         self._db.execute("DELETE FROM episodes WHERE key=?", (file.key,))
         self._db.executemany(
             "INSERT INTO episodes VALUES (?, ?, ?)",
@@ -291,6 +295,7 @@ class ExportState:
         """Remove a file that the source does not have any more from the state."""
         self._db.execute("DELETE FROM files WHERE key=?", (key,))
         self._db.execute("DELETE FROM episodes WHERE key=?", (key,))
+        self._db.execute("DELETE FROM tapes WHERE key=?", (key,))
         if kind == "answer":
             step = key.rpartition("/")[2].removesuffix(".json")
             self._db.execute("DELETE FROM answers WHERE user=? AND step=?", (user, step))
@@ -351,6 +356,24 @@ class ExportState:
         )
         for row in rows:
             yield self._participant(row[:5]) if row[0] else None, row[5], json.loads(row[6])
+
+    def tapes(self) -> Iterator[tuple[ExportedParticipant | None, Mapping[str, Any]]]:
+        """Yield the participant and the document (`talk.document`) of each piece of a tape.
+
+        Those of one game follow each other, in the order in which they were made. In a session the participant is None.
+        """
+        rows = self._db.execute(
+            "SELECT p.user, p.number, p.folder, p.document, p.membership, t.document FROM tapes t"
+            " JOIN files f ON f.key = t.key LEFT JOIN people p ON p.user = f.user"
+            " ORDER BY p.number, f.user, json_extract(t.document, '$.step'), json_extract(t.document, '$.attempt'),"
+            " length(t.key), t.key"
+        )
+        for row in rows:
+            yield self._participant(row[:5]) if row[0] else None, json.loads(row[5])
+
+    def has_tapes(self) -> bool:
+        """Return whether somebody has talked."""
+        return self._db.execute("SELECT 1 FROM tapes").fetchone() is not None
 
     def problems(self) -> Iterator[tuple[ExportedParticipant | None, str, str]]:
         """Yield the participant (None for a file of no participant), the key and the problem of each bad file."""

@@ -303,7 +303,7 @@ def _of_session(key: str) -> str:
     return "(somewhere in sessions/)"
 
 
-_RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:trial|episode)[0-9-]*\.jsonl\.gz")
+_RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:(?:trial|episode)[0-9-]*\.jsonl\.gz|talk-[0-9]*\.json)")
 
 
 def _without_ids(key: str, participant: ExportedParticipant | None, project: str) -> str:

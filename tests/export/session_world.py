@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,28 @@ def packed(folder: Path, made: Sequence[bytes], *, close: bool = True) -> bytes:
     else:
         file.flush()
     return path.read_bytes()
+
+
+def tape(members: Sequence[str] = (ANN, BOB)) -> bytes:
+    """Make a piece of a session's tape: each member says a line, and the agent answers the first one by a model."""
+    made: list[dict[str, Any]] = []
+
+    def record(kind: str, second: int, **fields: Any) -> None:
+        made.append({"time": f"2026-11-21T14:46:{second:02d}+00:00", "ns": second, "kind": kind, **fields})
+
+    where = {"episode": 1, "step": 2}
+    record("line", 10, n=1, by="left", text=said(members[0]), id=5, typed=2500, **where)
+    request = {"messages": [{"role": "user", "content": said(members[0])}]}
+    tokens = {"input": 9, "output": 2}
+    record("call", 11, hash="abc", nth=1, request=request, answer={"x": 1}, tokens=tokens, model="small", **where)
+    record("line", 12, n=2, by="ai", text="Hello", answers=1, **where)
+    record("line", 15, n=3, by="right", text=said(members[1]), id=6, to=["left"], original="Rude", **where)
+    record("line", 16, by="left", text=f"{said(members[0])}!", id=7, held=True, **where)
+    return json.dumps({"schema": 1, "seats": list(PLAYERS), "records": made}).encode()
+
+
+def tape_key(session: str = SID) -> str:
+    return recording_key(session, "3-talk-0001").replace(".jsonl.gz", ".json")
 
 
 def join(put: Put, user: str, seat: int, *, session_id: str = SID, score: float = 6.0) -> None:

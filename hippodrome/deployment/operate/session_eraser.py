@@ -9,6 +9,7 @@ session are deleted.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,11 +18,13 @@ from hippodrome.control.model import memberships
 from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.operate.storage import Note, Storage, newest, older, read_all
 from hippodrome.export import without_member
+from hippodrome.export.tape_without_member import without_member as without_member_of_tape
 from hippodrome.protocol import session as sessions
 from hippodrome.protocol.keys import membership_key, session_folder, session_key, sessions_folder
 from hippodrome.protocol.session import BadSession, SessionDocument, is_session_id
 
 _RECORDING = ".jsonl.gz"
+_PIECE = re.compile(r"/trials/[^/]+/[^/]+-talk-[0-9]+\.json$")
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ class SessionEraser:
         """Write the session's recordings without the participant, and delete their earlier versions."""
         folder = session_folder(self._project, found.id)
         for key in dict.fromkeys(version.key for version in self._storage.versions(folder)):
-            if key.endswith(_RECORDING):
+            if key.endswith(_RECORDING) or _PIECE.search(key):
                 self._rewrite(key, found.seat)
                 self._storage.delete(older(self._storage, key), note)
         self._storage.delete([*self._storage.uploads(folder)], note)
@@ -150,6 +153,12 @@ class SessionEraser:
         with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
             before, after = Path(folder, "before"), Path(folder, "after")
             self._storage.fetch(last, before)
-            if without_member.rewrite(before, after, seat, self._user):
+            if key.endswith(_RECORDING):
+                differs = without_member.rewrite(before, after, seat, self._user)
+            else:
+                piece = before.read_bytes()
+                after.write_bytes(without_member_of_tape(piece, seat, self._user))
+                differs = piece != after.read_bytes()
+            if differs:
                 self._storage.store(key, after)
                 self.rewritten += 1

@@ -37,6 +37,8 @@ class Tape:
         """`kept`: whether the records are stored; if not, they are lost with the server, as its recordings are."""
         self.earlier: list[dict[str, Any]] = []
         """The records of earlier servers, in order, after `load`."""
+        self.seats: tuple[str, ...] = ()
+        """In a session: the players, in the order of the seats."""
         self._settings = settings
         self._step = step
         self._store = store
@@ -90,7 +92,8 @@ class Tape:
         while self._waiting:
             with self._adding:
                 records, self._waiting = self._waiting, []
-            body = json.dumps({"schema": SCHEMA, "records": records}, separators=(",", ":"), default=str).encode()
+            piece = {"schema": SCHEMA, **({"seats": list(self.seats)} if self.seats else {}), "records": records}
+            body = json.dumps(piece, separators=(",", ":"), default=str).encode()
             created = False
             while not created:  # a piece may be of an earlier process of this server
                 self._number += 1

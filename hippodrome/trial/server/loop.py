@@ -248,6 +248,7 @@ class TrialLoop:
             answered=answered,
             said=self._recorder.tape.earlier,
         )
+        self._recorder.tape.seats = playing.seats
         self._use_talk(recorded)
         self._apply(effects)
 

@@ -31,7 +31,7 @@ from hippodrome.protocol.keys import handover_key, session_key
 from hippodrome.protocol.session import parse
 from tests.deployment.installation import CommandResult
 from tests.export.data_world import crowd, into_folder
-from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study
+from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study, tape, tape_key
 
 LABEL = ids.server_label("maze", ANN)
 
@@ -92,6 +92,17 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(ma
     again = machine.erase("--yes")
     assert (again.code, "nothing of this participant" in again.err) == (Exit.DONE, True)
     assert machine.contents() == after
+
+
+def test_what_one_member_has_said_is_erased_also_in_the_requests_to_a_model(machine: Machine) -> None:
+    study(machine.put, machine.tmp)
+    machine.put(tape_key(), tape())
+    assert machine.erase("--yes").code == Exit.DONE
+    assert machine.traces() == []
+    first, call, answer, other, held = json.loads(machine.contents()[tape_key()])["records"]
+    assert (first["n"], first["by"], first["text"], held["text"]) == (1, "left", "", "")
+    assert (call["hash"], call["tokens"], "request" in call) == ("abc", {"input": 9, "output": 2}, False)
+    assert (answer["text"], other["text"], other["original"]) == ("Hello", said(BOB), "Rude")
 
 
 def test_after_all_members_are_erased_the_session_is_deleted(machine: Machine) -> None:
