@@ -26,7 +26,7 @@ from hippodrome.control.config.layout import AGENT, REQUIREMENTS
 from hippodrome.protocol import players, server_modules
 from hippodrome.protocol.values import KeyPath, printable
 
-_IN_IMAGE = ("protocol", "trial")  # packages of Hippodrome
+_IN_IMAGE = ("llm", "protocol", "trial")  # modules of Hippodrome
 _MISSING = ("ImportError", "ModuleNotFoundError", "Exception", "BaseException")
 
 

@@ -34,6 +34,7 @@ def test_every_part_of_the_image_changes_the_bundle(
         "infra/Dockerfile",
         "requirements/trial.txt",
         "hippodrome/__init__.py",
+        "hippodrome/llm.py",
         "hippodrome/protocol/trial.py",
         "hippodrome/trial/server/server.py",
     ):
@@ -45,6 +46,7 @@ def test_every_part_of_the_image_changes_the_bundle(
     for file in (
         here / "infra/Dockerfile",
         here / "requirements/trial.txt",
+        here / "hippodrome/llm.py",
         here / "hippodrome/protocol/trial.py",
         here / "hippodrome/trial/server/server.py",
         folder / "agent.py",
@@ -57,7 +59,7 @@ def test_every_part_of_the_image_changes_the_bundle(
     seen.add(make_bundle(folder).hash)
     (folder / "agent2.py").chmod(0o755)
     seen.add(make_bundle(folder).hash)
-    assert len(seen) == 9
+    assert len(seen) == 10
 
 
 def test_other_files_do_not_change_the_bundle(folder: Path) -> None:

@@ -124,7 +124,10 @@ def test_modules_beside_the_agent_are_read_too(folder: Path) -> None:
 
 
 def test_of_our_own_code_the_image_holds_only_the_trials(folder: Path) -> None:
-    begin(folder, "import hippodrome.trial.agent, hippodrome.protocol\nimport hippodrome.control.model.ids")
+    begin(
+        folder,
+        "import hippodrome.trial.agent, hippodrome.protocol, hippodrome.llm\nimport hippodrome.control.model.ids",
+    )
     (line,) = found(folder)
     assert (
         line

@@ -89,7 +89,8 @@ def make_bundle(folder: Path, base: str = "", trial: Mapping[str, Any] | None = 
         "requirements/project.txt": _requirements(folder),
     }
     package = places.PACKAGES / "hippodrome"
-    code = (package / "__init__.py", *(package / "protocol").rglob("*.py"), *(package / "trial").rglob("*.py"))
+    files = (package / "__init__.py", package / "llm.py")  # agent.py may import hippodrome.llm
+    code = (*files, *(package / "protocol").rglob("*.py"), *(package / "trial").rglob("*.py"))
     entries |= {path.relative_to(places.PACKAGES).as_posix(): path for path in sorted(code)}
     entries |= {f"project/{name}": path for name, path in project_files(folder).items()}
     return Bundle(entries)
