@@ -42,7 +42,7 @@ def certificates() -> None:
     order, put = renewal.Renewal.obtain, Route53Challenges.put
 
     def obtain(self: Any, wish: Any) -> Any:
-        return order(self, renewal.RenewalRequest(**{**vars(wish), "trusted": SETTINGS["trusted"][wish.directory]}))
+        return order(self, certificate.RenewalRequest(**{**vars(wish), "trusted": SETTINGS["trusted"][wish.directory]}))
 
     def published(self: Any, name: str, values: Sequence[str], seconds: float) -> None:
         put(self, name, values, seconds)

@@ -13,8 +13,8 @@ import acme.client
 import pytest
 
 from hippodrome.control.certificates import rules as certificate
-from hippodrome.control.certificates.renewal import Renewal, RenewalOutcome, RenewalRequest
-from hippodrome.control.certificates.rules import ACCOUNT, CertificateRecord, OrderStage
+from hippodrome.control.certificates.renewal import Renewal, RenewalOutcome
+from hippodrome.control.certificates.rules import ACCOUNT, CertificateRecord, OrderStage, RenewalRequest
 from hippodrome.control.ports import Documents
 from hippodrome.local.backend.documents import FolderDocuments
 from testing.moto_world import moto_world  # noqa: F401 - a fixture

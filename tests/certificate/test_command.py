@@ -355,7 +355,7 @@ def test_wrong_options_are_refused(world, capsys, arguments, said):
 
 
 def test_every_reason_of_a_failure_has_a_sentence_and_advice():
-    from hippodrome.control.certificates.renewal import RenewalRequest
+    from hippodrome.control.certificates.rules import RenewalRequest
 
     for trouble in FailureReason:
         for directory in (STAGING, PRODUCTION, "https://ca.example/dir", "https:"):

@@ -48,7 +48,7 @@ def test_a_due_certificate_is_renewed_at_its_own_authority(function, place, log)
     place.ahead = timedelta(days=61)
     said = function()
     assert said["certificate"] == "ordered"
-    assert said["notAfter"] == place.state.not_after.isoformat()
+    assert said["notAfter"] == place.renewal().read()[1].not_after.isoformat()
     assert place.key != first
     assert place.read(ACCOUNT) == account
     assert not place.challenges.present
@@ -88,7 +88,8 @@ def test_a_certificate_that_was_put_there_by_hand_is_not_renewed(function, place
 
 def test_the_functions_role_allows_its_calls_and_no_other_role_allows_its_writes(moto_world, pebble, monkeypatch):
     """Route 53 and S3 on moto; the roles in infra/template.yml must allow each call (see testing/iam/enforcement.py)."""
-    from hippodrome.control.certificates.renewal import Renewal, RenewalRequest
+    from hippodrome.control.certificates.renewal import Renewal
+    from hippodrome.control.certificates.rules import RenewalRequest
     from testing.iam.actions import asks
 
     if moto_world.iam is None:

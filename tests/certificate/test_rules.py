@@ -143,7 +143,7 @@ def test_the_size_of_the_state_is_limited(count, text):
     assert len(state.failures) <= rules.MAX_FAILURES
     assert all(len(one.text) <= rules.MAX_TEXT for one in state.failures)
     assert from_json(to_json(state), CertificateRecord) == state
-    assert rules.succeeded(state, stored(), "", NOW).failures == ()
+    assert rules.succeeded(stored(), "", NOW).failures == ()
 
 
 def test_a_state_with_times_without_a_zone_is_refused():

@@ -20,7 +20,14 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from hippodrome.control.certificates.rules import FailureReason, OrderFailed, OrderStage, StoredCertificate, names_of
+from hippodrome.control.certificates.rules import (
+    FailureReason,
+    OrderFailed,
+    OrderStage,
+    RenewalRequest,
+    StoredCertificate,
+    names_of,
+)
 from hippodrome.control.certificates.session import errors_translated, open_account, open_network
 
 _LONG_AGO = datetime(1970, 1, 1, tzinfo=UTC)
@@ -41,38 +48,24 @@ class Issued:
         return f"{_ORIGIN}{self.stored.directory}\n{self.key}{self.chain}".encode()
 
 
-@dataclass(frozen=True)
-class OrderRequest:
-    """One order: the certificate's domain, the ACME directory, and the account."""
-
-    directory: str
-    domain: str  # the certificate is for its wildcard, `*.domain`
-    account: Mapping[str, Any] = field(repr=False)  # the JWK of the account key
-    email: str = ""
-    trusted: str = ""  # the root certificates (PEM) to trust at the directory's HTTPS address; "": the public ones
-    seconds: float = 300.0  # for the whole order
-
-
-def txt_name(domain: str) -> str:
-    """Return the name of the TXT record that proves control of `domain` and `*.domain`."""
-    return f"{acme_challenges.DNS01.LABEL}.{domain}"
-
-
 def order(
-    request: OrderRequest, publish: Callable[[list[str], float], None], tell: Callable[[OrderStage], None]
+    request: RenewalRequest,
+    account: Mapping[str, Any],
+    publish: Callable[[list[str], float], None],
+    tell: Callable[[OrderStage], None],
 ) -> Issued:
     """Place the order, prove control of the domain, fetch the certificate and verify it.
 
-    Calls `tell` at each stage, and `publish` with the values of the TXT record and the seconds within which they must
-    be visible. The caller must remove these values afterwards, also if the order fails. Raises OrderFailed, and the
-    exceptions of `publish`.
+    `account` is the JWK of the account key. Calls `tell` at each stage, and `publish` with the values of the TXT record
+    and the seconds within which they must be visible. The caller must remove these values afterwards, also if the order
+    fails. Raises OrderFailed, and the exceptions of `publish`.
     """
     deadline = time.monotonic() + request.seconds
     names = names_of(request.domain)
     key_pem = ec.generate_private_key(ec.SECP256R1()).private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    with open_network(request.account, request.trusted) as (network, retry_after):
+    with open_network(account, request.trusted) as (network, retry_after):
         tell(OrderStage.ACCOUNT)
         with errors_translated(retry_after):
             authority = open_account(request.directory, network, request.email)
@@ -118,11 +111,6 @@ def read_or_expired(chain: bytes, directory: str = "") -> StoredCertificate:
         return read_chain(chain, directory)
     except OrderFailed:
         return StoredCertificate((), "", _LONG_AGO, _LONG_AGO, directory)
-
-
-def chain_of(privkey: bytes) -> bytes:
-    """Return the chain of certificates (PEM) in `privkey.pem`."""
-    return privkey[privkey.index(b"-----BEGIN CERTIFICATE") :]
 
 
 def read_chain(pem: bytes, directory: str = "") -> StoredCertificate:

@@ -1,8 +1,9 @@
 """Orders a certificate if `rules.py` decides so, and stores it where the servers read it.
 
 A run first claims the order in `certificate.json`, by compare-and-swap, so two runs never order at the same time. If a
-run is killed, its claim expires after `rules.CLAIM`. One conditional write of `privkey.pem` replaces the certificate.
-All other documents are derived from `privkey.pem`; if a run is interrupted, the next run repairs them.
+run is killed, its claim expires after `rules.CLAIM`; its TXT record stays until the next order replaces it, or until
+`hippodrome destroy`. One conditional write of `privkey.pem` replaces the certificate. All other documents are derived
+from `privkey.pem`; if a run is interrupted, the next run repairs them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from hippodrome.control.certificates.rules import (
     Location,
     OrderFailed,
     OrderStage,
+    RenewalRequest,
     StoredCertificate,
     Verdict,
 )
@@ -45,18 +47,6 @@ class Challenges(Protocol):
 
     def remove(self, name: str, values: Sequence[str]) -> None:
         """Remove the record if it has exactly these values."""
-
-
-@dataclass(frozen=True)
-class RenewalRequest:
-    """The certificate that should be stored: its domain and its ACME directory."""
-
-    domain: str
-    directory: str
-    email: str = ""  # sent to the CA, not stored
-    trusted: str = ""  # as in `order.OrderRequest`
-    force: bool = False  # as in `rules.decide`
-    seconds: float = 300.0  # for the whole order
 
 
 @dataclass(frozen=True)
@@ -93,11 +83,10 @@ class Renewal:
         self._location = location
         self._tell = tell
         self._note = note
-        self._published: list[str] = []
 
     def read(self) -> tuple[CertificateRecord, StoredCertificate | None]:
         """Return the record in `certificate.json` and the stored certificate. Changes nothing."""
-        return self._state()[0], self._stored()[0]
+        return self._state(), self._stored()[0]
 
     def last_directory(self) -> str:
         """Return the ACME directory that issued the present certificate or, if it is gone, the one ordered last.
@@ -114,8 +103,7 @@ class Renewal:
 
     def decide(self, wanted: RenewalRequest) -> Decision:
         """Return what `obtain` would decide now."""
-        state, stored = self.read()
-        return self._decide(state, stored, wanted)
+        return self._decide(*self.read(), wanted)
 
     def obtain(self, wanted: RenewalRequest) -> RenewalOutcome:
         """Order the certificate if it is due, and store it.
@@ -129,29 +117,50 @@ class Renewal:
                 self._repair(stored, wanted)
             return RenewalOutcome(decision, stored)
         try:
-            self._remove_challenges(wanted.domain, self._state()[0].challenges)  # left by a run that was killed
             issued = self._order(wanted, token)
             self._tell(OrderStage.STORE)
             self._store(issued, before)
         except BaseException as error:
-            self._remove_challenges(wanted.domain, self._published)
             self._failed(token, wanted, error)
             raise
-        self._remove_challenges(wanted.domain, self._published)
-        self._record_result(token, lambda state: rules.succeeded(state, issued.stored, wanted.trusted, self._now()))
+        self._record_result(token, lambda _: rules.succeeded(issued.stored, wanted.trusted, self._now()))
         return RenewalOutcome(decision, issued.stored)
 
     # ---- the state
 
-    def _state(self) -> tuple[CertificateRecord, Document | None]:
-        found = self._documents.get(self._location.state)
-        if found is None:
-            return CertificateRecord(), None
+    def _state(self) -> CertificateRecord:
+        return self._parsed(self._documents.get(self._location.state))
+
+    def _parsed(self, found: Document | None) -> CertificateRecord:
         try:
-            return from_json(found.body, CertificateRecord), found
+            return from_json(found.body, CertificateRecord) if found else CertificateRecord()
         except ValueError as error:  # someone has edited it; the certificate has the names and the dates
             self._note(f"{self._location.state} cannot be read and is written anew", error)
-            return CertificateRecord(), found
+            return CertificateRecord()
+
+    def _change(self, change: Callable[[CertificateRecord], CertificateRecord]) -> None:
+        """Apply `change` to the state, and write it unless it is equal."""
+
+        def content(known: Document | None) -> bytes | None:
+            state = self._parsed(known)
+            wanted = change(state)
+            return None if wanted == state else to_json(wanted)
+
+        self._swap(self._location.state, content)
+
+    def _swap(self, key: str, content: Callable[[Document | None], bytes | None]) -> None:
+        """Write what `content` makes of the present document (None: nothing), again after each conflict."""
+        for _ in range(MAX_TRIES):
+            known = self._documents.get(key)
+            body = content(known)
+            if body is None:
+                return
+            try:
+                self._write(key, body, known)
+            except Conflict:
+                continue
+            return
+        raise Conflict(key)
 
     def _write(self, key: str, body: bytes, known: Document | None) -> None:
         if known is None:
@@ -159,38 +168,23 @@ class Renewal:
         else:
             self._documents.replace(key, body, known.etag)
 
-    def _change(self, change: Callable[[CertificateRecord], CertificateRecord | None]) -> bool:
-        """Apply `change` to the state and write it, again after each conflict; False if `change` returned None."""
-        for _ in range(MAX_TRIES):
-            state, known = self._state()
-            wanted = change(state)
-            if wanted is None or wanted == state:
-                return wanted is not None
-            try:
-                self._write(self._location.state, to_json(wanted), known)
-            except Conflict:
-                continue
-            return True
-        raise Conflict(self._location.state)
-
     def _decide_and_claim(
         self, wanted: RenewalRequest, token: str
     ) -> tuple[Decision, Document | None, StoredCertificate | None]:
         """Decide, and claim the order if one is due. Also return the present `privkey.pem` and its certificate."""
-        for _ in range(MAX_TRIES):
-            state, known = self._state()
+        result: tuple[Decision, Document | None, StoredCertificate | None]
+
+        def claim(state: CertificateRecord) -> CertificateRecord:
+            nonlocal result
             stored, before = self._stored()
             if state.claim == token:  # an earlier try has written it, and its reply was lost
-                return Decision(Verdict.ORDER, "claimed"), before, stored
-            decision = self._decide(state, stored, wanted)
-            if decision.verdict is not Verdict.ORDER:
-                return decision, before, stored
-            try:
-                self._write(self._location.state, to_json(rules.claimed(state, token, self._now())), known)
-            except Conflict:
-                continue
-            return decision, before, stored
-        raise Conflict(self._location.state)
+                result = Decision(Verdict.ORDER, "claimed"), before, stored
+                return state
+            result = self._decide(state, stored, wanted), before, stored
+            return rules.claimed(state, token, self._now()) if result[0].verdict is Verdict.ORDER else state
+
+        self._change(claim)
+        return result
 
     def _decide(self, state: CertificateRecord, stored: StoredCertificate | None, wanted: RenewalRequest) -> Decision:
         names = rules.names_of(wanted.domain)
@@ -199,7 +193,7 @@ class Renewal:
     def _record_result(self, token: str, change: Callable[[CertificateRecord], CertificateRecord]) -> None:
         """Record how our order ended, unless another run has claimed it. If that fails, the next run repairs it."""
         try:
-            self._change(lambda state: change(state) if state.claim == token else None)
+            self._change(lambda state: change(state) if state.claim == token else state)
         except Exception as error:  # noqa: BLE001 - the certificate matters more than its state
             self._note(f"{self._location.state} could not be written", error)
 
@@ -215,33 +209,25 @@ class Renewal:
     # ---- the order
 
     def _order(self, wanted: RenewalRequest, token: str) -> Issued:
-        from hippodrome.control.certificates import order  # noqa: PLC0415 - its import is slow
+        from hippodrome.control.certificates.order import order  # noqa: PLC0415 - its import is slow
+
+        name, published = rules.proof_name(wanted.domain), list[str]()
 
         def publish(values: list[str], seconds: float) -> None:
-            if not self._change(lambda state: rules.with_challenges(state, values) if state.claim == token else None):
+            if self._state().claim != token:
                 raise OrderFailed(FailureReason.OVERTAKEN, "another run is ordering this certificate now")
-            self._published = values
-            self._challenges.put(order.txt_name(wanted.domain), values, seconds)
-
-        request = order.OrderRequest(
-            directory=wanted.directory,
-            domain=wanted.domain,
-            account=account_key(self._documents, wanted.directory),
-            email=wanted.email,
-            trusted=wanted.trusted,
-            seconds=wanted.seconds,
-        )
-        return order.order(request, publish, self._tell)
-
-    def _remove_challenges(self, domain: str, values: Sequence[str]) -> None:
-        """Remove published values from DNS. If that fails, the next run does it."""
-        if not values:
-            return
-        from hippodrome.control.certificates.order import txt_name  # noqa: PLC0415 - its import is slow
+            published.extend(values)
+            self._challenges.put(name, values, seconds)
 
         try:
-            self._challenges.remove(txt_name(domain), values)
-            self._change(lambda state: rules.without_challenges(state, values))
+            return order(wanted, account_key(self._documents, wanted.directory), publish, self._tell)
+        finally:
+            if published:
+                self._remove_proof(name, published)
+
+    def _remove_proof(self, name: str, values: Sequence[str]) -> None:
+        try:
+            self._challenges.remove(name, values)
         except Exception as error:  # noqa: BLE001 - an old TXT record does no harm; a lost certificate would
             self._note("the challenge's TXT record could not be removed", error)
 
@@ -271,30 +257,22 @@ class Renewal:
         self._copy_chain()
 
     def _copy_chain(self) -> None:
-        """Copy the chain of `privkey.pem` to `fullchain.pem`."""
-        from hippodrome.control.certificates.order import chain_of  # noqa: PLC0415 - its import is slow
+        """Copy the chain of `privkey.pem`, which is read last, to `fullchain.pem`, so that a newer chain conflicts."""
 
-        for _ in range(MAX_TRIES):
-            known = self._documents.get(self._location.fullchain)  # read first, so that a newer chain conflicts
+        def content(known: Document | None) -> bytes | None:
             source = self._documents.get(self._location.privkey)
-            chain = chain_of(source.body) if source else None
-            if chain is None or (known and known.body == chain):
-                return
-            try:
-                self._write(self._location.fullchain, chain, known)
-            except Conflict:
-                continue
-            return
-        raise Conflict(self._location.fullchain)
+            chain = rules.chain_of(source.body) if source else None
+            return None if known and known.body == chain else chain
+
+        self._swap(self._location.fullchain, content)
 
     def _repair(self, stored: StoredCertificate, wanted: RenewalRequest) -> None:
-        """Finish what a killed run left undone: the chain, the state, the challenges."""
+        """Finish what a killed run left undone: the chain, and the state."""
         self._copy_chain()
-        state = self._state()[0]
+        state = self._state()
         if state.serial != stored.serial:
-            self._change(lambda now: rules.succeeded(now, stored, wanted.trusted, self._now()))
+            self._change(lambda _: rules.succeeded(stored, wanted.trusted, self._now()))
         elif state.claim and state.claimed and self._now() - state.claimed > rules.CLAIM:
-            self._remove_challenges(wanted.domain, state.challenges)
             self._change(rules.unclaimed)
 
 

@@ -70,6 +70,11 @@ def location(domain: str) -> Location:
     return Location(*(f"SSL/{domain}/{name}" for name in ("fullchain.pem", "privkey.pem", "certificate.json")))
 
 
+def chain_of(privkey: bytes) -> bytes:
+    """Return the chain of certificates (PEM) in `privkey.pem`."""
+    return privkey[privkey.index(b"-----BEGIN CERTIFICATE") :]
+
+
 class OrderStage(StrEnum):
     """The stages of an order, worded for the administrator."""
 
@@ -113,6 +118,18 @@ def limit_in(text: str) -> Limit:
     return Limit.REQUESTS
 
 
+@dataclass(frozen=True)
+class RenewalRequest:
+    """The certificate that should be stored: its domain and its ACME directory."""
+
+    domain: str  # the certificate is for its wildcard, `*.domain`
+    directory: str
+    email: str = ""  # sent to the CA, not stored
+    trusted: str = ""  # the root certificates (PEM) to trust at the directory's HTTPS address; "": the public ones
+    force: bool = False  # as in `decide`
+    seconds: float = 300.0  # for the whole order
+
+
 class OrderFailed(Exception):
     """The order failed, and the certificate in use stays. `until`: the CA asks for no retry before this time."""
 
@@ -140,16 +157,12 @@ class CertificateRecord(Record, frozen=True):
 
     schema: int = 1
     directory: str = ""
-    names: tuple[str, ...] = ()
     serial: str = ""  # hexadecimal
-    not_before: UtcDatetime | None = None
-    not_after: UtcDatetime | None = None
     ordered: UtcDatetime | None = None
     trusted: str = ""  # the root certificates (PEM) to trust at the directory's HTTPS address; "": the public ones
     failures: tuple[FailedOrder, ...] = ()  # since the last success, oldest first
     claim: str = ""  # the token of the run that is ordering now
     claimed: UtcDatetime | None = None
-    challenges: tuple[str, ...] = ()  # values that the TXT record may still have
 
 
 class CountedOrder(NamedTuple):
@@ -219,6 +232,11 @@ class Decision:
 def names_of(domain: str) -> tuple[str, ...]:
     """Return the names that the certificate is for: the wildcard `*.domain`."""
     return (f"*.{domain}",)
+
+
+def proof_name(domain: str) -> str:
+    """Return the name of the TXT record that proves control of `domain` and `*.domain` (RFC 8555, section 8.4)."""
+    return f"_acme-challenge.{domain}"
 
 
 def renew_at(not_before: datetime, not_after: datetime) -> datetime:
@@ -302,19 +320,6 @@ def claimed(state: CertificateRecord, token: str, now: datetime) -> CertificateR
     return msgspec.structs.replace(state, claim=token, claimed=now)
 
 
-def with_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """Return the record with values that are about to be published in DNS.
-
-    If this run is interrupted, a later run removes them from DNS.
-    """
-    return msgspec.structs.replace(state, challenges=tuple(values))
-
-
-def without_challenges(state: CertificateRecord, values: Sequence[str]) -> CertificateRecord:
-    """Return the record without these values, which are removed from DNS; unchanged if it holds other values."""
-    return msgspec.structs.replace(state, challenges=()) if state.challenges == tuple(values) else state
-
-
 def unclaimed(state: CertificateRecord) -> CertificateRecord:
     """Return the record without a claim, after a run was interrupted (Ctrl-C), so that another run may order."""
     return msgspec.structs.replace(state, claim="", claimed=None)
@@ -326,16 +331,6 @@ def failed(state: CertificateRecord, failure: FailedOrder) -> CertificateRecord:
     return msgspec.structs.replace(unclaimed(state), failures=kept)
 
 
-def succeeded(state: CertificateRecord, stored: StoredCertificate, trusted: str, now: datetime) -> CertificateRecord:
+def succeeded(stored: StoredCertificate, trusted: str, now: datetime) -> CertificateRecord:
     """Return the record of this new certificate, without the failed orders before it and without a claim."""
-    return msgspec.structs.replace(
-        unclaimed(state),
-        directory=stored.directory,
-        names=stored.names,
-        serial=stored.serial,
-        not_before=stored.not_before,
-        not_after=stored.not_after,
-        ordered=now,
-        trusted=trusted,
-        failures=(),
-    )
+    return CertificateRecord(directory=stored.directory, serial=stored.serial, ordered=now, trusted=trusted)

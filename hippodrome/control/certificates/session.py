@@ -5,10 +5,9 @@ Importing it loads `acme` and `cryptography` (0.2 s and more), so other modules 
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
 from pathlib import Path
@@ -27,8 +26,6 @@ REQUEST_SECONDS = 20  # for one response of the CA
 NONCE_ROUNDS = 4  # rounds of two attempts if the CA refuses a nonce; each refusal brings a new nonce
 MAX_WAIT = timedelta(days=8)  # the longest Retry-After accepted: Let's Encrypt's windows have 7 days
 DEFAULT_WAIT = timedelta(hours=1)  # if a CA refuses with `rateLimited` and sends no Retry-After
-
-_RETRY_AFTER = re.compile(r"retry after (\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)", re.IGNORECASE)
 
 
 def new_account_key() -> dict[str, Any]:
@@ -134,8 +131,9 @@ def _refusal(error: messages.Error, retry_after: Mapping[str, datetime]) -> Orde
     text = text_of(error)
     match error.code:
         case "rateLimited":
-            until = retry_after.get("until") or _retry_after_in(text) or datetime.now(UTC) + DEFAULT_WAIT
-            return OrderFailed(FailureReason.RATE_LIMITED, text, until)
+            return OrderFailed(
+                FailureReason.RATE_LIMITED, text, retry_after.get("until", datetime.now(UTC) + DEFAULT_WAIT)
+            )
         case "caa":
             return OrderFailed(FailureReason.CAA, text)
         case "serverInternal" | "badNonce":
@@ -174,11 +172,3 @@ def _parse_retry_after(header: str) -> datetime | None:
     except ValueError:
         return None
     return min(at if at.tzinfo else at.replace(tzinfo=UTC), now + MAX_WAIT)
-
-
-def _retry_after_in(text: str) -> datetime | None:
-    """The time in Let's Encrypt's message, such as "retry after 2026-11-22 10:00:00 UTC"; None if there is none."""
-    if found := _RETRY_AFTER.search(text):
-        with suppress(ValueError):
-            return min(datetime.fromisoformat(f"{found[1]}T{found[2]}+00:00"), datetime.now(UTC) + MAX_WAIT)
-    return None

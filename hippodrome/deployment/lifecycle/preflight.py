@@ -16,7 +16,7 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
-from hippodrome.control.certificates.rules import names_of
+from hippodrome.control.certificates.rules import names_of, proof_name
 from hippodrome.deployment.aws import caa, concurrency, public_access, quotas, regions
 from hippodrome.deployment.aws.account import Account, other_installations, servers_domain, site_host
 from hippodrome.deployment.aws.hosted_zone import delegation, exists, leading_away, read_zone, record_in
@@ -187,7 +187,7 @@ def _delegation(prepared: Prepared) -> Iterator[Finding]:
 def _proof(prepared: Prepared) -> Iterator[Finding]:
     """Check that Let's Encrypt can see the zone's TXT record, by which an installation proves its servers' domain."""
     zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
-    proof = f"_acme-challenge.{servers_domain(prepared.parameters)}"
+    proof = proof_name(servers_domain(prepared.parameters))
     if away := leading_away(prepared.account, zone, proof):
         name, kind = away
         yield bad(

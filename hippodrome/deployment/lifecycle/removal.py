@@ -16,7 +16,7 @@ from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
 from hippodrome.control.aws.challenges import TTL
 from hippodrome.control.aws.tasks import EcsTasks
-from hippodrome.control.certificates.rules import names_of
+from hippodrome.control.certificates.rules import proof_name
 from hippodrome.deployment.aws import resource_names
 from hippodrome.deployment.aws.account import Account, Installation
 from hippodrome.deployment.aws.versions import VersionedBucket
@@ -172,11 +172,7 @@ class Removal:
 
     def _acme_records(self, addresses: Addresses) -> None:
         """Delete the challenge records that interrupted orders of certificates left."""
-        for name in names_of(addresses.servers):
-            self._acme_record(f"_acme-challenge.{name.removeprefix('*.')}", addresses.zone)
-
-    def _acme_record(self, name: str, zone: str) -> None:
-        client = self.account.client("route53")
+        name, zone, client = proof_name(addresses.servers), addresses.zone, self.account.client("route53")
         try:
             answer = client.list_resource_record_sets(HostedZoneId=zone, StartRecordName=f"{name}.", MaxItems="10")
         except client.exceptions.NoSuchHostedZone:

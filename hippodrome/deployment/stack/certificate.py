@@ -23,9 +23,11 @@ from hippodrome.control.certificates.rules import (
     FailureReason,
     OrderFailed,
     OrderStage,
+    RenewalRequest,
     StoredCertificate,
     Verdict,
     names_of,
+    proof_name,
 )
 from hippodrome.deployment.aws import caa
 from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
@@ -35,7 +37,7 @@ from hippodrome.deployment.core import options
 from hippodrome.deployment.stack import certificate_transfer
 
 if TYPE_CHECKING:
-    from hippodrome.control.certificates.renewal import Renewal, RenewalRequest
+    from hippodrome.control.certificates.renewal import Renewal
 
 CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
 """By ACME directory, the names by which CAA records allow its authority to issue."""
@@ -198,7 +200,7 @@ def renewal_of(
     account: Account, installation: Installation, choice: Choice, tell: Callable[[OrderStage], None]
 ) -> tuple[Renewal, RenewalRequest]:
     """Make the service that renews the installation's certificate, and the request to it for this choice."""
-    from hippodrome.control.certificates.renewal import Renewal, RenewalRequest
+    from hippodrome.control.certificates.renewal import Renewal
 
     domain = installation.servers_domain
     platform = account.platform(installation)
@@ -243,7 +245,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
             "that is known, which may take some hours.",
             zone.name_servers,
         )
-    proof = f"_acme-challenge.{domain}"
+    proof = proof_name(domain)
     if away := leading_away(account, zone, proof):
         name, kind = away
         raise Problem(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -13,8 +13,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from hippodrome import cli
 from hippodrome.console.problem import Exit
 from hippodrome.control.certificates import order
-from hippodrome.control.certificates.order import Issued, OrderRequest, read_chain
-from hippodrome.control.certificates.rules import ACCOUNT, PRODUCTION, STAGING, location
+from hippodrome.control.certificates.order import Issued, read_chain
+from hippodrome.control.certificates.rules import ACCOUNT, PRODUCTION, STAGING, RenewalRequest, location
 from hippodrome.deployment.aws.account import Installation
 from hippodrome.deployment.lifecycle import deploy
 from hippodrome.deployment.stack import certificate, certificate_transfer
@@ -33,9 +33,9 @@ class Authority:
         self.accounts: list[str] = []
         self.days = 80.0
 
-    def order(self, request: OrderRequest, publish: Callable[..., Any], tell: Callable[..., Any]) -> Issued:
+    def order(self, request: RenewalRequest, account: Mapping[str, Any], publish: Any, tell: Any) -> Issued:
         self.orders.append(request.directory)
-        self.accounts.append(request.account["x"])
+        self.accounts.append(account["x"])
         key = ec.generate_private_key(ec.SECP256R1()).private_bytes(
             serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         )
