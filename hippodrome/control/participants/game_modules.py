@@ -35,7 +35,7 @@ def _jumps(trial: Mapping[str, Any]) -> bool:
 
 
 TALK = "talk"
-"""The built-in game (`trial.game`) in which participants only talk."""
+"""The built-in game (`trial.game`) in which participants only talk, as in `hippodrome.protocol.trial`."""
 MODULES: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
     "keys.js": lambda trial: bool(trial.get("keys")),
     "labels.js": lambda trial: bool(trial.get("labels")),
