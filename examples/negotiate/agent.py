@@ -1,8 +1,8 @@
 """Tells each participant in private who they are, and both what was offered after each round."""
 
 ROLES = {
-    "buyer": "You are the buyer. The bicycle is worth 100 to you: you gain 100 minus the price. Without a deal you gain nothing.",
-    "seller": "You are the seller. You need at least 60 for the bicycle: you gain the price minus 60. Without a deal you gain nothing.",
+    "buyer": "You are the buyer. The bicycle is worth 100 to you: your gain is 100 minus the price, or nothing.",
+    "seller": "You are the seller. The bicycle is worth 60 to you: your gain is the price minus 60, or nothing.",
 }
 
 

@@ -31,6 +31,7 @@ from hippodrome.trial.agent import environments, match
 from hippodrome.trial.agent.agent import AgentAdapter, AgentError
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.joint import JointAdapter
+from hippodrome.trial.agent.replies import TalkOfAgent
 from hippodrome.trial.agent.starting import start
 from hippodrome.trial.core.players import Player, who_plays
 from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
@@ -110,7 +111,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
         return
     players = progress.result
-    progress.callbacks = _callbacks(player, players, progress, config.callback_seconds)
+    progress.callbacks = _callbacks(player, players, progress, config)
     names, count = progress.known["names"], progress.known["count"]
     if count is not None and names > count:
         if not player.steps_itself:
@@ -213,18 +214,23 @@ def _note_idle(
 
 
 def _callbacks(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: AgentProgress, seconds: float
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: AgentProgress, config: TrialSection
 ) -> Callbacks:
-    """The agent's callbacks, called as on a server."""
+    """The agent's callbacks, called as on a server. What they say, nobody hears."""
     humans = tuple(each.name for each in players if each.human)
     return Callbacks(
         player.callbacks,
         TrialFacts("check", "check", None, tuple(each.name for each in players), humans),
         lambda: player.env,
-        seconds=seconds,
+        seconds=config.callback_seconds,
         stamp=dict,
         failed=progress.callback_failed,
+        talk=TalkOfAgent(config.options, say=None if config.chat is None else _unheard),
     )
+
+
+def _unheard(text: str, to: str | Sequence[str] | None = None, by: str | None = None) -> None:
+    """Take what a callback says, and do nothing."""
 
 
 def _foreign_actions(env: Any, actions: range) -> list[int]:
