@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +18,9 @@ from hippodrome.bots.report import BotReport, PlayedStep
 MAX_BYTES = 512 * 1024**2  # unpacked; a recording of a few seconds is only larger if the study's agent errs
 ANYWHERE = ("presence", "ping")  # kinds of lines of a session that may stand anywhere, also after an episode's end
 PIECE = 1024**2  # bytes unpacked at once
+
+_TAPE = re.compile(r"[A-Za-z0-9_-]+-talk-[0-9]{4,}\.json")
+"""The name of a piece of a tape of talk, which lies among the recordings (`hippodrome.protocol.keys.tape_key`)."""
 
 
 @dataclass
@@ -115,7 +119,7 @@ def verify(
         trials = (session or folder) / "trials"
         _look_at_plays(found, report, folder, _recordings(trials, read), last_error, recorded=recorded)
         for path in sorted(trials.rglob("*")):
-            if path.is_file() and path.suffix != ".gz":
+            if path.is_file() and path.suffix != ".gz" and not _TAPE.fullmatch(path.name):
                 found.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
         code = membership.get("completionCode") or document(folder / "participant.json").get("completionCode")
         if code and str(code) in report.final_page:

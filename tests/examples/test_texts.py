@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
-EXAMPLES = sorted(path.parent for path in (Path(__file__).resolve().parents[2] / "examples").glob("*/config.yml"))
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "examples").glob("*/config.yml"))
+EXAMPLES = [path.parent for path in CONFIGS if "\n  game: talk" not in path.read_text(encoding="utf-8")]
+"""The examples with buttons and a score."""
 
 
 def page_before_the_game(folder: Path, config: Any) -> str:
