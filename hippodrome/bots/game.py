@@ -1,4 +1,4 @@
-"""Plays on a connection to a trial server (docs/wire.md): presses keys at random and acknowledges frames."""
+"""Plays on a connection to a trial server (docs/wire.md): presses keys at random, talks, and acknowledges frames."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed
 
 from hippodrome.bots.report import BotReport, PlayedStep
+from hippodrome.bots.talk import ScriptedTalk
 from hippodrome.protocol import keyboard
 from hippodrome.trial.core.choices import NOT_POSSIBLE
 from hippodrome.trial.pictures.frames import Decoder
@@ -82,6 +83,7 @@ class GameConnection:
         self._scene = SceneDecoder()
         self._images: set[str] = set()  # hashes of the images that the bot has asked for
         self._keys: RandomKeys | None = None  # None until the server has sent the controls
+        self._talk: ScriptedTalk | None = None  # None if nobody talks
         self._state = ""
         self._turns = False  # whether the game is played turn by turn
         self._to_act = True  # whether it is this player's turn
@@ -158,8 +160,14 @@ class GameConnection:
         if "UI" in message:
             self._turns = message.get("pace") == "turns"
             self._keys = RandomKeys(self._random, message)
+            if "chat" in message and self._talk is None:
+                self._talk = ScriptedTalk(self._random, message["chat"], time.monotonic())
             await self._load(message.get("assets", ()))
             self._may_stop = "stop" in message["UI"]
+        if self._talk is not None and "lines" in message:
+            play.lines += self._talk.heard(message)
+        elif self._talk is not None and "refused" in message:
+            self._talk.refused()
         if message.get("done"):
             play.done, play.score, play.episodes = True, message.get("score", 0), message.get("episodes", 0)
             play.outcome = message.get("outcome", play.outcome)
@@ -187,10 +195,12 @@ class GameConnection:
         return reads or (self._state == "paused" and not waits)
 
     async def _press(self, keys: RandomKeys) -> None:
-        """Press keys while the game is played; stop the game when it was played for long enough."""
+        """Press keys while the game is played, and talk; stop the game when it was played for long enough."""
         began: float | None = None
         while True:
             await asyncio.sleep(self._random.uniform(0.1, 0.5))
+            for message in self._talk.messages(time.monotonic()) if self._talk is not None else ():
+                await self._send(message)
             if self._state != "playing" or not self._to_act:
                 continue
             began = began or time.monotonic()

@@ -21,6 +21,7 @@ class PlayedStep:
     seconds: float = 0.0  # seconds of playing: the times between two frames, added up
     timed_frames: int = 0  # received in `seconds`
     bytes: int = 0  # the bytes of frames, scenes and images
+    lines: int = 0  # lines that the bot has said and read
     score: float = 0
     episodes: int = 0
     done: bool = False

@@ -204,6 +204,8 @@ def _look_at_game(
     found.games += 1
     if play.done and (answers.get("score"), answers.get("episodes")) != (play.score, play.episodes):
         found.missing.append(f"{who}: the score shown is not the score stored")
+    if play.lines > answers.get("talk", {}).get("lines", 0):
+        found.missing.append(f"{who}: {play.lines} lines said but not all are counted")
     if not recordings:
         return
     steps, pictures = sum(one.steps for one in recordings), sum(one.pictures for one in recordings)

@@ -100,6 +100,8 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
         frame_rates = ", ".join(sorted({str(each.frame_rate) for each in plays if each.frame_rate}))
         amount = sum(each.bytes for each in plays)
         rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {frame_rates} set"))
+        if any(each.lines for each in plays):
+            rows.append(("lines said", str(sum(each.lines for each in plays))))
         rows.append(("frames received", f"{sum(each.frames for each in plays)}, {amount / 1e6:.1f} MB"))
     return rows
 
