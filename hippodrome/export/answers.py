@@ -109,7 +109,8 @@ class StudyAnswers:
                 links[name] = links.get(name, 0) + 1
             _only_common(fields)
         self.steps = self._in_order(steps)
-        self._answerable = [step for step in self.steps if not (project and step == project.final.key)]
+        final = project.final.key if project else ""
+        self._answerable = [step for step in self.steps if step != final or any(key[0] == final for key in fields)]
         self.versioned = [step for step in self._answerable if step in versioned]
         self.moved = [
             ChangedPage(step, page, others)

@@ -15,7 +15,7 @@ from hippodrome.protocol.keys import NAME
 from hippodrome.protocol.section_keys import Section
 from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.protocol.trial_sections import ChatSection, SceneSection, Ui, chat
-from hippodrome.protocol.values import KeyPath, Plain, number_in, show
+from hippodrome.protocol.values import KeyPath, Plain, SectionProblem, checked, number_in, show
 
 RATE_CHANGE, RATE_CHANGE_MISSPELT = "allowFrameRateChange", "allowFramRateChange"  # HIPPO's documentation has both
 MAX_EPISODES = 1_000_000
@@ -45,13 +45,17 @@ def _break(value: object) -> float | str:
         raise ValueError(f"{error}; or the name of a file in the steps folder") from None
 
 
-def _until(value: object) -> dict[str, int] | None:
-    """Check `until` and return it; None if it is left out."""
-    if value is None:
-        return None
+def _until(value: object) -> object:
+    """Check that `until` names success, and return it."""
     if not isinstance(value, dict) or [*value] != ["success"]:
         raise ValueError(f"must be a number of episodes that succeed, such as {{success: 3}}, not {show(value)}")
-    return {"success": int(str(values.whole(1, MAX_EPISODES)(value["success"])))}
+    return value
+
+
+def _successes(section: Mapping[Any, Any], path: KeyPath) -> tuple[dict[str, int] | None, list[SectionProblem]]:
+    """Check the number of episodes in `until`."""
+    number, problems = checked(values.whole(1, MAX_EPISODES), section["success"], (*path, "success"))
+    return (None if problems else {"success": number}), problems
 
 
 def _step(value: object) -> str:
@@ -97,6 +101,7 @@ class TrialSection(Section):
             "required": ["success"],
             "additionalProperties": False,
         },
+        entries=_successes,
         kind="`{success: n}`",
         example="{success: 3}",
     )

@@ -121,6 +121,7 @@ def test_who_declines_is_asked_nothing_more_and_gets_no_server(tmp_path: Path, p
     assert heading(page) == "Thank you"
     end = soup.stored("alice", "end")
     assert (end["end"], end["code"] in page) == ("declined", True)
+    assert ('class="study">soup<' in page, "TEXT.copy" not in page, '"Copy"' in page) == (True, True, True)
     assert topics(platform) == [Topic.STOP], "no server was requested"
     alice.post(agree="yes")
     assert heading(alice.get()) == "Thank you"
@@ -616,6 +617,13 @@ def test_participants_who_play_together_are_assigned_together(tmp_path: Path, pl
     matched(pair, "cid", "dan")
     conditions = {pair.stored(user, "assignment")["condition"]["pay"] for user in ("ann", "cid")}
     assert conditions == {"equal", "best"}, "pairs are balanced"
+
+
+def test_a_front_end_is_told_that_levels_are_drawn_with_the_match(tmp_path: Path, platform: FakePlatform) -> None:
+    pair = pairs(tmp_path, platform)
+    matched(pair, "cid", "dan")
+    assert "unassigned" not in json.loads(pair.visitor("cid").get(accept="application/json"))
+    assert json.loads(consented(pair, "ann").get(accept="application/json"))["unassigned"] is True
 
 
 def test_a_lobbys_page_that_was_made_before_the_study_had_factors_is_loaded_again(

@@ -95,7 +95,17 @@ def test_columns_stand_in_the_order_of_the_study_and_of_its_pages(tmp_path: Path
     ]
     times = [name for name in first if name.startswith("answered.")]
     assert times == [f"answered.{step}" for step in ("1", "2", "3", "4", "old")]
+    assert "answered.finalStep" not in first, "its page asks nothing"
     assert (first["participant"], first["1.consent"], first["old.x"], second["1.consent"]) == ("a", "", "1", "yes")
+
+
+def test_it_says_when_a_last_page_with_fields_was_answered(tmp_path: Path) -> None:
+    ((first, second), _) = written(filled({"a": {"finalStep": {"remarks": "fun"}}, "b": {"1": {}}}), tmp_path)
+    assert (first["finalStep.remarks"], first["answered.finalStep"] != "", second["answered.finalStep"]) == (
+        "fun",
+        True,
+        "",
+    )
 
 
 @QUICK

@@ -39,11 +39,8 @@ class Html(str):
     __slots__ = ()
 
 
-def message_page(
-    title: str, text: str, *, lang: str = IN_ENGLISH.language, more: Html | None = None, end: str = ""
-) -> Page:
-    """Return a page with a title and a text, such as an error. That of an `end` looks like a step, with `more` HTML."""
-    body = "message" if more is None else "step"
+def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
+    """Return a page with a title and a text, such as an error."""
     nonce = secrets.token_urlsafe(16)
     page = fill(
         "frame.html",
@@ -51,11 +48,11 @@ def message_page(
         dir=_direction(lang),
         title=title,
         head=Html(),
-        style=Html(style(body) + _of_direction(lang)),
-        body=body,
-        data=fill("end", end=end) if end else Html(),
+        style=Html(style("message") + _of_direction(lang)),
+        body="message",
+        data=Html(),
         header=Html(),
-        main=fill("message", title=title, text=text, more=more or Html()),
+        main=fill("message", title=title, text=text, more=Html()),
         footer=Html(),
         script=Html(),
     )

@@ -107,6 +107,24 @@ def step_page(view: StepView) -> Page:
     return Page(text, headers(view.project, nonce))
 
 
+def end_page(project: Project, user_id: str, end: str, code: str, link: str) -> Page:
+    """Return the page of an end for which the study has no page of its own, with the code and the link if there are."""
+    nonce = secrets.token_urlsafe(16)
+    texts = Texts(project.texts)
+    title, text = texts["endTitle"], texts["endText"]
+    page = frame(
+        project,
+        Step(end, ""),
+        user_id,
+        nonce,
+        main=fill("message", title=title, text=text, more=end_code(texts, code, link)),
+        script=script("step.js", nonce, texts=texts),
+        title=title,
+        data=fill("end", end=end),
+    )
+    return Page(page, headers(project, nonce))
+
+
 def fragment(view: StepView) -> str:
     """Return the researcher's part of a page, for a program with a frame and a form of its own. Raises FragmentError.
 

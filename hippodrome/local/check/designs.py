@@ -13,11 +13,13 @@ from hippodrome.protocol.similar import did_you_mean
 
 OF_EVERY_STEP = frozenset({"outcome", "passed", "tries"})
 """Fields that answers may have beside those of their pages."""
+OF_GAMES = ("score", "outcome", "episodes", "frames", "seconds", "trial", "completionCode")
 
 
 def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
-    """Return a mistake for each field that a check or a rule names and that no element of the page has."""
+    """Return a mistake for each field that a check or a rule names and that no page or game has."""
     fields = {step.key: _fields(step.files) for step in config.steps if step.files}
+    games = {step.key: _fields_of_game(config, step.key) for step in config.game_steps}
     source = read_source(folder)
     found = []
     for path, step, field, why in [*_of_checks(config), *_of_rules(config)]:
@@ -25,7 +27,25 @@ def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
         if known and field not in known | OF_EVERY_STEP:
             message = f"the page of {step} has no field {field}{did_you_mean(field, known)}{why}"
             found.append(source.diagnostic(path, message, remark=not why))
+        elif step in games and field not in games[step]:
+            found.append(source.diagnostic(path, _no_answer_of_game(step, field, games[step])))
     return found + list(_not_offered(config, source)) + list(_never_compared(config, source))
+
+
+def _no_answer_of_game(step: str, field: str, known: list[str]) -> str:
+    if field == "reached":
+        remedy = f"; give {step} a criterion, such as until: {{success: 3}}"
+    else:
+        remedy = did_you_mean(field, known) or f"; it has {', '.join(known)}"
+    return f"the answer of the game {step} has no {field}{remedy}"
+
+
+def _fields_of_game(config: Config, key: str) -> list[str]:
+    """The fields of the answer that the trial stores for a game (docs/data.md)."""
+    together = ("player", "session") if config.project.has_sessions else ()
+    scores = ("scores",) if len(config.trial.named_players()) > 1 else ()
+    has_criterion = config.design.own_trial.get(key, {}).get("until", config.trial.until) is not None
+    return [*OF_GAMES, *scores, *together, *(("reached",) if has_criterion else ())]
 
 
 def _not_offered(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:

@@ -33,14 +33,14 @@ from hippodrome.protocol.keys import participant_folder
 from hippodrome.protocol.session import ASSIGNMENT
 
 ROUNDS = 3
-MOST_CELLS = 12
-"""The most bots for an end whose rule asks about the cell. They get the cells that are drawn for them, as people do."""
+BY_CHANCE = 8
+"""Bots for an end that depends on chance: on a game, or on the cell that is drawn for people who play together."""
 Watch = Callable[[Sequence[BotReport]], None]
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a bot is sent: to an end, or to the last page, in a cell. `cell` is "" if it gets any."""
+    """Where a bot is sent: to an end, or to the last page, in a cell; "" if it gets any."""
 
     end: End | None = None
     cell: str = ""
@@ -91,8 +91,22 @@ class Ends:
         goals = [Goal(cell="" if size > 1 else cell) for cell in self.cells if not self.came_through(cell)]
         for end in self.tried:
             if not self.reached(end.name):
-                goals += [Goal(end)] * (min(len(self.cells), MOST_CELLS) if _asks(end, "condition") else 1)
+                goals += self._goals_of(end)
         return [goal for goal in goals for _ in range(size)]
+
+    def _goals_of(self, end: End) -> list[Goal]:
+        """The bots for an end: one in each cell if a rule asks about it, and several if it depends on chance."""
+        asks_cell = _asks(end, "condition")
+        if asks_cell and self._config.project.players == 1:
+            goals = [Goal(end, cell) for cell in self.cells]
+        else:
+            goals = [Goal(end)] * (min(len(self.cells), BY_CHANCE) if asks_cell else 1)
+        return goals * max(1, BY_CHANCE // len(goals)) if self.games_asked(end) else goals
+
+    def games_asked(self, end: End) -> list[str]:
+        """The games about whose answers a rule of the end asks. Bots play them by chance."""
+        asked = {names[1] for rule in end.when for names in rules.mentioned(rule) if names[0] == "answers"}
+        return sorted(step.key for step in self.design.steps if step.type.on_server and step.key in asked)
 
     async def rehearse(self, link: str, watch: Watch, *, at_once: int, ramp: float, **bot: Any) -> list[BotReport]:
         """Send bots until nothing is left to reach, at most ROUNDS times. Return their reports.
@@ -194,8 +208,7 @@ def _unreached(ends: Ends, source: ConfigSource) -> Iterator[str]:
 def _why(ends: Ends, end: End) -> str:
     """What the bots did about the rules of an end, and what they cannot do."""
     sent = [walk.report for walk in ends.walks if walk.goal.end == end]
-    asked = {names[1] for rule in end.when for names in rules.mentioned(rule) if names[0] == "answers"}
-    if chance := sorted(step.key for step in ends.design.steps if step.type.on_server and step.key in asked):
+    if chance := ends.games_asked(end):
         return f"It asks about {' and '.join(chance)}, which bots play by chance: play it yourself. {_where(sent)}"
     if _asks(end, "order") or _asks(end, "run"):
         return f"It asks about an order, which is drawn: try again. {_where(sent)}"

@@ -75,6 +75,18 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
         ),
         (
             "    - game\n",
+            "    - game: {until: {success: two}}\n",
+            'config.yml:7: project.steps item 3.game.until.success: must be a whole number from 1 to 1000000, not "two" '
+            "(with partner: helpful)",
+        ),
+        (
+            "    - game\n",
+            "    - game: {until: {success: 3}}\n    - train:\n        until:\n          success: two\n",
+            'config.yml:10: project.steps item 4.train.until.success: must be a whole number from 1 to 1000000, not "two" '
+            "(with partner: helpful)",
+        ),
+        (
+            "    - game\n",
             "    - game: {answers: [consents]}\n",
             "config.yml:7: project.steps item 3.game.answers item 1: there is no step consents; did you mean consent?",
         ),
@@ -94,6 +106,17 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
             "agent:{partner}",
             "agent:{partners}",
             "config.yml:16: trial.players.partner: there is no factor partners; did you mean partner?",
+        ),
+        (
+            "not answers.quiz.passed",
+            "answers.game.scor < 3",
+            "config.yml:13: project.ends.out: the answer of the game game has no scor; did you mean score?",
+        ),
+        (
+            "not answers.quiz.passed",
+            "not answers.game.reached",
+            "config.yml:13: project.ends.out: the answer of the game game has no reached; give game a criterion, such as "
+            "until: {success: 3}",
         ),
         ("answers.consent", 'answers["1"]', "config.yml:12: project.ends.declined.when: there is no step 1"),
         (

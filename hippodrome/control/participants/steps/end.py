@@ -30,8 +30,7 @@ class EndPage:
         if request.wants_json:
             text = f"{texts['endText']} {texts.say('endCode', code=code) if code else ''}".strip()
             return program_message(200, texts["endTitle"], text)
-        shown, title, text = pages.end_code(texts, code, link), texts["endTitle"], texts["endText"]
-        page = frame.message_page(title, text, lang=texts.language, more=shown, end=stop.ended.end)
+        page = pages.end_page(stop.project, user_id, stop.ended.end, code, link)
         return http.html(200, page.html, page.headers)
 
     def _own_page(self, request: Request, user_id: str, stop: Stop, step: Step) -> Response:

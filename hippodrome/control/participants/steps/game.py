@@ -62,7 +62,9 @@ class GameStep:
         if project.has_sessions:
             is_unassigned = project.assigns and visit.standing.assignment is None
             state, proof = self._state_together(visit), {"ticket": ticket}
-            proof |= {UNASSIGNED: "1"} if is_unassigned else {}
+            if is_unassigned:
+                proof |= {UNASSIGNED: "1"}
+                state |= {UNASSIGNED: True}
         else:
             state, proof = self._state_alone(visit), {}
         played = project.for_session(state.get("players", 0)) or project
