@@ -15,3 +15,13 @@ StudyFolder = Annotated[
         show_default=False,
     ),
 ]
+
+StudyFolders = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="STUDY…",
+        help="The study's folder, with config.yml, steps/ and agent.py; else the present folder. With --host several.",
+        show_default=False,
+    ),
+]
+"""The same for a command that may be given several folders."""

@@ -238,6 +238,7 @@ class Settings:
     cluster: str = "hippodrome"
     task_definition: str = "hippodrome"
     game_sources: str = ""  # the sources in the pages' Content-Security-Policy to which the game may connect
+    game_path: str = ""  # below this path all servers are at the one address in `game_sources`, by their names
     user_id_names: bool = True  # whether projects may name servers after participants' ids (`subdomain: userId`)
     certificate_url: str = ""  # where servers without a name get their certificate (`certify_server`)
     plain_clients: bool = False  # whether projects' front ends may open servers without a token (`plainClients`)
@@ -251,6 +252,12 @@ class Settings:
     def game_scheme(self) -> str:
         """The scheme of trial servers' addresses: `wss`, or `ws` where they have no TLS."""
         return self.game_sources.partition(":")[0] or "wss"
+
+    def game_address(self, host: str, port: int) -> str:
+        """Return the address at which browsers reach the server with this host and port."""
+        if self.game_path:
+            return f"{self.game_sources}{self.game_path}{host.partition('.')[0]}/"
+        return f"{self.game_scheme}://{host}:{port}/"
 
     @classmethod
     def from_env(cls, env: Mapping[str, str]) -> Settings:

@@ -29,12 +29,17 @@ class NotPublished(Exception):
 
 
 def publish(
-    folder: Path, documents: Documents, subdomain: str | None = None, say: Callable[[str], None] = lambda _: None
+    folder: Path,
+    documents: Documents,
+    subdomain: str | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    *,
+    signed: bool = False,
 ) -> Config:
     """Check the project, copy its pages where they differ, and register it; return the project.
 
-    `subdomain` replaces the project's. `say` gets a sentence if steps have changed and participants have begun. Raises
-    `NotPublished`.
+    `subdomain` replaces the project's, and with `signed` links are signed whatever it says. `say` gets a sentence if
+    steps have changed and participants have begun. Raises `NotPublished`.
     """
     try:
         config = read_project(folder)
@@ -44,6 +49,8 @@ def publish(
         _put(documents, f"{config.project.id}/steps/{composed(file.name)}", file.read_bytes())
     # On this machine servers are processes, also if the project says that they run on AWS.
     registration = {**config.registration(), "useAWS": False}
+    if signed:
+        registration["signedLinks"] = True
     if subdomain is not None:
         registration["subdomain"] = subdomain
     changed = _changed(documents, config)

@@ -9,7 +9,7 @@ import resource
 import select
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -17,9 +17,9 @@ from typing import Annotated
 import psutil
 import typer
 
-from hippodrome.console.arguments import StudyFolder
+from hippodrome.console.arguments import StudyFolders
 from hippodrome.console.problem import Exit, Problem
-from hippodrome.local import requirements
+from hippodrome.local import lab, requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend import files
@@ -35,7 +35,7 @@ STARTER_SECONDS = 1.0  # seconds between two looks whether the starter still run
 
 
 def command(
-    folder: StudyFolder = Path(),
+    folders: StudyFolders = None,
     *,
     port: Annotated[int, typer.Option(help="If it is in use, the next free one is taken. 0: any free one.")] = 8000,
     data: Annotated[
@@ -43,7 +43,11 @@ def command(
         typer.Option(help="Where answers and recordings are kept; else data/ in STUDY.", show_default=False),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="127.0.0.1 or localhost: a study runs for this machine only.")
+        str,
+        typer.Option(
+            help="Serve a lab: an address or name of this machine, or 0.0.0.0 for all. Else the study is for this "
+            "machine only."
+        ),
     ] = server.HOST,
     origin: Annotated[
         list[str] | None,
@@ -54,8 +58,18 @@ def command(
         ),
     ] = None,
     tls: Annotated[
-        bool, typer.Option("--tls", help="Serve pages by https, and servers by TLS at names below localhost.")
+        bool,
+        typer.Option(
+            "--tls", help="Serve pages by https, and servers by TLS: at names below localhost, or with --host there."
+        ),
     ] = False,
+    certificate: Annotated[
+        Path | None,
+        typer.Option(help="With --host: a PEM file with your own certificate and its chain.", show_default=False),
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option(help="With --certificate: the PEM file of its key.", show_default=False)
+    ] = None,
     names: Annotated[
         str | None,
         typer.Option(
@@ -75,51 +89,72 @@ def command(
 ) -> None:
     """Run the study on this machine, and print its link. What its requirements.txt names is installed first.
 
-    Answers and recordings are kept in its folder data/ from run to run. Ctrl-C ends the study.
+    Answers and recordings are kept in its folder data/ from run to run. Ctrl-C ends the study. With --host, computers
+    and phones of this network take part, and several studies may be named: their data are in data/, here.
     """
-    must_hold_study(folder)
-    requirements.prepare(folder)
+    folders = folders or [Path()]
+    for folder in folders:
+        must_hold_study(folder)
+    is_lab = host not in (server.HOST, "localhost")
+    _check_options(len(folders), is_lab=is_lab, tls=tls, names=names, certificate=certificate, key=key)
+    origins = [_origin(given) for given in origin or ()]
+    place = lab.host_of(host) if is_lab else None
+    for folder in folders:
+        requirements.prepare(folder)
     os.umask(0o077)  # answers are personal data: only their owner may read the files of this process and its servers
-    data = folder / "data" if data is None else data
-    activity_log = ActivityLog()
-    if host not in ("127.0.0.1", "localhost"):
-        raise Problem(
-            f"A study cannot run at {host}: its servers listen at 127.0.0.1, and browsers connect to them there, "
-            "so participants could not play on another machine.",
-            "Leave --host out.",
-            exit_code=Exit.MISUSE,
-        )
-    origins = [origin_of(given) for given in origin or ()]
-    if None in origins:
-        raise Problem(
-            f"--origin {(origin or [])[origins.index(None)]} is no origin.",
-            "Write it like http://localhost:3000.",
-            exit_code=Exit.MISUSE,
-        )
-    if names is not None and (names not in ("hash", "userId") or not tls):
-        raise Problem(
-            "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses.",
-            exit_code=Exit.MISUSE,
-        )
-    new_study = partial(Study, origins=[each for each in origins if each], tls=tls, names=names, fake_model=fake_model)
+    if data is None:
+        data = folders[0] / "data" if len(folders) == 1 else Path("data")
+    new_study = partial(
+        Study,
+        origins=origins,
+        tls=tls or certificate is not None,
+        names=names,
+        host=place,
+        fake_model=fake_model,
+        certificate=(certificate, key) if certificate and key else None,
+    )
     try:
-        _run_study(folder, port, data, fresh, activity_log=activity_log, new_study=new_study, starter=starter)
+        _run_study(folders, port, data, fresh, activity_log=ActivityLog(), new_study=new_study, starter=starter)
     except files.InUse as error:
         at = f", at {error}" if str(error) else ""
-        activity_log.show(f"A study already runs with the data in {data}{at}.", "End it there with Ctrl-C first.")
+        raise Problem(f"A study already runs with the data in {data}{at}.", "End it there with Ctrl-C first.") from None
     except NotPublished as error:
-        activity_log.show("The study cannot run yet:", *(f"  {problem}" for problem in error.problems))
+        raise Problem("The study cannot run yet:", details=error.problems) from None
     except server.NoPort as error:
-        activity_log.show(f"{error}.")
+        raise Problem(f"{error}.") from None
     except OSError as error:
-        activity_log.show(f"The study cannot run with the data in {data}: {_reason(error)}.", _remedy(error))
-    else:
-        return
-    raise typer.Exit(1)
+        raise Problem(f"The study cannot run with the data in {data}: {_reason(error)}.", _remedy(error)) from None
+
+
+def _check_options(
+    number: int, *, is_lab: bool, tls: bool, names: str | None, certificate: Path | None, key: Path | None
+) -> None:
+    """Raise `Problem` if these options do not go together. `number` is that of the studies."""
+    wrong = None
+    if names is not None and is_lab:
+        wrong = "--names has no effect with --host: a lab's servers are at the address of its pages."
+    elif names is not None and (names not in ("hash", "userId") or not tls):
+        wrong = "--names is hash or userId, and needs --tls: without it, browsers find servers by their addresses."
+    elif number > 1 and not is_lab:
+        wrong = "Several studies at once need --host: without it, each study has a server of its own."
+    elif (certificate is None) != (key is None):
+        wrong = "--certificate and --key belong together."
+    elif certificate is not None and not is_lab:
+        wrong = "--certificate needs --host: for names of this machine alone, --tls makes a certificate."
+    if wrong:
+        raise Problem(wrong, exit_code=Exit.MISUSE)
+
+
+def _origin(given: str) -> str:
+    """Return an origin as browsers write it. Raises `Problem` if this is none."""
+    found = origin_of(given)
+    if found is None:
+        raise Problem(f"--origin {given} is no origin.", "Write it like http://localhost:3000.", exit_code=Exit.MISUSE)
+    return found
 
 
 def _run_study(
-    folder: Path,
+    folders: Sequence[Path],
     port: int,
     data: Path,
     fresh: bool,
@@ -140,7 +175,7 @@ def _run_study(
         _move_aside(data.resolve(), state, activity_log)
     _allow_more_files()
     with _signals() as ended, function_log(state / "logs", activity_log):
-        study = new_study(folder, data, state, port, activity_log)
+        study = new_study(folders, data, state, port, activity_log)
         hold.write(f"{study.server.url} (process {os.getpid()})")
         try:
             study.start()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import os
 import secrets
-from collections.abc import Collection
+import ssl
+from collections.abc import Collection, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.text import Text
 
+from hippodrome.console.problem import Problem
 from hippodrome.control.config import Config
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import Project
@@ -19,13 +24,15 @@ from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend.authority import Authority
 from hippodrome.local.backend.platform import LocalPlatform
 from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.lab import Host, Lab, qr
+from hippodrome.local.publish import NotPublished
 from hippodrome.local.stand_in import StandIn
 from hippodrome.local.watch import Watch
 from hippodrome.local.web.access import TLS_NAMES
 from hippodrome.local.web.app import App
 from hippodrome.local.web.names import PORT as NAMES_PORT
 from hippodrome.local.web.names import Names
-from hippodrome.local.web.server import HOST, WebServer, listen
+from hippodrome.local.web.server import HOST, WebServer, address_of, listen
 
 OTHERS = 0o077  # the permissions of all users but the owner
 
@@ -37,11 +44,11 @@ FUNCTIONS = {
 
 
 class Study:
-    """A study that runs on this machine."""
+    """A study that runs on this machine; in a lab several of them, under one address."""
 
     def __init__(
         self,
-        folder: Path,
+        folders: Sequence[Path],
         data: Path,
         state: Path,
         port: int,
@@ -51,47 +58,72 @@ class Study:
         tls: bool = False,
         names: str | None = None,
         fake_model: bool = False,
+        host: Host | None = None,
+        certificate: tuple[Path, Path] | None = None,
     ) -> None:
-        """Publish the project in `folder` and take a port. Raises `NotPublished`, `NoPort`, and OSError.
+        """Publish the projects in `folders` and take a port. Raises `NotPublished`, `NoPort`, `Problem`, and OSError.
 
         With `tls`, pages are served by https, and servers have names below localhost. `names` ("hash" or "userId") says
-        how servers are named; None: as the project says. With `fake_model`, a stand-in answers in the place of the
-        study's language model also if there is a key.
+        how servers are named; None: as the project says. With `host`, other machines reach pages and servers there;
+        then `certificate` names the files of a certificate's chain and its key, instead of one that is made here. With
+        `fake_model`, a stand-in answers in the place of a study's language model also if there is a key.
         """
         self._data = data
         self._state = state
         self._port = port
+        self._tls = tls
         self._activity_log = activity_log
-        activity_log.named = tls
-        self._authority = Authority(state.parent / "tls") if tls else None
-        names_listener = listen(NAMES_PORT) if tls else None
+        activity_log.named, activity_log.one_port = tls and host is None, host is not None
+        self._authority = _authority(state.parent, tls, host, certificate)
+        names_listener = listen(NAMES_PORT) if tls and host is None else None
         named_port: int | None = names_listener.getsockname()[1] if names_listener else None
         _end_servers_of_other_addresses(state, named_port)
+        listener = listen(port, host.bound) if host else listen(port)
+        site = _site_context(self._authority, host, certificate)
+        address = address_of(listener, site, host.shown if host else None)
         self._platform = LocalPlatform(
             data,
             state,
-            project_folder=folder,
+            project_folder=folders[0],
             written=activity_log.wrote,
             named_port=named_port,
             subdomain=names,
+            more_folders=folders[1:],
+            lab=address if host else None,
             say=activity_log.warn,
         )
         installed.use(self._platform)
-        self._config = self._platform.publish()
+        self._configs = {folder: self._platform.publish(folder) for folder in folders}
+        if len(self._project_ids()) < len(folders):
+            raise NotPublished(["Two studies have the same id; give each a project.id of its own."])
         self._stand_in = StandIn(always=fake_model)
-        self._stand_in.use(self._config, activity_log.warn)
-        next_step_at = own_cells.OwnCells(self._platform, FUNCTIONS["next_step"]).handler
-        app = App({**FUNCTIONS, "next_step": next_step_at}, activity_log.warn, origins)
-        site = self._authority.context("localhost", HOST, *sorted(TLS_NAMES)) if self._authority else None
-        self.server = WebServer(app, listen(port), self._platform.retry.report, site)
+        for config in self._configs.values():
+            self._stand_in.use(config, activity_log.warn)
+        self._lab = Lab(self._platform, address, self._project_ids) if host else None
+        if self._lab is not None:
+            functions = self._lab.functions(FUNCTIONS)
+        else:  # in a lab cells are drawn, as on AWS
+            own = own_cells.OwnCells(self._platform, FUNCTIONS["next_step"])
+            functions = {**FUNCTIONS, "next_step": own.handler}
+        app = App(functions, activity_log.warn, origins, any_name=host is not None)
+        find = self._platform.port_of_label if host else None
+        self.server = WebServer(app, listener, self._platform.retry.report, site, url=address, find=find)
         self._names: Names | None = None
         if self._authority is not None and names_listener is not None:
             self._names = Names(names_listener, self._authority, self._platform.port_of)
-        self._watch = Watch(folder, self._config, self._platform.publish, self._published, activity_log.say)
+        self._watches = [self._watch(folder, config) for folder, config in self._configs.items()]
+
+    def _watch(self, folder: Path, config: Config) -> Watch:
+        publish, published = partial(self._platform.publish, folder), partial(self._published, folder)
+        return Watch(folder, config, publish, published, self._activity_log.say)
+
+    def _project_ids(self) -> list[str]:
+        return list(dict.fromkeys(config.project.id for config in self._configs.values()))
 
     def start(self) -> None:
         """Start the servers' threads and the web server, print the link, and watch the project's files."""
-        self._activity_log.set_steps(step.key for step in self._config.steps)
+        for config in self._configs.values():
+            self._activity_log.set_steps(config.project.id, (step.key for step in config.steps))
         self._platform.start()
         self.server.start()
         if self._names is not None:
@@ -100,14 +132,16 @@ class Study:
         playing_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
         if playing_on:
             self._activity_log.say(f"{playing_on} server(s) of the last run play on")
-        self._watch.start()
+        for watch in self._watches:
+            watch.start()
         self._activity_log.follow(self._platform.tasks, self._platform.documents.folder)
 
     def close(self) -> None:
         """End the servers and the web server. The data stay, and the next run goes on with them."""
         running = len(self._platform.tasks.playing())
         self._activity_log.show("", f"Ending{f', and {running} server(s) with it' if running else ''} …")
-        self._watch.close()
+        for watch in self._watches:
+            watch.close()
         self.server.close()
         if self._names is not None:
             self._names.close()
@@ -116,45 +150,80 @@ class Study:
         self._activity_log.close()
         self._activity_log.show(f"Ended. The data are in {self._data}.")
 
-    def _published(self, changed: Config) -> None:
-        self._activity_log.set_steps(step.key for step in changed.steps)
+    def _published(self, folder: Path, changed: Config) -> None:
+        self._configs[folder] = changed
+        self._activity_log.set_steps(changed.project.id, (step.key for step in changed.steps))
         installed.use(self._platform)  # the functions forget the pages that they have cached
         self._stand_in.use(changed, self._activity_log.warn)
         if not changed.project.live:
             self._activity_log.warn(_NOT_LIVE)
 
     def _banner(self) -> None:
-        project, url = self._config.project, self.server.url
-        link = f"{url}/next?projectId={project.id}"
-        own = link + self._signed(_new_id()) if project.signed_links else link
-        lines = [
-            Text(""),
-            Text.assemble("  ", (project.name or project.id, "bold")),
-            Text(f"  {self._config.summary()}"),
-            Text(""),
-            Text.assemble("  Link   ", (own, "bold green")),
+        lines = [Text("")]
+        if self._lab is not None:
+            lines += self._about_the_lab(self._lab)
+        for config in self._configs.values():
+            lines += self._about(config)
+        lines += [
             Text(f"  Data   {self._data}"),
             Text(f"  Logs   {from_here(self._state / 'logs')}"),
             *self._how_to_trust(),
-            *self._how_to_play_together(link),
-            *self._how_to_try_cells(link),
-            Text(""),
-            Text(f"  {_FOR_ONE if project.signed_links else _FOR_ALL} Ctrl-C ends everything."),
         ]
-        if self._port and not url.endswith(f":{self._port}"):
+        if self._lab is None:
+            (config,) = self._configs.values()
+            lines += [*self._how_to_play_together(config), *self._how_to_try_cells(config)]
+        lines += [Text(""), Text(f"  {self._who_takes_part()} Ctrl-C ends everything.")]
+        if self._port and not self.server.url.endswith(f":{self._port}"):
             lines.append(Text(f"  Port {self._port} is in use, so it is another one.", "yellow"))
-        if not project.live:
-            lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
         if self._data.stat().st_mode & OTHERS:
             lines.append(Text(f"  {_OPEN.format(data=self._data)}", "yellow"))
-        if project.use_aws:
+        if any(config.project.use_aws for config in self._configs.values()):
             lines.append(Text("  useAWS is true, but on this machine servers are processes.", "yellow"))
         self._activity_log.show(*lines, Text(""))
 
+    def _about(self, config: Config) -> list[Text]:
+        """The study's name, its summary and its link; in a lab with a QR code, if there is no other study."""
+        project = config.project
+        link = self._lab.link(project.id) if self._lab else self._link(config)
+        own = link + self._signed(config, _new_id()) if project.signed_links and self._lab is None else link
+        lines = [
+            Text.assemble("  ", (project.name or project.id, "bold")),
+            Text(f"  {config.summary()}"),
+            Text(""),
+            Text.assemble("  Link   ", (own, "bold green")),
+        ]
+        if self._lab is not None:
+            lines += _code(link) if len(self._configs) == 1 else [Text("")]
+            if config.game_steps and project.max_servers is None:
+                lines.append(Text(f"  {_NO_LIMIT.format(cores=os.cpu_count())}", "yellow"))
+        if not project.live:
+            lines.append(Text(f"  {_NOT_LIVE}.", "yellow"))
+        return lines
+
+    def _about_the_lab(self, lab: Lab) -> list[Text]:
+        """Whom this server reaches, what others in the network can see, and where the list of studies is."""
+        return [
+            Text(f"  A lab's server: every machine that can reach {self.server.url} can open it."),
+            Text(f"  {_ENCRYPTED if self._tls else _PLAIN}", "" if self._tls else "yellow"),
+            Text.assemble("  List   ", (lab.list_link, "green")),
+            Text(""),
+        ]
+
+    def _who_takes_part(self) -> str:
+        if self._lab is not None:
+            return _IN_LAB
+        return _FOR_ONE if any(config.project.signed_links for config in self._configs.values()) else _FOR_ALL
+
+    def _link(self, config: Config) -> str:
+        return f"{self.server.url}/next?projectId={config.project.id}"
+
     def _how_to_trust(self) -> list[Text]:
         """With TLS: at which port servers have names, and which certificate the browser must trust."""
-        if self._names is None or self._authority is None:
+        if self._authority is None:
             return []
+        if self._names is None:
+            shown = _TRUST.format(file=from_here(self._authority.certificate))
+            return [Text(line) for line in shown.splitlines()]
         shown = _TLS.format(port=self._names.port, file=from_here(self._authority.certificate))
         lines = [Text(line) for line in shown.splitlines()]
         if self._names.port != NAMES_PORT:
@@ -162,9 +231,9 @@ class Study:
             lines.append(Text(text, "yellow"))
         return lines
 
-    def _how_to_play_together(self, link: str) -> list[Text]:
+    def _how_to_play_together(self, config: Config) -> list[Text]:
         """With `players`: a link for each place, so that one researcher can play in all of them."""
-        project = self._config.project
+        project, link = config.project, self._link(config)
         if not project.has_sessions:
             return []
         run = secrets.token_hex(2)
@@ -172,10 +241,10 @@ class Study:
             project.id,
             project.players,
             project.matching,
-            self._config.groups,
+            config.groups,
             lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
         )
-        queries = [self._signed(each) if project.signed_links else f"&userId={each}" for each in user_ids]
+        queries = [self._signed(config, each) if project.signed_links else f"&userId={each}" for each in user_ids]
         text = _TOGETHER.format(
             places="both" if project.players == 2 else f"all {project.players}", patience=f"{project.patience:g}"
         )
@@ -187,9 +256,9 @@ class Study:
             *(Text(f"    {link}{each}", "green") for each in queries),
         ]
 
-    def _how_to_try_cells(self, link: str) -> list[Text]:
+    def _how_to_try_cells(self, config: Config) -> list[Text]:
         """With `conditions`: a link for each of the first cells."""
-        project = self._published_project()
+        project, link = self._published_project(config), self._link(config)
         names = own_cells.cell_names(project) if project and not project.has_sessions else []
         if not names or project is None:
             return []
@@ -201,21 +270,21 @@ class Study:
             *(
                 Text.assemble(
                     f"    {name:{width}}  ",
-                    (f"{link}{self._signed(_new_id()) if project.signed_links else ''}&cell={name}", "green"),
+                    (f"{link}{self._signed(config, _new_id()) if project.signed_links else ''}&cell={name}", "green"),
                 )
                 for name in first
             ),
             *([Text(f"    … and {more} more, such as &cell={names[-1]}")] if more > 0 else []),
         ]
 
-    def _published_project(self) -> Project | None:
+    def _published_project(self, config: Config) -> Project | None:
         cache = ProjectCache(self._platform, SecretCache(self._platform.documents))
-        return cache.project(self._config.project.id)
+        return cache.project(config.project.id)
 
-    def _signed(self, user_id: str) -> str:
+    def _signed(self, config: Config, user_id: str) -> str:
         """What is appended to the study's link to make this participant's signed link."""
-        project_id = self._config.project.id
-        project = self._published_project()
+        project_id = config.project.id
+        project = self._published_project(config)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 
@@ -227,6 +296,18 @@ _TLS = """\
   Let your browser trust this certificate, which vouches for names of this machine alone. In Chrome: Settings, Privacy
   and security, Security, Manage certificates. In Firefox: Settings, Privacy & Security, View Certificates, Authorities.
   On macOS: open it, and choose Always Trust."""
+_TRUST = """\
+  Trust  {file}
+
+  Each computer of the lab must trust this certificate, which vouches for this address alone: in the browser's settings,
+  Security, Manage certificates. Otherwise participants see a warning."""
+_PLAIN = (
+    "Plain HTTP: whoever can read this network's traffic reads answers, and can play for others. With --tls it is "
+    "encrypted."
+)
+_ENCRYPTED = "Pages and games are encrypted."
+_IN_LAB = "Each browser that opens the link is a new participant, with a signed link of their own."
+_NO_LIMIT = "Each game is a process here. Set maxServers in config.yml to what this machine's {cores} cores can run."
 _TOGETHER = """\
   To play in {places} places yourself, open these links in windows side by side: a page that is hidden counts as away.
   Come to the game in each within {patience} seconds of the others (`patience`):"""
@@ -235,6 +316,43 @@ _FOR_ALL = "Whoever opens the link gets an id of their own; add &userId=… to c
 _FOR_ONE = "signedLinks is true: this link is for one participant; each start prints another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"
 _NOT_LIVE = "config.yml says `live: false`: participants get a 404 until it says true"
+
+
+def _code(link: str) -> list[Text]:
+    """The link as a QR code, for a terminal."""
+    drawn = io.StringIO()
+    qr(link).terminal(out=drawn, compact=True)
+    return [Text.from_ansi(line) for line in drawn.getvalue().splitlines()]
+
+
+def _authority(root: Path, tls: bool, host: Host | None, certificate: tuple[Path, Path] | None) -> Authority | None:
+    """The authority that makes certificates here; None without TLS, and if there is a certificate. Raises OSError."""
+    if not tls or certificate is not None:
+        return None
+    return Authority(root / "tls") if host is None else Authority(root / f"tls-{host.shown}", host.shown)
+
+
+def _site_context(
+    authority: Authority | None, host: Host | None, certificate: tuple[Path, Path] | None
+) -> ssl.SSLContext | None:
+    """The TLS context of the pages; None without TLS. Raises `Problem` if the certificate cannot be used."""
+    if certificate is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        try:
+            context.load_cert_chain(*certificate)
+        except (OSError, ValueError) as error:  # an SSLError is an OSError
+            raise Problem(
+                f"The certificate {certificate[0]} and the key {certificate[1]} cannot be used: {error}.",
+                "Name two PEM files that belong together: the certificate with its chain, and its key.",
+            ) from None
+        return context
+    if authority is None:
+        return None
+    return (
+        authority.context(host.shown, "localhost", HOST)
+        if host
+        else authority.context("localhost", HOST, *sorted(TLS_NAMES))
+    )
 
 
 def _new_id() -> str:

@@ -126,7 +126,7 @@ def _activity_log() -> tuple[ActivityLog, io.StringIO]:
 
 def test_the_terminal_shortens_ids_and_shows_no_answers() -> None:
     activity_log, text = _activity_log()
-    activity_log.set_steps(["1", "2", "finalStep"])
+    activity_log.set_steps("study", ["1", "2", "finalStep"])
     folder = "study/users/5f2a9bc01d7e"
     activity_log.wrote(f"{folder}/participant.json", b'{"group": 1, "completionCode": "SECRET"}')
     activity_log.wrote(f"{folder}/answers/2.json", b'{"step": "2", "page": "survey-1", "answers": {"x": "SECRET"}}')

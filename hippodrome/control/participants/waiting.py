@@ -67,9 +67,9 @@ class ServerStates:
                 state.update(_closed(record))
             elif step is not None and step.type.on_server and record.lacks(step.key):
                 state["state"] = ServerState.QUEUED  # `GameStep` has this server stopped, and another will start
-            elif record.state is ServerState.READY and record.host:
+            elif record.state is ServerState.READY and (host := record.browser_host(dns)):
                 self._remember(record)
-                state["url"] = f"{self._settings.game_scheme}://{record.browser_host(dns)}:{record.port}/"
+                state["url"] = self._settings.game_address(host, record.port)
                 state["token"] = self._secrets.token(record)
         state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
         state["typical"] = round(sorted(self._start_times)[len(self._start_times) // 2]) if self._start_times else None

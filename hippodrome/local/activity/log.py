@@ -60,11 +60,13 @@ class ActivityLog:
         self._console = console or Console(highlight=False, soft_wrap=True)
         self.named = False
         """Whether browsers find servers by their names (`TLS=1`)."""
+        self.one_port = False
+        """Whether browsers reach servers at the port of the pages (`--host`)."""
         self._lock = threading.Lock()
         self._states: dict[str, tuple[int, str]] = {}
         self._shown: set[str] = set()  # the keys of answers and the ids of sessions that were shown
         self._failing: set[str] = set()  # whose present server has written an error before it was ready
-        self._last_step = ""
+        self._last_steps: dict[str, str] = {}  # by project
         self._held: dict[str, tuple[threading.Timer, str]] = {}  # lines that are held back, by participant
         self._looking = threading.RLock()
         self._watched: dict[str, WatchedServer] = {}
@@ -122,10 +124,13 @@ class ActivityLog:
 
     # What this process writes
 
-    def set_steps(self, steps: Iterable[str]) -> None:
-        """Set the keys of the steps, in order. A participant who answers the last step but one comes to the end."""
+    def set_steps(self, project_id: str, steps: Iterable[str]) -> None:
+        """Set the keys of a project's steps, in order.
+
+        A participant who answers the last step but one comes to the end.
+        """
         keys = list(steps)
-        self._last_step = keys[-2] if len(keys) > 1 else ""
+        self._last_steps[project_id] = keys[-2] if len(keys) > 1 else ""
 
     def wrote(self, key: str, body: bytes) -> None:
         """Show the event of a document that was just written: an arrival, an answer, a session, a server's new state.
@@ -180,7 +185,7 @@ class ActivityLog:
         if isinstance(answers := record.get("answers"), dict) and "completionCode" in answers and kind.on_server:
             done = "went on without the game of"
         self.participant(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
-        if step == self._last_step:
+        if step == self._last_steps.get(key.partition("/")[0]):
             self.participant(user_id, "came to the end of the study", "green")
         self._show_held(user_id)
 
@@ -210,7 +215,7 @@ class ActivityLog:
             which = "has a warm server" if record.get("warmServerName") else "server ready"
             # A server's name may be a participant's id, so it is not shown.
             where = "its name, port " if self.named else f"ws://{record.get('host')}:"
-            self.participant(user_id, f"{which} at {where}{record.get('port')}")
+            self.participant(user_id, which if self.one_port else f"{which} at {where}{record.get('port')}")
         elif state == "closed":
             reason = str(record.get("reason"))
             text = f"server gone ({_CAUSES.get(str(record.get('cause'))) or _REASONS.get(reason, reason)})"

@@ -1,7 +1,8 @@
 """A certificate authority of this machine, for `run --tls`. Browsers that trust it trust names below localhost.
 
-Its certificate allows it no other names (RFC 5280, 4.2.1.10), so its key is of no use to imitate other sites.
-Each name gets a certificate of its own: browsers and OpenSSL do not accept `*.localhost`.
+With `--host` it is another one, for that name or address. Its certificate allows it no other names (RFC 5280,
+4.2.1.10), so its key is of no use to imitate other sites. Each name gets a certificate of its own: browsers and OpenSSL
+do not accept `*.localhost`.
 """
 
 from __future__ import annotations
@@ -29,15 +30,17 @@ _COMMON_NAME = "Hippodrome on this machine"
 class Authority:
     """A certificate authority of this machine, whose certificate and key are in `folder`. Raises OSError.
 
-    A new one is made if there is none, if it is damaged, or if its certificate expires within NAME_DAYS.
+    A new one is made if there is none, if it is damaged, or if its certificate expires within NAME_DAYS. `host` is a
+    name or an IPv4 address for which it may make certificates beside localhost's; each needs a folder of its own.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, host: str | None = None) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.certificate = folder / "authority.pem"
         """The file of the certificate that a browser must trust."""
         self._key_file = folder / "authority.key"
         self._folder = folder
+        self._host = host
         found = self._load()
         self._own, self._key = found if found is not None else self._make()
 
@@ -83,6 +86,10 @@ class Authority:
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, _COMMON_NAME)])
         here = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_network("127.0.0.0/8"))]
+        if self._host is not None:
+            named = general_name(self._host)
+            is_name = isinstance(named, x509.DNSName)
+            here.append(named if is_name else x509.IPAddress(ipaddress.ip_network(self._host)))
         own = (
             _builder(name, AUTHORITY_DAYS)
             .issuer_name(name)

@@ -34,6 +34,7 @@ from hippodrome.local.publish import NotPublished, publish
 from hippodrome.protocol import disk
 
 DOMAIN = "localhost"
+GAME_PATH = "/game/"  # where browsers find the servers of a lab (`local/web/relay.py`)
 _OURS = ("queue", "tasks", "timers")  # folders in which no other process has unfinished files
 _KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
@@ -70,26 +71,36 @@ class LocalPlatform:
         written: Written | None = None,
         named_port: int | None = None,
         subdomain: str | None = None,
+        more_folders: Sequence[Path] = (),
+        lab: str | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
         """`named_port`: the port at which browsers find all servers by their names, with TLS.
 
         None: each server has its own port. `subdomain` says how servers are named, instead of the project's.
+
+        `more_folders` are those of further studies. With `lab`, the address of the web server, other machines take
+        part: links are signed, and browsers find servers at that address, below GAME_PATH.
         """
         self._state = state
-        self._project = project_folder
+        self._folders = (project_folder, *more_folders)
+        self._is_lab = lab is not None
         self._subdomain = subdomain
         self._handlers = HANDLERS if handlers is None else handlers
         self._say = say
+        # The researcher of a study is the administrator here, unless others can reach the servers.
+        is_private = lab is None
         self.settings = Settings(
             root_domain=DOMAIN,
             bucket="data",
-            game_sources=f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*",
-            plain_clients=True,  # the researcher of a study is the administrator here
+            game_sources=_game_sources(lab, named_port),
+            game_path="" if is_private else GAME_PATH,
+            plain_clients=is_private,
+            user_id_names=is_private,
         )
         self.retry = Retry(say)
         self.documents = FolderDocuments(data, state, written, self.retry)
-        self.dns = FileDns(state, self.retry, named=named_port is not None)
+        self.dns = FileDns(state, self.retry, named=named_port is not None or not is_private)
         self.bus = FolderBus(state, self._handlers, say, self.retry)
         self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say, retry=self.retry)
         self.tasks = ProcessTasks(
@@ -105,14 +116,24 @@ class LocalPlatform:
         )
         self._closed = threading.Event()
 
-    def publish(self) -> Config:
-        """Register the project, and copy its pages to the documents. Raises NotPublished."""
-        return publish(self._project, self.documents, self._subdomain, self._say)
+    def publish(self, folder: Path | None = None) -> Config:
+        """Register the project in this folder (None: the first), and copy its pages to the documents.
+
+        Raises NotPublished.
+        """
+        folder = folder or self._folders[0]
+        config = publish(folder, self.documents, self._subdomain, self._say, signed=self._is_lab)
+        self.tasks.add_project(config.project.id, folder)
+        return config
 
     def port_of(self, name: str) -> int | None:
         """Return the port of the server with this DNS name; None if there is no such server."""
         label, _, domain = name.partition(".")
         return self.tasks.port_of(label) if domain == DOMAIN and self.dns.has(name) else None
+
+    def port_of_label(self, label: str) -> int | None:
+        """Return the port of the server whose DNS name begins with this label; None if there is no such server."""
+        return self.port_of(f"{label}.{DOMAIN}")
 
     def now(self) -> datetime:
         return datetime.now(UTC)
@@ -193,7 +214,8 @@ class LocalPlatform:
             if document:
                 with contextlib.suppress(Conflict):
                     self.documents.create(key, document.body)
-        self.publish()
+        for folder in self._folders:
+            self.publish(folder)
         installed.use(self)  # the functions forget what they have cached
         self._say("The study was published again and goes on. Answers that were deleted do not come back.")
         if ended:
@@ -209,6 +231,13 @@ class LocalPlatform:
                 handler(_scheduled(self.now()), None)
             except Exception as error:  # noqa: BLE001 - the next sweep tries again
                 self._say(f"the sweep failed: {type(error).__name__}: {error}")
+
+
+def _game_sources(lab: str | None, named_port: int | None) -> str:
+    """The sources of servers: in a lab the web server's own address; else their names at one port, or any port here."""
+    if lab is not None:
+        return lab.replace("http", "ws", 1)
+    return f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*"
 
 
 def _reason(error: Exception) -> str:

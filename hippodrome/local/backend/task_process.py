@@ -53,13 +53,15 @@ class Shared:
     emit: Emit
     say: Say
     retry: Retry
+    projects: dict[str, Path] = field(default_factory=dict)
+    """The folders of projects by their ids. `project` is the folder of any other."""
     lock: threading.RLock = field(default_factory=threading.RLock)
     closed: threading.Event = field(default_factory=threading.Event)  # set when this process ends
 
-    @property
-    def agent_folder(self) -> Path:
-        """The folder of agent.py."""
-        return layout.agent_folder(self.project).resolve()
+    def agent_folder(self, request: TaskRequest) -> Path:
+        """Return the folder of agent.py for this server."""
+        project_id = request.environment.get(environment.PROJECT_ID, "")
+        return layout.agent_folder(self.projects.get(project_id, self.project)).resolve()
 
     def log(self, name: str) -> Path:
         """Return the log file of the server of this name."""
@@ -75,7 +77,7 @@ class Shared:
             environment.HOST: HOST,
             environment.PORT: "0",
             environment.TLS: "off",
-            environment.AGENT_DIR: str(self.agent_folder),
+            environment.AGENT_DIR: str(self.agent_folder(request)),
             "PYTHONUNBUFFERED": "1",
         }
 
@@ -185,7 +187,7 @@ class TaskProcess:
             self._shared.files.path / self.task.name,
             self._log,
             mark=self._mark,
-            folder=self._shared.agent_folder,
+            folder=self._shared.agent_folder(request),
             environment=self._shared.environment(request),
         )
 

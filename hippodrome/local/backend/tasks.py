@@ -146,6 +146,10 @@ class ProcessTasks:
 
     # What local mode calls beside the port
 
+    def add_project(self, project_id: str, folder: Path) -> None:
+        """Servers of this project run the code in this folder, from now on."""
+        self._shared.projects[project_id] = folder.resolve()
+
     def start(self) -> None:
         """Take over the servers of an earlier process: follow each that runs, and send the last events of the others.
 

@@ -22,15 +22,21 @@ _PORTS = {"http": 80, "https": 443}
 
 
 def refusal(
-    method: str, path: str, headers: Mapping[str, str], origins: Collection[str] = (), *, scheme: str = "http"
+    method: str,
+    path: str,
+    headers: Mapping[str, str],
+    origins: Collection[str] = (),
+    *,
+    scheme: str = "http",
+    any_name: bool = False,
 ) -> str | None:
     """Return the sentence with which a request is refused; None if it is answered.
 
     The names in `headers` are in lower case. `origins` are other origins whose pages are answered too, such as
-    `http://localhost:3000`.
+    `http://localhost:3000`. With `any_name` the server has any name: that of a lab answers only who has a link.
     """
     host = headers.get("host", "")
-    if _name(host) not in (NAMES | TLS_NAMES if scheme == "https" else NAMES):
+    if not any_name and _name(host) not in (NAMES | TLS_NAMES if scheme == "https" else NAMES):
         return "This server answers to the names of this machine only, such as 127.0.0.1."
     origin, site = headers.get("origin"), headers.get("sec-fetch-site")
     if origin in origins:

@@ -31,10 +31,16 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 
 class App:
-    """The ASGI application. `functions` are the handlers by name. Pages of `origins` are answered, too."""
+    """The ASGI application. `functions` are the handlers by name. Pages of `origins` are answered, too.
 
-    def __init__(self, functions: Mapping[str, Handler], say: Say, origins: Collection[str] = ()) -> None:
+    `any_name`: requests are answered whatever name of this machine they have used.
+    """
+
+    def __init__(
+        self, functions: Mapping[str, Handler], say: Say, origins: Collection[str] = (), *, any_name: bool = False
+    ) -> None:
         self._functions = functions
+        self._any_name = any_name
         self._say = say
         self._origins = frozenset(origins)
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="function")
@@ -64,12 +70,13 @@ class App:
         if path == "/healthz":
             return _plain(200, "ok\n")
         headers = joined(headers_of(scope))
-        refused = access.refusal(scope["method"], path, headers, self._origins, scheme=scope.get("scheme", "http"))
+        scheme = scope.get("scheme", "http")
+        refused = access.refusal(scope["method"], path, headers, self._origins, scheme=scheme, any_name=self._any_name)
         if refused:
             return _plain(403, f"{refused}\n")
         for route in ROUTES:
             parameters = route.match(scope["method"], path)
-            if parameters is not None:
+            if parameters is not None and route.function in self._functions:
                 break
         else:
             return _nothing_here(scope["method"], headers.get("accept", ""))

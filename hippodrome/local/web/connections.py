@@ -53,6 +53,11 @@ class HttpConnection(H11Protocol):
         if self.answering and not before:
             self._arm(REQUEST_SECONDS)
 
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        super().handle_websocket_upgrade(event)
+
     def on_response_complete(self) -> None:
         self._arm(HEADER_SECONDS)
         super().on_response_complete()

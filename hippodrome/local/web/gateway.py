@@ -46,6 +46,8 @@ ROUTES = (
     Route(("GET", "HEAD"), "/", "next_step"),
     Route(("GET", "POST", "OPTIONS"), "/start", "send_start_server_message"),
     Route(("GET", "POST", "OPTIONS"), "/stop", "send_stop_server_message"),
+    Route(("GET", "HEAD"), "/join/{projectId}", "join"),  # these two on a lab's server alone
+    Route(("GET", "HEAD"), "/lab", "lab"),
 )
 
 

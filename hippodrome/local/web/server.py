@@ -1,4 +1,4 @@
-"""The web server: uvicorn in a thread, at a port that only this machine can reach."""
+"""The web server: uvicorn in a thread, at a port of this machine."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import ssl
 import threading
 import time
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any
 
 import uvicorn
 
 from hippodrome.local.web.app import App
 from hippodrome.local.web.connections import HttpConnection
+from hippodrome.local.web.relay import Find, Relay
 
 HOST = "127.0.0.1"
 PORTS_TRIED = 20
@@ -28,21 +30,21 @@ class NoPort(Exception):
     """The number is no port, or no port that was tried is free; the text is a sentence for the researcher."""
 
 
-def listen(port: int) -> socket.socket:
-    """Return a listening socket that only this machine can reach, at this port or the next free one. 0 means any port.
+def listen(port: int, host: str = HOST) -> socket.socket:
+    """Return a socket that listens at this port of the address `host`, or at the next free one. 0 means any port.
 
-    Raises `NoPort`.
+    Without `host` only this machine can reach it. Raises `NoPort`.
     """
     if not 0 <= port <= HIGHEST_PORT:
         raise NoPort(f"{port} is no port: a port is a number from 1 to {HIGHEST_PORT} (PORT=, --port)")
     last = min(port + PORTS_TRIED, HIGHEST_PORT)
     for number in range(port, last + 1):
-        if port and _answers(number):  # macOS would let us listen beside a server that listens on every address
+        if port and _answers(number, host):  # macOS would let us listen beside a server that listens on every address
             continue
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((HOST, number))
+            listener.bind((host, number))
             listener.listen(1024)
         except OSError:
             listener.close()
@@ -52,11 +54,17 @@ def listen(port: int) -> socket.socket:
     raise NoPort(f"{tried} in use or not allowed; choose another (PORT=, --port)")
 
 
-def _answers(port: int) -> bool:
+def address_of(listener: socket.socket, tls: ssl.SSLContext | None, host: str | None = None) -> str:
+    """Return the address of a web server. `host` is the name in it, unless it is only for this machine."""
+    name = host or ("localhost" if tls else HOST)
+    return f"{'https' if tls else 'http'}://{name}:{listener.getsockname()[1]}"
+
+
+def _answers(port: int, host: str) -> bool:
     """Whether a server accepts connections at this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.settimeout(0.2)
-        return probe.connect_ex((HOST, port)) == 0
+        return probe.connect_ex((host, port)) == 0  # 0.0.0.0 leads to this machine
 
 
 class _Server(uvicorn.Server):
@@ -79,15 +87,26 @@ class _Server(uvicorn.Server):
 
 
 class WebServer:
-    """uvicorn in a thread of its own, so that the main thread can wait for signals. `url` is its address."""
+    """uvicorn in a thread of its own, so that the main thread can wait for signals. `url` is its address.
+
+    It may be given, with another name than this machine's own. `find` returns the port of the game's server of a name:
+    then browsers reach the servers of games at this port, too.
+    """
 
     def __init__(
-        self, app: App, listener: socket.socket, report: Report | None = None, tls: ssl.SSLContext | None = None
+        self,
+        app: App,
+        listener: socket.socket,
+        report: Report | None = None,
+        tls: ssl.SSLContext | None = None,
+        *,
+        url: str | None = None,
+        find: Find | None = None,
     ) -> None:
         self._app = app
         self._listener = listener
-        port = listener.getsockname()[1]
-        self.url = f"https://localhost:{port}" if tls else f"http://{HOST}:{port}"
+        self.url = url or address_of(listener, tls)
+        relay: Any = partial(Relay, find) if find is not None else "none"
         config = uvicorn.Config(
             app,
             http=HttpConnection,
@@ -95,7 +114,7 @@ class WebServer:
             access_log=False,
             log_level="error",
             server_header=False,
-            ws="none",
+            ws=relay,
             timeout_graceful_shutdown=2,
             timeout_keep_alive=5,
             ssl_context_factory=(lambda *_: tls) if tls else None,

@@ -232,7 +232,7 @@ def test_without_a_free_port_the_server_says_so(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_only_ports_that_were_tried_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "_answers", lambda _port: True)
+    monkeypatch.setattr(server, "_answers", lambda _port, _host: True)
     with pytest.raises(server.NoPort, match="The ports 65530 to 65535 are all in use or not allowed"):
         server.listen(65530)
 
