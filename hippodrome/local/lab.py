@@ -133,7 +133,9 @@ class Lab:
         link = self.link(project.id)
         closed = "" if project.live else "<p>It is closed (<code>live: false</code>).</p>"
         shown = f'<p style="overflow-wrap: anywhere"><a href="{escape(link)}">{escape(link)}</a></p>'
-        return f"<h2>{escape(project.name or project.id)}</h2>{closed}{shown}{qr(link).svg_inline(scale=4)}"
+        return (
+            f"<h2>{escape(project.name or project.id)}</h2>{closed}{shown}{qr(link).svg_inline(scale=4, light='white')}"
+        )
 
     @property
     def _list_key(self) -> str:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
 
 import httpx
@@ -21,6 +22,7 @@ from hippodrome import cli
 from hippodrome.console.problem import Exit
 from hippodrome.local.backend.authority import Authority
 from testing.processes import ROOT
+from testing.waiting import until
 from tests.local.conftest import Local, write_study
 from tests.local.lab_clients import own_link, send
 
@@ -131,6 +133,27 @@ def test_a_lab_may_have_a_certificate_of_its_own(local: Make, tmp_path: Path) ->
     assert one.end() == 0
 
 
+def _state_at_the_game(joining: str) -> dict[str, Any]:
+    """Answer the page before the game as a new participant. Return the state of their server, once it is decided."""
+    own, _ = own_link(joining)
+    with httpx.Client(headers={"accept": "application/json"}) as client:
+        shown = client.get(own).json()
+        client.post(own, json={"hippodrome-step": "1", "hippodrome-ticket": shown["ticket"], "word": "x"})
+        until(lambda: client.get(own).json()["state"] not in ("queued", "starting", "naming"))
+        found: dict[str, Any] = client.get(own).json()
+        return found
+
+
+def test_a_lab_runs_no_more_games_at_once_than_the_study_allows(local: Make) -> None:
+    one = local()
+    config = one.folder / "config.yml"
+    config.write_text(config.read_text().replace("  maxRuntime: 5", "  maxRuntime: 5\n  maxServers: 1"))
+    one.begin("--host", HOST)
+    states = [_state_at_the_game(link(one)) for _ in range(2)]
+    assert [(state["state"], state["reason"]) for state in states] == [("ready", None), ("failed", "full")]
+    assert one.end() == 0
+
+
 NAMESPACES = """
 set -e
 ip link set lo up
@@ -153,23 +176,23 @@ kill $clients
 exit $status
 """
 """The lab's server in one network namespace and its clients in another: two hosts, with a cable between them."""
-OUTER = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--user", "--map-root-user", "--net"]
+OUTER = ["unshare", "--user", "--map-root-user", "--net"]
 
 
 def _no_namespaces() -> str:
     missing = [tool for tool in ("unshare", "nsenter", "ip") if shutil.which(tool) is None]
     if missing:
         return f"needs {', '.join(missing)}"
-    probe = [*OUTER, "ip", "link", "add", "a", "type", "veth", "peer", "name", "b"]
+    probe = [*OUTER, "ip", "link", "add", "lab", "type", "veth", "peer", "name", "clients"]
     done = subprocess.run(probe, capture_output=True, check=False)
     return "needs network namespaces with pairs of devices" if done.returncode else ""
 
 
 @pytest.mark.skipif(bool(_no_namespaces()), reason=_no_namespaces())
-def test_ten_clients_of_another_host_play_with_as_many_servers_as_the_study_allows(tmp_path: Path) -> None:
+def test_ten_clients_of_another_host_play(tmp_path: Path) -> None:
     study = write_study(tmp_path / "study", frames=20)
     config = study / "config.yml"
-    config.write_text(config.read_text().replace("  maxRuntime: 5", "  maxRuntime: 5\n  maxServers: 4"))
+    config.write_text(config.read_text().replace("  maxRuntime: 5", "  maxRuntime: 5\n  maxServers: 10"))
     environment = {**os.environ, "PYTHON": sys.executable, "STUDY": str(study), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [*OUTER, "sh", "-c", NAMESPACES], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
