@@ -176,7 +176,7 @@ def test_a_study_that_is_not_live_does_not_exist(project: Any, hold: Any) -> Non
     async def visit() -> None:
         for link in (study.link, with_user(study.link, "ada")):
             reply = await ask(link)
-            assert (reply.status, "no such study" in reply.text) == (404, True)
+            assert (reply.status, "Study not found" in reply.text) == (404, True)
 
     asyncio.run(visit())
     assert not (study.data / "tiny" / "users").exists()

@@ -254,7 +254,7 @@ def is_last_or_true(world: World, user: str, page: dict[str, object]) -> bool:
         return True
     if "message" in page:
         closed, full = not world.project.live, world.project.max_participants is not None
-        return (closed and "no such study" in str(page["message"])) or (full and "full" in str(page["message"]))
+        return (closed and "Study not found" in str(page["message"])) or (full and "full" in str(page["message"]))
     if page.get("state") in ("ended", "failed"):
         record = world.record_of(user)
         assert record is not None
