@@ -51,6 +51,7 @@ READERS = {
             "docs/sessions",
             "docs/talk",
             "docs/lobby",
+            "docs/lab",
             "docs/recruiting",
             "docs/data",
             "docs/aws-project",
