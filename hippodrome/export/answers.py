@@ -305,11 +305,24 @@ def _has_version(answers: Mapping[str, Any]) -> bool:
 
 
 def _fields(answers: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The fields of an answer's document that have a value."""
+    """The fields of an answer's document that have a value; those of the map `talk` of a game as `talk.lines` …"""
     found = answers.get("answers")
-    return {str(n): value for n, value in found.items() if value is not None} if isinstance(found, dict) else {}
+    if not isinstance(found, dict):
+        return {}
+    if isinstance(talk := found.get(_TALK), dict):
+        found = {name: value for name, value in found.items() if name != _TALK} | dict(_flat(talk, _TALK))
+    return {str(n): value for n, value in found.items() if value is not None}
 
 
+def _flat(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}.{name}")
+        else:
+            yield f"{prefix}.{name}", value
+
+
+_TALK = "talk"
 _SENT_NUMBERS = ("whole as text", "number as text")
 _TYPED_NUMBERS = ("whole as typed", "number as typed")
 """Texts such as 07 and 2.50: from a field for numbers they are numbers, and from another field they may be codes."""

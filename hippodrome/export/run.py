@@ -22,7 +22,7 @@ import msgspec
 from hippodrome.console import screen
 from hippodrome.console.problem import Problem
 from hippodrome.control.model.project import MASTER_LIST, Project, read_list
-from hippodrome.export import fetch, keys, listing, manifest, runs, table_files, tables, talk
+from hippodrome.export import calls, fetch, keys, listing, manifest, runs, table_files, tables, talk
 from hippodrome.export.answers import StudyAnswers
 from hippodrome.export.fetch import Fetcher
 from hippodrome.export.listing import Tally, Wanted
@@ -256,10 +256,14 @@ def _write_games(state: ExportState, folder: Path, style: table_files.Style) -> 
     if any(found.get("callbacks") for _, _, found in state.episodes()):
         lines = tables.callbacks(state, folder, shared)
         written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)
-    if state.has_tapes():
+    if any(found.record.get("kind") == "line" for found in talk.records(state)):
         shared_talk = state.has_sessions()
         said = talk.messages(state, shared_talk)
         written += table_files.write(folder / "messages", talk.columns(shared_talk), said, style)
+    if calls.has_calls(state):
+        shared_calls = state.has_sessions()
+        rows = calls.calls(state, shared_calls)
+        written += table_files.write(folder / "calls", calls.columns(shared_calls), rows, style)
     if shared:
         rows = tables.presence(state, folder)
         written += table_files.write(folder / "presence", tables.PRESENCE, rows, style)
@@ -298,7 +302,7 @@ def _sound_minari(folder: Path) -> bool:
 
 def _remove_stale(folder: Path, written: list[Path]) -> None:
     """Remove the tables of an earlier run that this run did not write, and half-written tables."""
-    games = ("episodes", "callbacks", "messages", "presence")
+    games = ("episodes", "callbacks", "messages", "calls", "presence")
     for name in ("answers", "answers-long", "runs", "runs-*", "tries", *games, "problems"):
         for path in folder.glob(f"{name}.*"):
             if path not in written:

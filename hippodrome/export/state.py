@@ -371,10 +371,6 @@ class ExportState:
         for row in rows:
             yield self._participant(row[:5]) if row[0] else None, json.loads(row[5])
 
-    def has_tapes(self) -> bool:
-        """Return whether somebody has talked."""
-        return self._db.execute("SELECT 1 FROM tapes").fetchone() is not None
-
     def problems(self) -> Iterator[tuple[ExportedParticipant | None, str, str]]:
         """Yield the participant (None for a file of no participant), the key and the problem of each bad file."""
         rows = self._db.execute(

@@ -16,11 +16,11 @@ from hippodrome.local.rehearsal.study_process import StudyProcess
 from testing.processes import ROOT
 
 KEY = "sk-the-key-of-the-study"
-HINTS = '''
+HINTS = """
     def on_episode_start(self, session):
         session.record("hint", session.ask("Which way?"))
         raise RuntimeError({name: os.environ.get(name) for name in ("LLM_KEY", "OPENAI_BASE_URL")})
-'''
+"""
 
 
 @pytest.mark.timeout(120)
