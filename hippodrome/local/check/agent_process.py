@@ -12,8 +12,10 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -29,6 +31,7 @@ from hippodrome.protocol.trial import TrialSection
 from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.trial.agent import environments, match
 from hippodrome.trial.agent.agent import AgentAdapter, AgentError
+from hippodrome.trial.agent.callback_names import MODERATE, REPLY
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.agent.replies import TalkOfAgent
@@ -36,12 +39,14 @@ from hippodrome.trial.agent.starting import start
 from hippodrome.trial.core.players import Player, who_plays
 from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
 from hippodrome.trial.llm.ledger import Ledger, Moment
+from hippodrome.trial.llm.partner import Partner, prompt_of
 from hippodrome.trial.pictures import assets
 from hippodrome.trial.pictures.assets import Assets
 from hippodrome.trial.pictures.reader import PictureReader
 from hippodrome.trial.server import assignment
 from hippodrome.trial.settings import trial_section
 
+LINE, MAX_PIECES = "Hello", 1_000  # what is said to the agent; the most pieces of its answer that are taken
 NO_KEY_SECONDS = 2.0  # an episode that ends within these seconds without a key gets a remark
 
 _LOOKING_UP = ("os", "collections.abc", "_collections_abc")  # where os.getenv, environ.get and `in` are implemented
@@ -111,7 +116,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
         return
     players = progress.result
-    progress.callbacks = _callbacks(player, players, progress, config)
+    progress.callbacks = _callbacks(player, players, progress, config, folder)
     names, count = progress.known["names"], progress.known["count"]
     if count is not None and names > count:
         if not player.steps_itself:
@@ -122,10 +127,27 @@ def _try(report: Path, deadline: Deadline) -> None:
     if isinstance(player, JointAdapter):
         player.views = tuple(one.name for one in players if one.human)
     game = CheckedGame(joint, players, config, progress)
-    if game.load(folder, adapter.agent_module) and game.play(reset):
+    if game.load(folder, adapter.agent_module) and game.play(reset) and _talk(player, players, config, progress):
         _note_idle(joint, players, config, progress)
         if game.begin_each(games[1:], set_game) and game.close():
             progress.over()
+
+
+def _talk(
+    player: AgentAdapter | JointAdapter, players: Sequence[Player], config: TrialSection, progress: AgentProgress
+) -> bool:
+    """Let the agent look at a line and answer it, if people talk; return False if that failed, which is reported."""
+    methods = player.talk
+    progress.known["talks"] = sorted(methods)
+    human = next(each.name for each in players if each.human)
+
+    def said(method: Callable[..., Any], name: str) -> None:
+        result = method(progress.callbacks.session_of(name, human, None), human, LINE)
+        for _ in islice(() if result is None or isinstance(result, str | bool) else result, MAX_PIECES):
+            pass
+
+    asked = [(name, methods[name]) for name in (MODERATE, REPLY) if name in methods and config.chat is not None]
+    return all(progress.call(name, partial(said, method, name)) for name, method in asked)
 
 
 def _ask_stand_in(section: LlmSection) -> None:
@@ -214,7 +236,11 @@ def _note_idle(
 
 
 def _callbacks(
-    player: AgentAdapter | JointAdapter, players: Sequence[Player], progress: AgentProgress, config: TrialSection
+    player: AgentAdapter | JointAdapter,
+    players: Sequence[Player],
+    progress: AgentProgress,
+    config: TrialSection,
+    folder: Path,
 ) -> Callbacks:
     """The agent's callbacks, called as on a server. What they say, nobody hears."""
     humans = tuple(each.name for each in players if each.human)
@@ -225,8 +251,18 @@ def _callbacks(
         seconds=config.callback_seconds,
         stamp=dict,
         failed=progress.callback_failed,
-        talk=TalkOfAgent(config.options, say=None if config.chat is None else _unheard),
+        talk=_talk_of_agent(config, folder, humans[0]),
     )
+
+
+def _talk_of_agent(config: TrialSection, folder: Path, human: str) -> TalkOfAgent:
+    """What a session gives the agent for its talk: a line to answer, and the stand-in for a model."""
+    line = {"by": human, "text": LINE, "episode": 1, "step": 0}
+    say = None if config.chat is None else _unheard
+    if config.llm is None:
+        return TalkOfAgent(config.options, lambda player, n: [line], say)
+    partner = Partner(config.llm, prompt_of(config.llm, folder))
+    return TalkOfAgent(config.options, lambda player, n: [line], say, partner.ask)
 
 
 def _unheard(text: str, to: str | Sequence[str] | None = None, by: str | None = None) -> None:

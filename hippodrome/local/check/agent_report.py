@@ -21,8 +21,11 @@ from hippodrome.local.check.remedies import remedy
 from hippodrome.local.check.wording import short
 from hippodrome.protocol import environment as variables
 from hippodrome.protocol.players import HUMAN
+from hippodrome.protocol.trial import TALK
+from hippodrome.protocol.trial_sections import AI
 from hippodrome.protocol.values import KeyPath, printable
 from hippodrome.trial.agent import environments
+from hippodrome.trial.agent.callback_names import REPLY
 from hippodrome.trial.core.messages import FEEDBACK
 
 SLOW = 0.5  # the share of the frame rate below which an agent gets a remark
@@ -76,6 +79,7 @@ class AgentReport:
             *self._idle(),
             *self._turns(),
             *self._unheard(),
+            *self._talk(),
             *self._nobody_matched(),
             *self._not_on_aws(),
         ]
@@ -202,6 +206,9 @@ class AgentReport:
             return []
         if steps < min(PLAY_STEPS, ENDLESS * trial.starting_frame_rate) or (trial.max_episodes == 1 and trial.ui.stop):
             return []
+        if trial.game == TALK:
+            message = "the conversation has no end: write episodeSeconds, or let participants end it (ui: {stop: true})"
+            return [self._in_config(("trial", "game"), message, remark=True)]
         message = (
             f"no episode ended within {steps} steps of random play; if that is not intended, step() must return "
             "terminated or truncated, or maxSteps or episodeSeconds under trial must end episodes"
@@ -233,6 +240,23 @@ class AgentReport:
             return []
         message = f"class Agent has no feedback(word), so what participants say ({words[0]}) is only recorded"
         return [self._in_config((*remarks.UI, words[0]), message, remark=True)]
+
+    def _talk(self) -> list[Diagnostic]:
+        """Remarks on methods that nobody talks to, and on names for which nobody answers, for the first group only."""
+        trial, methods = self._config.trial, self._report.get("talks")
+        if methods is None or self._group:
+            return []
+        if trial.chat is None:
+            sentence = "is never called, since nobody talks; write chat: true under trial of config.yml"
+            return [self._at(self._place_of(name), f"{name}() {sentence}", remark=True) for name in methods]
+        alone = () if self._config.project.has_sessions else (AI,)
+        names = [name for name in trial.chat.partners or alone if name not in trial.named_players()]
+        if not names or REPLY in methods or trial.llm is not None:
+            return []
+        message = (
+            f"nobody answers for {printable(names[0])}: write reply(self, session, player, text) in class Agent, or llm"
+        )
+        return [self._in_config(("trial", "chat"), message, remark=True)]
 
     def _turns(self) -> list[Diagnostic]:
         """A remark on players who take turns in real time, for the first group only."""

@@ -52,6 +52,30 @@ def test_failures_of_an_agent_are_reported_with_their_line(folder: Path, old: st
     assert line.startswith(said)
 
 
+@pytest.mark.parametrize(
+    ("chat", "method", "said"),
+    [
+        (
+            "",
+            "def reply(self, session, player, text): pass",
+            "remark: reply() is never called, since nobody talks; write",
+        ),
+        ("  chat: true", "", "remark: trial.chat: nobody answers for ai: write reply(self, session, player, text) in"),
+        ("  chat: true", "def reply(self, session, player, text): return session.talk[0]['texts']", "reply() fails"),
+        ("  chat: true", "def moderate(self, session, player, text): return 1 / 0", "moderate() fails"),
+        ("  chat: true", "def reply(self, session, player, text): yield 'Hi'; session.say('!')", ""),
+    ],
+)
+def test_who_talks_to_nobody_and_an_agent_that_cannot_answer_are_named(
+    folder: Path, chat: str, method: str, said: str
+) -> None:
+    source, written = folder / "agent.py", folder / "config.yml"
+    source.write_text(source.read_text() + f"    {method}\n")
+    written.write_text(written.read_text().rstrip() + f"\n{chat}\n")
+    found = tried(folder)
+    assert any(said in line for line in found) if said else found == [], found
+
+
 def test_callbacks_that_fail_are_mistakes_and_the_game_goes_on(folder: Path) -> None:
     source = folder / "agent.py"
     start = len(source.read_text().splitlines())
