@@ -111,3 +111,43 @@ async def test_two_participants_talk_without_an_agent(launch):
         await anna.until(lambda: len(anna.refused) == 2 and anna.turn == "seller")
         await anna.say(command="stop")
         assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+
+
+NOISY = """
+    def on_tick(self, session):
+        for number in range(100):
+            session.say(f"\\x1b[31m{number} <img src=x onerror=alert(1)> \\ud800 {{{{ 7 * 7 }}}}")
+
+    def reply(self, session, player, text):
+        raise ValueError(text)
+"""
+
+
+async def test_an_agent_that_shouts_does_not_slow_the_game_and_what_people_type_is_in_no_log(launch, open_client):
+    server = launch(agent=grid_agent() + NOISY, trial={"chat": True, "ui": {"start": True, "stop": True}})
+    async with open_client(server.address) as client:
+        await client.start()
+        await say(client, 1, "a private secret")
+        await client.see(60)
+        lines = len(client.lines)
+        began, ended = client.frames[-50][0], client.frames[-1][0]
+        assert ended - began < 10, "50 frames, which take 1.7 s"
+        assert 1 < lines < 200
+        assert client.lines[max(client.lines)]["text"].startswith("[31m")
+        await client.stop()
+    assert "too many lines" in server.log_text()
+    assert "reply failed: ValueError at agent.py:" in server.log_text()
+    assert "secret" not in server.log_text()
+
+
+async def test_in_two_tabs_the_second_one_talks_on(launch, open_client):
+    server = launch(agent=grid_agent() + TALKS, trial={"chat": True})
+    async with open_client(server.address) as first, open_client(server.address) as second:
+        await first.enter()
+        await say(first, 1, "Hi")
+        await first.read(2)
+        await second.enter()
+        assert await first.closed() == 4409
+        assert len(await second.read(2)) == 2
+        await say(second, 2, "You")
+        assert (await second.read(4))[-1] == ("ai", "player_0 says You")

@@ -156,6 +156,7 @@ class Callbacks:
         self.facts = facts
         self._env = env
         self._seconds = seconds
+        self._failed = failed
         self._late = late
         self._notes = _Notes(stamp, failed, hide)
         self._now = _EpisodeState()
@@ -269,13 +270,15 @@ class Callbacks:
         """Return the session for a call of `reply` or `moderate` about a player's line; `n` is the number of the line
         to answer. For any thread."""
         now = self._now
-        where = {"episode": now.episode, "step": now.ticks}
+        where: dict[str, Any] = {"episode": now.episode, "step": now.ticks}
+        if len(self.facts.humans) > 1:
+            where["player"] = player
         return self._session(_Call(self._notes, name, where, lambda: self._late(self.recorded)), player, n)
 
     def talk_failed(self, name: str, error: Exception) -> None:
-        """Record and log the error of `reply` or `moderate`. For the event loop's thread."""
-        self._notes.failed(name, error, episode=self._now.episode, step=self._now.ticks)
-        self._late(self.recorded)
+        """Log the error of `reply` or `moderate`, each type once: its message may quote what a participant has said."""
+        if self._notes.once(f"{name} {type(error).__name__}"):
+            self._failed(name, error)
 
     def _session(self, call: _Call, player: str | None, n: int | None = None) -> Session:
         """Return the session for a call. `player`: whose talk it has; None for all. `n`: the line to answer."""

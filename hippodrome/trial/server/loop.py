@@ -12,13 +12,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from hippodrome.trial.agent.callback_names import MODERATE, REPLY
+from hippodrome.trial.agent.callback_names import MODERATE, REPLY, TALK_METHODS
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.calls import AgentCalls, Calls
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.agent.joint_calls import JointCalls
 from hippodrome.trial.agent.replies import Mouth, Replies, TalkOfAgent
-from hippodrome.trial.agent.tracebacks import report, without
+from hippodrome.trial.agent.tracebacks import report, where, without
 from hippodrome.trial.agent.worker import Worker
 from hippodrome.trial.core.effects import (
     AskReply,
@@ -423,9 +423,7 @@ class TrialLoop:
             lambda: agent.env,
             seconds=settings.trial.callback_seconds,
             stamp=self._recorder.stamp,
-            failed=lambda name, error: log.error(
-                "the callback %s failed\n%s", name, report(error, settings.agent_dir, settings.private)
-            ),
+            failed=self._callback_failed,
             hide=self._hide,
             late=self._callbacks.late,
             talk=TalkOfAgent(
@@ -449,13 +447,21 @@ class TrialLoop:
                 fallback=None if model is None else model.fallback,
             )
 
+    def _callback_failed(self, name: str, error: BaseException) -> None:
+        """Log the error of a callback; of `reply` and `moderate` place and type: its message may quote what was said."""
+        folder = self.settings.agent_dir
+        if name in TALK_METHODS:
+            log.error("%s failed: %s at %s", name, type(error).__name__, where(error, folder) or "an unknown place")
+        else:
+            log.error("the callback %s failed\n%s", name, report(error, folder, self.settings.private))
+
     def _talk_failed(self, name: str, error: Exception) -> None:
         """Record that `reply` or `moderate` has raised, or took too long."""
         assert self._calls.callbacks is not None
         self._calls.callbacks.talk_failed(name, error)
         moment = self._calls.moment
-        where = {"episode": moment.episode, "step": moment.step}
-        self._recorder.tape.add({"kind": "error", "method": name, "name": type(error).__name__, **where})
+        place = {"episode": moment.episode, "step": moment.step}
+        self._recorder.tape.add({"kind": "error", "method": name, "name": type(error).__name__, **place})
 
     def _ask_agent(self, effect: AskReply | Moderate) -> None:
         assert self._replies is not None
