@@ -11,6 +11,7 @@ from hippodrome.control.model import design, hippo_entry, ids
 from hippodrome.control.model.design import Assignment, Block, End, Factor, Step
 from hippodrome.control.model.matching import MATCH
 from hippodrome.control.model.records import Record, from_data, from_json, to_json
+from hippodrome.protocol.trial_llm import is_loopback
 
 MASTER_LIST = "project_master_list.json"
 STEPS_FOLDER: Literal["steps"] = "steps"
@@ -159,9 +160,13 @@ class Project(Record, frozen=True):
 
     @property
     def uses_llm(self) -> bool:
-        """Whether a game of the study has a language model (`trial.llm`), so that its servers need the model's key."""
+        """Whether a game of the study has a language model (`trial.llm`) elsewhere than on its server.
+
+        Then its servers need the model's key.
+        """
         own_sections = (section.trial for step in self.steps for section in step.sections)
-        return any(trial.get("llm") for trial in (self.trial, *own_sections))
+        models = (trial.get("llm") for trial in (self.trial, *own_sections))
+        return any(model and not is_loopback(str(model.get("url"))) for model in models)
 
     @property
     def pages_in_game(self) -> list[Step]:

@@ -39,8 +39,8 @@ class Html(str):
     __slots__ = ()
 
 
-def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> Page:
-    """Return a page with a title and a text, such as an error."""
+def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language, more: Html | None = None) -> Page:
+    """Return a page with a title and a text, such as an error, and perhaps `more` HTML below them."""
     nonce = secrets.token_urlsafe(16)
     page = fill(
         "frame.html",
@@ -52,7 +52,7 @@ def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language) -> P
         body="message",
         data=Html(),
         header=Html(),
-        main=fill("message", title=title, text=text, more=Html()),
+        main=fill("message", title=title, text=text, more=more or Html()),
         footer=Html(),
         script=Html(),
     )

@@ -115,5 +115,7 @@ def test_a_study_needs_the_key_if_any_of_its_games_has_a_language_model() -> Non
     llm = {"llm": {"url": "https://models.example.org/v1", "model": "small"}}
     assert not study().uses_llm
     assert study(trial=llm).uses_llm
+    here = {"llm": {"url": "http://localhost:11434/v1", "model": "small"}}
+    assert not study(trial=here).uses_llm, "a model on the server itself needs no key"
     of_a_game = Step("talk", "game", sections=(Section(trial=llm),))
     assert study(steps=[of_a_game, Step("bye", "bye")]).uses_llm

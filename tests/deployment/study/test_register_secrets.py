@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-import pytest
-
 from hippodrome.console.problem import Exit
-from hippodrome.control.model.project import Project
 from testing.aws_events import ACCOUNT
-from tests.deployment.registering import Register, RegisterWorld
+from tests.deployment.registering import Register, RegisterWorld, configure
 
-
-@pytest.fixture
-def with_llm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Project, "uses_llm", property(lambda self: True))
+TALKS = ("trial:\n", "trial:\n  llm: {url: https://models.example.org/v1, model: small}\n")
+"""A change of the study's config.yml (`configure`)."""
 
 
 def store_key(register_world: RegisterWorld) -> None:
@@ -32,8 +28,9 @@ def secrets(register_world: RegisterWorld) -> list[dict[str, Any]]:
 
 
 def test_without_the_key_a_study_with_a_language_model_is_refused(
-    register_world: RegisterWorld, register: Register, with_llm: None
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
+    configure(folder, TALKS)
     refused = register(code=Exit.FAILED)
     assert "The study has trial.llm, and the installation hippodrome has no LLM_KEY: no server could start." in (
         refused.err
@@ -46,16 +43,29 @@ def test_without_the_key_a_study_with_a_language_model_is_refused(
 
 
 def test_servers_of_a_study_with_a_language_model_get_the_key_from_the_parameter(
-    register_world: RegisterWorld, register: Register, monkeypatch: pytest.MonkeyPatch
+    register_world: RegisterWorld, folder: Path, register: Register
 ) -> None:
     store_key(register_world)
     register(code=Exit.DONE)
     assert secrets(register_world) == []
-    with monkeypatch.context() as patched:
-        patched.setattr(Project, "uses_llm", property(lambda self: True))
-        register(code=Exit.DONE)
-        arn = f"arn:aws:ssm:us-east-1:{ACCOUNT}:parameter/hippodrome/hippodrome/LLM_KEY"
-        assert secrets(register_world) == [{"name": "LLM_KEY", "valueFrom": arn}]
-        assert "Nothing to do" in register("--dry-run").out
+    configure(folder, TALKS)
+    register(code=Exit.DONE)
+    arn = f"arn:aws:ssm:us-east-1:{ACCOUNT}:parameter/hippodrome/hippodrome/LLM_KEY"
+    assert secrets(register_world) == [{"name": "LLM_KEY", "valueFrom": arn}]
+    assert "Nothing to do" in register("--dry-run").out
+    configure(folder)
     register(code=Exit.DONE)
     assert secrets(register_world) == [], "a study that has no model any more gives its servers no key"
+
+
+def test_a_model_of_one_game_alone_needs_the_key_too(
+    register_world: RegisterWorld, folder: Path, register: Register
+) -> None:
+    steps = (
+        "steps:\n    - consent\n    - chat: {llm: {url: https://models.example.org/v1, model: small}}\n    - thanks\n"
+    )
+    configure(folder, ("steps: {1: consent, 2: game, 3: thanks}\n", steps))
+    assert "has no LLM_KEY" in register(code=Exit.FAILED).err
+    store_key(register_world)
+    register(code=Exit.DONE)
+    assert [one["name"] for one in secrets(register_world)] == ["LLM_KEY"]
