@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, MutableMapping
 
+from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.config import Config
 from hippodrome.local.fake_model import FakeModel
 from hippodrome.protocol import environment
@@ -25,12 +26,15 @@ class StandIn:
     def use(self, config: Config, say: Callable[[str], None] = lambda sentence: None) -> None:
         """Start the stand-in if the study has a model that cannot be asked; `say` gets a sentence then.
 
-        Raises ValueError if FAKE_MODEL is wrong.
+        Raises `Problem` if FAKE_MODEL is wrong.
         """
         unpaid = not self._env.get(environment.LLM_KEY) and not all(is_loopback(one["url"]) for one in config.models)
         if self._model is not None or not config.models or not (self._always or unpaid):
             return
-        self._model = FakeModel()
+        try:
+            self._model = FakeModel()
+        except ValueError as error:
+            raise Problem(f"{error}.", exit_code=Exit.MISUSE) from None
         self._env[environment.LLM_URL] = self._model.url
         self._env.pop(environment.LLM_KEY, None)
         if not self._always:

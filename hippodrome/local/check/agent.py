@@ -100,7 +100,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         variables.PROJECT_ID: config.project.id,
         variables.SERVER: "check",
         variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
-        variables.TRIAL: json.dumps(config.registration()["trial"]),
+        variables.TRIAL: json.dumps(_trial(config)),
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
         "GAMES": json.dumps(_games(folder, config, group)),
@@ -108,6 +108,12 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         "CALL_SECONDS": str(CALL_SECONDS),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
+
+
+def _trial(config: Config) -> dict[str, Any]:
+    """The section `trial`, with the language model of another game or level if its own games have none."""
+    trial = config.registration()["trial"]
+    return {**trial, "llm": config.models[0]} if config.models else trial
 
 
 def _games(folder: Path, config: Config, group: int | None) -> list[dict[str, Any]]:
