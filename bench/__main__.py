@@ -40,6 +40,7 @@ MEASURES = (  # each is `module.function`
     "crowds.pairs",
     "crowds.warm",
     "crowds.addresses",
+    "talk.lines",
     "data.download",
     "designs.balance",
     "designs.calls",

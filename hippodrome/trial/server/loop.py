@@ -448,7 +448,7 @@ class TrialLoop:
             )
 
     def _callback_failed(self, name: str, error: BaseException) -> None:
-        """Log the error of a callback; of `reply` and `moderate` place and type: its message may quote what was said."""
+        """Log the error of a callback; of `reply` and `moderate` place and type: a message may quote what was said."""
         folder = self.settings.agent_dir
         if name in TALK_METHODS:
             log.error("%s failed: %s at %s", name, type(error).__name__, where(error, folder) or "an unknown place")
