@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from hippodrome.trial.agent import replies
-from hippodrome.trial.agent.replies import Replies
+from hippodrome.trial.agent.replies import Mouth, NoChat, Replies
 from hippodrome.trial.core.effects import AskReply, Moderate
 from hippodrome.trial.core.talk import MAX_SAID
 from testing.async_tests import pytest_pyfunc_call  # noqa: F401 - a hook
@@ -100,3 +101,22 @@ async def test_a_line_passes_as_it_is_if_moderate_is_slow_or_broken(monkeypatch:
     heard = Heard(moderate=moderate)
     assert await heard.ask("fine", "rude", "bad", "odd", "slow", moderate=True) == [None, False, "***", None, None]
     assert heard.failed == ["moderate TypeError", "moderate AgentTimeout"]
+
+
+async def test_the_agent_speaks_to_those_who_are_there_and_in_no_participants_name():
+    said: list[Any] = []
+    talk: Any = SimpleNamespace(people=("red", "blue"))
+    mouth = Mouth(lambda: talk, lambda *line: said.append(line))
+    mouth.say("Hi")
+    mouth.say("Psst", to="red", by="guide")
+    with pytest.raises(ValueError, match="nobody is called 'green'; there are red, blue"):
+        mouth.say("Hi", to=["red", "green"])
+    with pytest.raises(ValueError, match="cannot speak as 'red'"):
+        mouth.say("I am red", by="red")
+    with pytest.raises(TypeError, match="takes a text, not int"):
+        mouth.say(5)  # type: ignore[arg-type]
+    await asyncio.sleep(0)
+    assert said == [("Hi", None, None), ("Psst", ("red",), "guide")]
+    talk = None
+    with pytest.raises(NoChat, match="write chat: true"):
+        mouth.say("Hi")
