@@ -44,7 +44,7 @@ def test_the_key_is_in_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         study.interrupt()
         study.clear()
         model.stop()
-    assert [headers["Authorization"] for _, _, headers in model.requests] == [f"Bearer {KEY}"]
+    assert {headers["Authorization"] for _, _, headers in model.requests} == {f"Bearer {KEY}"}
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert any(path.name.endswith("-talk-0001.json") for path in files)
     assert any("on_episode_start failed" in path.read_text() for path in files if path.suffix == ".log")
