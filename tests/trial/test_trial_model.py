@@ -167,7 +167,7 @@ async def test_a_model_that_cannot_answer_says_the_fallback(
         await client.enter()
         await say(client, 1, "something private")
         assert await client.read(2) == [("player_0", "something private"), ("ai", "One moment.")]
-    assert "ModelRefused" in server.log_text()
+    assert "reply failed: ModelRefused: the model's API answers with status 400" in server.log_text()
     assert "something private" not in server.log_text()
     assert KEY not in server.log_text()
 

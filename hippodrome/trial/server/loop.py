@@ -53,6 +53,7 @@ from hippodrome.trial.core.policies import AskPolicy
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.core.unfinished import RecordedTrial
 from hippodrome.trial.llm.endpoint import Endpoint, Game
+from hippodrome.trial.llm.errors import ModelError
 from hippodrome.trial.llm.ledger import Ledger, Moment
 from hippodrome.trial.llm.partner import NoPrompt, Partner, prompt_of
 from hippodrome.trial.policies.places import Places
@@ -450,7 +451,9 @@ class TrialLoop:
     def _callback_failed(self, name: str, error: BaseException) -> None:
         """Log the error of a callback; of `reply` and `moderate` place and type: a message may quote what was said."""
         folder = self.settings.agent_dir
-        if name in TALK_METHODS:
+        if isinstance(error, ModelError):  # its message quotes nothing, and says such things as status 401
+            log.error("%s failed: %s: %s", name, type(error).__name__, error)
+        elif name in TALK_METHODS:
             log.error("%s failed: %s at %s", name, type(error).__name__, where(error, folder) or "an unknown place")
         else:
             log.error("the callback %s failed\n%s", name, report(error, folder, self.settings.private))
