@@ -299,8 +299,8 @@ _TLS = """\
 _TRUST = """\
   Trust  {file}
 
-  Each computer of the lab must trust this certificate, which vouches for this address alone: in the browser's settings,
-  Security, Manage certificates. Otherwise participants see a warning."""
+  Each computer of the lab must trust this authority, which vouches for this address and localhost alone: in the
+  browser's settings, Security, Manage certificates. Otherwise participants see a warning."""
 _PLAIN = (
     "Plain HTTP: whoever can read this network's traffic reads answers, and can play for others. With --tls it is "
     "encrypted."
