@@ -22,6 +22,7 @@ from hippodrome.trial.recordings.presigned import PresignedStore, StoreError
 from hippodrome.trial.recordings.spool import store_file
 from testing.strict_s3 import StrictS3
 from testing.studies import study
+from testing.waiting import until_async
 from tests.trial.test_trial_tls import certificate
 
 USER = "P1"
@@ -104,6 +105,28 @@ async def test_a_game_is_stored_by_presigned_requests_alone(town, launch, open_c
     assert refused == []
     assert {method for method, path, _ in town.requests if path == "/sign"} == {"POST"}
     assert not running.store.exists()
+
+
+async def test_what_people_say_is_stored_while_they_play_and_the_next_server_reads_it(town, launch, open_client):
+    record = town.start()
+    trial = {"ui": UI, "chat": True, "players": {}}
+    running = launch(trial=trial, **town.variables(record))
+    async with open_client(running.address) as client:
+        await client.enter()
+        for number in range(1, 4):
+            town.failing = [500, 403]
+            await client.say(say={"id": number, "text": f"Line {number}"})
+            key = f"{FOLDER}/trials/{record.name}/3-talk-{number:04d}.json"
+            await client.read(number)
+            await until_async(lambda key=key: town.body(key) is not None)
+        running.process.kill()
+        await client.closed()
+    lost = town.close(record, Reason.LOST)
+    second = town.start(attempt=2, before=lost)
+    running = launch(trial=trial, **town.variables(second))
+    async with open_client(running.address) as client:
+        await client.enter()
+        assert [text for _, text in await client.read(3)] == ["Line 1", "Line 2", "Line 3"]
 
 
 def test_the_certificate_comes_by_presigned_requests_too(town, launch, open_client):
