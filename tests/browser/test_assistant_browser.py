@@ -38,7 +38,7 @@ def test_the_owl_answers_what_is_typed_and_the_button(
     page.get_by_role("button", name="I agree").click()
     page.get_by_role("button", name="Continue").click()
     page.wait_for_selector("#play:not([hidden])")
-    page.wait_for_function("() => document.getElementById('mode').dataset.state === 'ready'")
+    page.wait_for_function("() => document.getElementById('play').dataset.state === 'ready'")
     page.locator("#overlay-button").click()
     page.fill("#chat-field", "Which way is up?")
     page.press("#chat-field", "Enter")

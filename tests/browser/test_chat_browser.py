@@ -501,7 +501,7 @@ def test_the_keyboard_of_a_phone_does_not_cover_the_field(
     talking.history = [{"n": n, "by": "ai", "text": f"Line {n}"} for n in range(1, 9)]
     talking.open(tab)
     tell(talking.world, state="playing")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     shot(tab, f"{width}-chat-no-keyboard")
     assert tab.evaluate(SIZE) == [width, height]
     if width > height:

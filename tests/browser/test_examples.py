@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.explores, pytest.mark.timeout(300
 
 FLAWS = (Path(__file__).parent / "flaws.js").read_text()
 SIZES = [(1280, 800), (360, 740)]
-STATE = "wanted => document.getElementById('mode').dataset.state === wanted"
+STATE = "wanted => document.getElementById('play').dataset.state === wanted"
 
 
 def come_to_the_game(page: Any, link: str) -> None:

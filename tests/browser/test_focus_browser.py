@@ -24,7 +24,7 @@ def rated(world: World) -> World:
 def begin(world: World, page: Any) -> None:
     play(world, page)
     tell(world, state="playing")
-    page.wait_for_selector("#mode[data-state=playing]", state="attached")
+    page.wait_for_selector("#play[data-state=playing]", state="attached")
 
 
 def drag(page: Any) -> None:

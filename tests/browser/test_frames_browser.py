@@ -101,7 +101,7 @@ def test_a_texture_is_drawn_and_exact_once_it_stands_still(tab: Any, frame_kinds
     wait_until(tab, lambda: frame_kinds.count(JPEG) >= 30)
     assert not {KEY, DIFFERENCE} & set(frame_kinds[5:])
     tab.keyboard.press("p")
-    tab.wait_for_selector("#mode[data-state=paused]", state="attached")
+    tab.wait_for_selector("#play[data-state=paused]", state="attached")
     wait_until(tab, lambda: ROWS in frame_kinds)
     wait_until(tab, lambda: np.array_equal(picture := pixels(tab, WIDTH, HEIGHT), picture_at(step_of(picture))))
     t = step_of(pixels(tab, WIDTH, HEIGHT))

@@ -91,7 +91,7 @@ class Person:
         self.page.wait_for_function(says, arg=[selector, text])
 
     def wait_until_playing(self) -> None:
-        self.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+        self.page.wait_for_selector("#play[data-state=playing]", state="attached")
 
     def check_german(self, name: str) -> None:
         """Check that no text of Hippodrome is English, shown or hidden, and that nothing is wider than the page."""

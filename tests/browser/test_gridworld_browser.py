@@ -40,7 +40,7 @@ def test_the_game_waits_for_the_participant_and_the_partner_moves_by_itself(
     page.get_by_role("button", name="I agree").click()
     page.get_by_role("button", name="Continue").click()
     page.wait_for_selector("#play:not([hidden])")
-    page.wait_for_function("() => document.getElementById('mode').dataset.state === 'ready'")
+    page.wait_for_function("() => document.getElementById('play').dataset.state === 'ready'")
     page.locator("#overlay-button").click()
     for left in (36, 34, 32):
         page.wait_for_function(HUD, arg="Your turn")

@@ -60,7 +60,7 @@ def test_keys_outside_the_project_send_nothing_and_p_still_starts_and_pauses(wor
     play(world_with_keys, tab)
     tab.keyboard.press("p")
     world_with_keys.wait_for({"command": "start"})
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     tab.keyboard.press("p")
     world_with_keys.wait_for({"command": "pause"})
     tab.keyboard.press("d")
@@ -159,7 +159,7 @@ def test_instructions_can_be_read_again_in_a_pause_and_are_not_shown_after_a_rel
     tab.goto(world_with_pages.url)
     tab.click("text=Go to the game")
     tab.click("#overlay-button")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     assert not tab.is_visible("#instructions-button")
     tab.keyboard.press("KeyP")
     tab.click("#instructions-button")
@@ -195,7 +195,7 @@ def test_the_page_between_two_games_follows_the_last_picture_and_its_button_star
     shot(tab, f"{width}-between")
     before = len(world_with_pages.player_commands())
     tab.click("text=Next game")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     assert world_with_pages.player_commands()[before:] == ["start"]
     assert tab.is_visible("#play")
 

@@ -119,7 +119,7 @@ def test_two_people_agree_on_a_price(chromium: Any, held: Held) -> None:
     for person in (ada, bert):
         person.page.click("text=Go to the conversation")
     for person in (ada, bert):
-        person.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+        person.page.wait_for_selector("#play[data-state=playing]", state="attached")
     seller.write("85, and it is yours. It has new tyres and a light.")
     buyer.read("85, and it is yours.")
     for person in (ada, bert):
@@ -132,7 +132,7 @@ def test_two_people_agree_on_a_price(chromium: Any, held: Held) -> None:
     for person in (ada, bert):
         person.read("The buyer offers 75, and the seller asks for 80.")
     for person in (ada, bert):
-        person.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+        person.page.wait_for_selector("#play[data-state=playing]", state="attached")
     seller.write("78?")
     buyer.read("78?")
     assert buyer.page.inner_text("#episode") == "Round 2 of 2"
@@ -154,14 +154,14 @@ def test_a_participant_negotiates_with_a_model(chromium: Any, held: Held, width:
     eve.page.click("text=Go to the conversation")
     eve.page.wait_for_selector(".line:not(.mine) b:text('Seller')")
     eve.page.click("#overlay-button")
-    eve.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+    eve.page.wait_for_selector("#play[data-state=playing]", state="attached")
     eve.write("Would you take 70?")
     eve.page.wait_for_function("() => document.querySelectorAll('.line:not(.mine):not([aria-hidden])').length === 2")
     eve.look("model")
     eve.page.click("text=End this round")
     eve.offer(70)
     eve.page.click("text=Next round")
-    eve.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+    eve.page.wait_for_selector("#play[data-state=playing]", state="attached")
     eve.page.reload()
     eve.read("Would you take 70?")
     lines = eve.page.eval_on_selector_all("#chat-log .line", LINES)

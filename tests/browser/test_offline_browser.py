@@ -29,7 +29,7 @@ def in_lobby(world: World, page: Any) -> None:
 def playing(world: World, page: Any) -> None:
     play(world, page)
     tell(world, state="playing")
-    page.wait_for_selector("#mode[data-state=playing]", state="attached")
+    page.wait_for_selector("#play[data-state=playing]", state="attached")
 
 
 def paused(world: World, page: Any) -> None:

@@ -63,7 +63,7 @@ def test_at_the_end_of_a_game_its_last_picture_and_score_are_seen_whole(
     phone.wait_for_selector("#overlay-title:text('The game is over')")
     check_panel(phone, size)
     shot(phone, f"{name}-over")
-    assert box(phone, ".stage") == before, "the picture stays where it is"
+    assert box(phone, ".stage") == pytest.approx(before), "the picture stays where it is"
 
 
 CHOICES = ["cooperate", "defect"]

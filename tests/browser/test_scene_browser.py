@@ -101,7 +101,7 @@ def game(world: World, tab: Any, tmp_path: Path) -> Iterator[Any]:
 def test_every_type_of_object_is_drawn_where_it_belongs(game: Any, tab: Any, width: int, height: int) -> None:
     game(width=width, height=height)
     tab.click("#overlay-button")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     spots = {
         **{(0.01, 0.3): "#bfe3f2", (0.5, 0.98): "#4f9d69", (0.85, 0.15): "#f6c445", (0.17, 0.6): "#b5533c"},
         **{(0.6, 0.5): "#7a4fbf", (0.6, 0.41): "#7a4fbf", (0.66, 0.43): "#bfe3f2"},  # turned about its middle
@@ -126,14 +126,14 @@ def test_a_browser_that_cannot_inflate_draws_objects(game: Any, tab: Any, lacks:
     tab.add_init_script(lacks)
     game()
     tab.click("#overlay-button")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     tab.wait_for_function(f"""() => ({SHOWN})([0.17, 0.6]) === "#b5533c" && ({SHOWN})([0.45, 0.83]) === "#c82040" """)
 
 
 def test_a_sprite_with_a_tween_moves_between_two_pictures(game: Any, tab: Any) -> None:
     game()
     tab.click("#overlay-button")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     tab.evaluate(
         """() => {
             const easel = document.querySelectorAll(".stage canvas")[1];
@@ -243,13 +243,13 @@ def test_the_game_waits_for_its_images(game: Any, world: World, tab: Any) -> Non
     tab.keyboard.press("ArrowRight")
     tab.keyboard.press("Space")
     tab.wait_for_timeout(200)
-    assert tab.get_attribute("#mode", "data-state") == "ready"
+    assert tab.get_attribute("#play", "data-state") == "ready"
     for send in held:
         send()
     tab.wait_for_selector("#overlay-button:visible")
     assert tab.inner_text("#overlay-title") == "Ready?"
     tab.keyboard.press("ArrowRight")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
 
 
 def test_images_are_not_loaded_again_when_the_connection_comes_back(game: Any, world: World, tab: Any) -> None:

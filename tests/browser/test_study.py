@@ -65,7 +65,7 @@ def answer_questionnaire(visitor: Any) -> None:
 
 def wait_for_game(visitor: Any, state: str = "ready") -> None:
     visitor.page.wait_for_selector("#play:not([hidden])")
-    visitor.page.wait_for_function("state => document.getElementById('mode').dataset.state === state", arg=state)
+    visitor.page.wait_for_function("state => document.getElementById('play').dataset.state === state", arg=state)
 
 
 def wait_for_motion(visitor: Any) -> dict[str, Any]:
@@ -200,7 +200,7 @@ def test_the_game_goes_on_after_a_reload_and_in_a_second_tab(visit: Any, study: 
     first, visitor.page = visitor.page, visitor.tab()
     visitor.page.goto(visitor.link)
     wait_for_game(visitor, "paused")
-    first.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
+    first.wait_for_function("() => document.getElementById('play').dataset.state === 'elsewhere'")
     assert "another tab" in first.locator("#overlay-title").inner_text()
     first.bring_to_front()
     second, visitor.page, visitor.pictures = visitor.page, first, True
@@ -214,7 +214,7 @@ def test_the_game_goes_on_after_a_reload_and_in_a_second_tab(visit: Any, study: 
     visitor.page.bring_to_front()
     visitor.page.get_by_role("button", name="Play here instead").click()
     wait_for_game(visitor, "paused")
-    second.wait_for_function("() => document.getElementById('mode').dataset.state === 'elsewhere'")
+    second.wait_for_function("() => document.getElementById('play').dataset.state === 'elsewhere'")
     end_game(visitor)
 
     assert len(set(visitor.sockets)) == 1  # the same server throughout

@@ -44,7 +44,7 @@ def come_to_the_game(page: Any, link: str) -> None:
     page.get_by_label("How many of the eight times").fill("3")
     page.get_by_role("button", name="Continue").click()
     page.wait_for_selector("#play:not([hidden])")
-    page.wait_for_function("() => document.getElementById('mode').dataset.state === 'ready'")
+    page.wait_for_function("() => document.getElementById('play').dataset.state === 'ready'")
 
 
 def words(step: dict[str, Any]) -> list[str]:
@@ -68,7 +68,7 @@ def test_a_participant_says_good_and_bad_and_sees_that_it_was_heard(
     )
     come_to_the_game(page, with_user(study.link, name))
     page.locator("#overlay-button").click()
-    page.wait_for_function("() => document.getElementById('mode').dataset.state === 'playing'")
+    page.wait_for_function("() => document.getElementById('play').dataset.state === 'playing'")
     page.evaluate(WATCH)
     before = len(pictures)
     while len(pictures) < before + LOOKS:

@@ -47,7 +47,7 @@ def test_the_page_says_whose_turn_it_is_and_how_long_it_lasts(
 def test_the_key_that_starts_the_game_makes_no_move(in_turns: World, tab: Any) -> None:
     play(in_turns, tab)
     tell(in_turns, state="ready", toAct=False)
-    tab.wait_for_selector("#mode[data-state=ready]", state="attached")
+    tab.wait_for_selector("#play[data-state=ready]", state="attached")
     before = len(in_turns.commands("action"))
     tab.keyboard.press("ArrowUp")
     in_turns.wait_for({"command": "start"})
@@ -64,5 +64,5 @@ def test_a_page_for_turns_says_nothing_of_turns_in_a_game_in_real_time(world: Wo
     world.controls = {"player": "left", "players": ["left", "right"]}
     play(world, tab)
     tell(world, state="playing")
-    tab.wait_for_selector("#mode[data-state=playing]", state="attached")
+    tab.wait_for_selector("#play[data-state=playing]", state="attached")
     assert tab.inner_text("#turn") == ""

@@ -73,7 +73,7 @@ class Person:
         self.page.evaluate("window.titles = []")
 
     def wait_until_playing(self) -> None:
-        self.page.wait_for_selector("#mode[data-state=playing]", state="attached")
+        self.page.wait_for_selector("#play[data-state=playing]", state="attached")
 
     def answers(self, step: str = "3") -> dict[str, Any]:
         path = self.study.data / "two-players" / "users" / self.name / "answers" / f"{step}.json"
@@ -178,7 +178,7 @@ def test_the_game_waits_for_a_participant_who_looks_at_another_tab(come: Any) ->
     ida.page.evaluate(NOTE_TITLES)
     ida.page.wait_for_timeout(5_000)  # longer than the countdown
     assert ida.page.evaluate("window.titles") == []
-    assert theo.page.get_attribute("#mode", "data-state") != "playing"
+    assert theo.page.get_attribute("#play", "data-state") != "playing"
     theo.page.evaluate(LOOKS_AWAY, False)
     for person in (ida, theo):
         person.wait_until_playing()
@@ -242,7 +242,7 @@ def test_two_people_with_one_link_are_one_participant_and_the_last_page_plays(co
         second.set_default_timeout(45_000)
         second.goto(gwen.link)
         gwen.wait_for_title(ELSEWHERE)
-        second.wait_for_selector("#mode[data-state=playing]", state="attached")
+        second.wait_for_selector("#play[data-state=playing]", state="attached")
         hans.wait_until_playing()
         gwen.page.wait_for_timeout(3_000)  # a page that takes the game back by itself would have done so by now
         assert second.locator("#overlay-title:text('another tab'):visible").count() == 0

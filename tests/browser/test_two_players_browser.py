@@ -28,7 +28,7 @@ SHORT = {
 }
 ALONE = {"  patience: 30\n": "  patience: 10\n"}
 SAYS = "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)"
-PLAYS = "() => document.getElementById('mode').dataset.state === 'playing'"
+PLAYS = "() => document.getElementById('play').dataset.state === 'playing'"
 
 Come = Callable[..., Any]
 

@@ -143,6 +143,7 @@ _GAME = {
     "picture": "Game picture",
     "toRead": "To read",
     "loading": "Loading the game…",
+    "loadingNote": "This takes a few seconds.",
     "pictures": "Pictures of the game",
     "loadingPictures": "Loading the pictures…",
     "readyTitle": "Ready – {study}",

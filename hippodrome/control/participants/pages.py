@@ -154,6 +154,7 @@ def game_page(view: GameView) -> Page:
         data["server"] = view.sources
     if said := texts.of_server():
         data["said"] = said
+    data |= _of_trial(view.project.trial)
     over_title, over_text = _over_texts(view.state, texts) if over else ("", "")
     moved = bool(view.state.get("replaces"))
     data |= {"talk": True} if is_talk else {}
@@ -196,6 +197,19 @@ def game_page(view: GameView) -> Page:
         body="game",
     )
     return Page(text, headers(view.project, nonce, connect=view.sources))
+
+
+def _of_trial(trial: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page knows before the server's first message: the picture's shape, and the action without a button.
+
+    In real time the idle action is taken while no key is pressed. Turn by turn it is a choice like any other.
+    """
+    found: dict[str, Any] = {}
+    if isinstance(scene := trial.get("scene"), Mapping) and scene.get("width") and scene.get("height"):
+        found["ratio"] = round(scene["width"] / scene["height"], 4)
+    if trial.get("pace") != "turns" and (idle := trial.get("idleAction")):
+        found["idle"] = idle
+    return found
 
 
 def is_over(state: Mapping[str, Any]) -> bool:

@@ -1,6 +1,6 @@
 // Draws unpacked frames on the canvas.
 import { KEY, ROWS } from "./frames.js";
-import { find } from "./page.js";
+import { data, find } from "./page.js";
 
 const canvas = find("screen");
 const context = canvas.getContext("2d", { alpha: false });
@@ -57,9 +57,16 @@ function beginPicture({ width, height, channels }) {
 
 // Fits the layout to the picture. `ratio` is its width divided by its height.
 export function shapePicture(ratio) {
+  leaveRoom(ratio);
+  document.body.classList.add("shown");
+}
+
+function leaveRoom(ratio) {
   document.body.style.setProperty("--ratio", ratio);
   document.body.classList.toggle("wide", ratio > 1);
 }
+
+if (data.ratio) leaveRoom(data.ratio);
 
 function putRows(first, count, { width, height, channels }) {
   if (!imageData) {

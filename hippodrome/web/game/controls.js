@@ -2,7 +2,7 @@
 import { command } from "./actions.js";
 import { hooks } from "./hooks.js";
 import { assignKeys, DIRECTIONS, showLegend } from "./keyboard.js";
-import { find, make } from "./page.js";
+import { data, find, make } from "./page.js";
 import { game } from "./state.js";
 import { actionButton, followFingers } from "./touch.js";
 
@@ -30,7 +30,8 @@ export function buildControls(message) {
         groupOf("pad", directions.map(buttonOf)),
         groupOf("others", others.map(buttonOf)),
       ]),
-      commandsOf(shown, message),
+      commandButtons(shown, [["good", TEXT.good], ["bad", TEXT.bad], ...list(message.words).map((word) => [String(word), nice(String(word))])], "commands words"),
+      commandsOf(shown),
       hooks.rates(shown, message),
     ].filter(Boolean),
   );
@@ -39,15 +40,20 @@ export function buildControls(message) {
 
 const list = (value) => (Array.isArray(value) ? value : []);
 
-// The actions that get keys or buttons: not "noop", and instead of a compound such as "upright" its parts.
+// The actions that get keys or buttons: not the one that is taken while no key is pressed, and instead of a compound such as "upright" its parts.
 function singleActions(actionSpace) {
   const single = list(actionSpace).map(String).flatMap((name) => (COMPOUND.test(name) ? name.match(/up|down|left|right|fire/g) : [name]));
-  return [...new Set(single)].filter((name) => name !== "noop").slice(0, 64);
+  return [...new Set(single)].filter((name) => name !== "noop" && name !== data.idle).slice(0, 64);
 }
 
 export function groupOf(className, buttons) {
+  return buttons.length ? followFingers(equalButtons(className, buttons)) : null;
+}
+
+// All buttons of a group are as large as the one with the longest label needs.
+function equalButtons(className, buttons) {
   const letters = buttons.map((each) => each.textContent.length);
-  return buttons.length ? followFingers(make("div", { className, style: `--letters:${Math.max(...letters)}` }, ...buttons)) : null;
+  return make("div", { className, style: `--letters:${Math.max(...letters)}` }, ...buttons);
 }
 
 export const labelOf = (action, labels = {}) => labels[action] ?? DIRECTIONS[action]?.label ?? nice(action);
@@ -58,23 +64,23 @@ export function nice(name) {
   return words.charAt(0).toUpperCase() + words.slice(1).toLowerCase();
 }
 
-function commandsOf(shown, { words }) {
+function commandsOf(shown) {
   return commandButtons(shown, [
-    ["toggle", TEXT.start, shown.has("start") ? "start" : "pause"],
+    ["toggle", TEXT.pause, "pause"],
     ["reset", TEXT.reset],
-    ...Object.entries({ good: TEXT.good, bad: TEXT.bad, trainOnline: TEXT.trainOnline, trainOffline: TEXT.trainOffline }),
-    ...list(words).map(String).map((word) => [word, nice(word)]),
+    ["trainOnline", TEXT.trainOnline],
+    ["trainOffline", TEXT.trainOffline],
     ["stop", TEXT.end],
   ]);
 }
 
 // Makes the buttons that the project offers, out of `all`: each is a command, its label, and its key in `ui` if that differs.
-export function commandButtons(shown, all) {
+export function commandButtons(shown, all, className = "commands") {
   const buttons = all.filter(([name, , key = name]) => shown.has(key)).map(([name, label]) => {
     const button = make("button", { type: "button", textContent: label });
     button.dataset.command = name;
     button.addEventListener("click", () => command(name));
     return button;
   });
-  return buttons.length ? make("div", { className: "commands" }, ...buttons) : null;
+  return buttons.length ? equalButtons(className, buttons) : null;
 }

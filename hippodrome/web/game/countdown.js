@@ -1,7 +1,7 @@
 // The first picture of a game, which stands still for a moment, and the time that is left in the game.
 import { hooks } from "./hooks.js";
 import { overlays, showOverlay } from "./overlay.js";
-import { duration, find, make, setText } from "./page.js";
+import { addStyle, duration, find, make, setText } from "./page.js";
 import { game } from "./state.js";
 
 const SOON = 10; // a screen reader says when so many seconds are left
@@ -13,10 +13,8 @@ let saidSoon = false;
 
 overlays.freeze = { title: TEXT.getReady };
 // One line at the top, so that the picture below can be seen.
-hooks.overlay.push((name) => {
-  find("overlay").style.cssText = name === "freeze" ? "min-height: 0; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem" : "";
-});
-document.querySelector(".hud").append(timeLeft);
+addStyle("[data-state=freeze] .overlay { place-self: start stretch; margin: 0; grid-auto-flow: column; align-items: baseline; justify-content: center; padding: .3rem; }");
+find("score").parentNode.after(timeLeft);
 
 hooks.message.push((message) => {
   if (!message.state) return;

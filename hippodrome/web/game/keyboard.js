@@ -57,12 +57,17 @@ function codeOf({ code, key }) {
 const OPERATE = { BUTTON: /^(\s|Enter)$/, INPUT: /^(Arrow|Page|Home|End)/ }; // the only input is the slider for the speed
 let tabbed = false;
 
-window.addEventListener("pointerdown", () => { tabbed = false; }, true);
+function noteTab(is) {
+  tabbed = is;
+  find("play").classList.toggle("tabbed", is); // only then a ring shows the focus
+}
+
+window.addEventListener("pointerdown", () => noteTab(false), true);
 
 export function onKeyDown(event) {
   if (event.key === "Meta") releaseAll(); // macOS sends no keyup of other keys while Cmd is held
   const does = hooks.key(event) ?? keys.get(codeOf(event));
-  if (!does && event.key === "Tab") tabbed = true;
+  if (!does && event.key === "Tab") noteTab(true);
   if (!does || find("play").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   if (tabbed && OPERATE[event.target.tagName]?.test(event.key)) return;
   event.preventDefault(); // the page must not scroll

@@ -2,6 +2,7 @@
 import { groupOf, labelOf } from "./controls.js";
 import { hooks } from "./hooks.js";
 import { DIRECTIONS } from "./keyboard.js";
+import { data } from "./page.js";
 import { actionButton } from "./touch.js";
 
 const ARROWS = { ArrowUp: "up", ArrowLeft: "left", ArrowRight: "right", ArrowDown: "down" };
@@ -55,7 +56,7 @@ hooks.controls = ({ keys, labels = {}, actionSpace }) => {
     space: bound.has(nameOfKey(" ")),
     groups: [
       groupOf("pad", pad.map((key) => padButton(key, single.has(key) ? label(single.get(key)) : DIRECTIONS[ARROWS[key]].label))),
-      groupOf("others", actions.filter(standsAlone).slice(0, MAX_BUTTONS).map((action) => {
+      groupOf("others", actions.filter((action) => action !== data.idle && standsAlone(action)).slice(0, MAX_BUTTONS).map((action) => {
         const key = keyOf(action);
         return actionButton(key === undefined ? action : nameOfKey(key), label(action));
       })),

@@ -4,7 +4,7 @@ import { find, points, setText } from "./page.js";
 import { game } from "./state.js";
 
 export const overlays = {
-  loading: { title: TEXT.loading },
+  loading: { title: TEXT.loading, note: TEXT.loadingNote },
   ready: { title: TEXT.ready, button: TEXT.start, hint: TEXT.orArrow },
   paused: { title: TEXT.paused, button: TEXT.goOn, hint: TEXT.orArrow },
   break: { button: TEXT.goOnNow, aside: true }, // breaks.js has its words
@@ -21,12 +21,7 @@ export function showOverlay(name) {
   if (overlay.aside) find("controls").after(find("overlay")); // in their place: the last picture stays visible
   else find("trouble").before(find("overlay"));
   find("controls").inert = !["ready", "playing", "paused"].includes(name);
-  find("mode").dataset.state = name;
-  setText(find("mode"), { playing: TEXT.playing, paused: TEXT.paused }[name] ?? "");
-  for (const button of document.querySelectorAll("[data-command=toggle]")) {
-    button.textContent = { playing: TEXT.pause, paused: TEXT.goOn }[name] ?? TEXT.start;
-    button.style.visibility = game.offered?.has(name === "playing" ? "pause" : "start") ? "" : "hidden";
-  }
+  find("play").dataset.state = name; // for the style
   const score = name === "break" ? `. ${TEXT.yourScore(points(game.episodeScore))}.` : "";
   setText(find("announce"), `${overlay.title ?? TEXT.playing}${score}`);
   setText(find("overlay-score"), "");

@@ -16,6 +16,7 @@ let picture = { width: 600, height: 400, background: "#ffffff", coordinates: "re
 let unitX = 600; // pixels of the picture for an x of 1
 let unitY = 400;
 let repaint = () => {};
+let shaped = 0; // the ratio for which the layout has room; 0 if frames may have changed it
 
 // Takes the picture's size and background from the scene's description. `changed` is called when the scene has to be drawn
 // again.
@@ -29,8 +30,9 @@ export function prepare(scene, changed) {
 
 // Shows this canvas, in the shape of the scene. Returns whether it was hidden.
 export function place() {
-  const ratio = String(picture.width / picture.height);
-  if (document.body.style.getPropertyValue("--ratio") !== ratio) shapePicture(ratio);
+  const ratio = picture.width / picture.height;
+  if (ratio !== shaped) shapePicture(ratio);
+  shaped = ratio;
   if (!easel.hidden) return false;
   easel.hidden = false;
   fit();
@@ -40,6 +42,7 @@ export function place() {
 // Hides this canvas, so that the canvas of the frames shows.
 export function putAway() {
   easel.hidden = true;
+  shaped = 0;
 }
 
 // Gives the canvas as many pixels as it covers on the screen. Returns whether that changed.

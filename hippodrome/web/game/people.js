@@ -34,7 +34,6 @@ const ENDINGS = {
 hooks.overlay.push((name) => {
   presence.shown = name;
   offerNoStart();
-  find("overlay").dataset.name = name;
   // Other modules show these overlays too, such as sprites.js when all images have come; then this covers them again.
   if (["ready", "paused"].includes(name)) queueMicrotask(coverPicture);
 });
@@ -137,7 +136,6 @@ function offerNoStart() {
   const line = [...find("legend").children].find((each) => [` ${TEXT.keyStart}`, ` ${TEXT.keyToggle}`].includes(each.lastChild.textContent));
   if (line?.lastChild.textContent === ` ${TEXT.keyStart}`) line.remove();
   else if (line) line.lastChild.textContent = ` ${TEXT.keyPause}`;
-  for (const button of document.querySelectorAll("[data-command=toggle]")) button.hidden = !["playing", "paused"].includes(presence.shown) || !game.offered.has("pause");
 }
 
 // Pages that are read beside the game: the game goes on once all participants have read them

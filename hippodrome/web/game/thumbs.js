@@ -11,7 +11,7 @@ const css = `
 @media (pointer: coarse) and (min-aspect-ratio: 5/4) { .pad { --thumb: calc(1.1 * var(--key)); } }
 @media (pointer: coarse) and (min-aspect-ratio: 5/4) and (max-height: 34rem) {
   .wide .board { grid-template: "hud hud hud" "walk room jump" minmax(13rem, 1fr) / 7.2rem minmax(0, 1fr) 7.2rem; }
-  .wide .controls { grid-area: 2 / 1 / 3 / 4; justify-content: end; width: auto; max-width: none; pointer-events: none; }
+  .wide .controls { grid-area: 2 / 1 / 3 / 4; justify-content: end; justify-self: stretch; flex-flow: row wrap; width: auto; max-width: none; pointer-events: none; }
   .wide .controls .pad { max-width: none; grid-template-columns: var(--thumb) var(--thumb) 1fr 7.2rem; }
   .wide .controls button { pointer-events: auto; }
   .wide .hands > .overlay { grid-area: jump; zoom: .8; }

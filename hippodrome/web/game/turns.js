@@ -15,6 +15,7 @@ let wasMine = false;
 document.querySelector(".hud").append(turn, choice);
 addStyle(`.hud { flex-wrap: wrap; }
 .hud :is(#turn, #choice) { flex: 1 0 100%; min-height: 1.6em; text-align: center; white-space: normal; }
+#turn { font-size: 1rem; }
 .hud #choice { font-size: .875rem; line-height: 1.2; color: var(--ink); }
 #choice:empty { display: none; }
 #turn.mine { color: var(--ink); font-weight: 600; }
