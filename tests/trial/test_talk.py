@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from tests.trial.conftest import grid_agent
-from tests.trial.sessions import launch_formed, member
+from tests.trial.sessions import answer, launch_formed, member
 
 TALKS = """
     def reply(self, session, player, text):
@@ -87,6 +87,26 @@ async def test_a_game_of_words_alone_needs_no_environment_and_no_picture(launch,
     answers = server.answer()["answers"]
     assert (answers["episodes"], answers["talk"]["lines"]) == (1, 1)
     assert 2 <= answers["frames"] <= 4
+
+
+DEALS = """
+class Agent:
+    def moderate(self, session, player, text):
+        if text == "Deal":
+            session.env.end({"buyer": 20, "seller": 30}, success=True)
+"""
+
+
+async def test_an_agent_ends_the_game_when_people_agree(launch):
+    players = {"buyer": "human", "seller": "human"}
+    trial = {"game": "talk", "episodeSeconds": 600, "maxEpisodes": 5, "until": {"success": 1}, "players": players}
+    server = launch_formed(launch, agent=DEALS, trial=trial)
+    async with member(server, "anna") as anna, member(server, "bert") as bert:
+        await anna.until(lambda: anna.state["state"] == "playing")
+        await say(anna, 1, "Deal")
+        assert await asyncio.gather(anna.closed(), bert.closed()) == [1000, 1000]
+    scores = {user: answer(server.store, user)["answers"]["score"] for user in ("anna", "bert")}
+    assert scores == {"anna": 20, "bert": 30}
 
 
 async def test_two_participants_talk_without_an_agent(launch):
