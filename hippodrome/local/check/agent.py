@@ -153,7 +153,7 @@ def _answers(before: list[Step], game: Step, names: list[str], given: Mapping[st
 def _made_up(folder: Path, config: Config, group: int | None) -> dict[str, dict[str, Any]]:
     """Answers to all questions of the study, by step."""
     try:
-        given = EarlierAnswers(open_folder(folder).path, config, config.steps).answers(group)[0]
+        given = EarlierAnswers(open_folder(folder).path, config, config.steps).made_up(group)
     except StepFileError:
         return {}
     checks = (step.key for step in config.design.steps if step.right)

@@ -94,19 +94,15 @@ def _try(report: Path, deadline: Deadline) -> None:
 
     games = json.loads(os.environ.pop("GAMES"))
 
-    def set_game(game: Mapping[str, Any]) -> None:
-        answers = game["answers"]
-        humans = [one.name for one in players if one.human]
-        by_player = answers if answers is None or len(humans) == 1 else dict.fromkeys(humans, answers)
-        player.set_game(game["options"], by_player)
-        progress.callbacks.facts = replace(progress.callbacks.facts, answers=by_player or {})
+    def begin_session(game: Mapping[str, Any]) -> None:
+        now = replace(config, options=game["options"])
+        _begin_session(player, players, progress, now, folder=folder, answers=game["answers"])
 
     def reset() -> Any:
         os.environ.__class__ = usual_class
         if given:
             assignment.set_environment(os.environ, _assigned(given))
-        set_game(games[0])
-        progress.callbacks.session_begins()
+        begin_session(games[0])
         return joint.reset(1)
 
     question = json.loads(os.environ.pop("MATCH", "null"))
@@ -116,7 +112,6 @@ def _try(report: Path, deadline: Deadline) -> None:
     if not progress.call("players", lambda: who_plays(config, joint.action_spaces, group)):
         return
     players = progress.result
-    progress.callbacks = _callbacks(player, players, progress, config, folder)
     names, count = progress.known["names"], progress.known["count"]
     if count is not None and names > count:
         if not player.steps_itself:
@@ -129,7 +124,7 @@ def _try(report: Path, deadline: Deadline) -> None:
     game = CheckedGame(joint, players, config, progress)
     if game.load(folder, adapter.agent_module) and game.play(reset) and _talk(player, players, config, progress):
         _note_idle(joint, players, config, progress)
-        if game.begin_each(games[1:], set_game) and game.close():
+        if game.begin_each(games[1:], begin_session) and game.close():
             progress.over()
 
 
@@ -235,24 +230,34 @@ def _note_idle(
                 break
 
 
-def _callbacks(
+def _begin_session(
     player: AgentAdapter | JointAdapter,
     players: Sequence[Player],
     progress: AgentProgress,
     config: TrialSection,
+    *,
     folder: Path,
-) -> Callbacks:
-    """The agent's callbacks, called as on a server. What they say, nobody hears."""
+    answers: Mapping[str, Any] | None,
+) -> None:
+    """Give the agent the options of `config` and answers, and call its callbacks as on a server.
+
+    What they say, nobody hears.
+    """
     humans = tuple(each.name for each in players if each.human)
-    return Callbacks(
+    given = answers if answers is None or len(humans) == 1 else dict.fromkeys(humans, answers)
+    player.set_game(config.options, given)
+    before = progress.callbacks
+    progress.callbacks = callbacks = Callbacks(
         player.callbacks,
-        TrialFacts("check", "check", None, tuple(each.name for each in players), humans),
+        TrialFacts("check", "check", None, tuple(each.name for each in players), humans, answers=given or {}),
         lambda: player.env,
         seconds=config.callback_seconds,
         stamp=dict,
         failed=progress.callback_failed,
         talk=_talk_of_agent(config, folder, humans[0]),
     )
+    callbacks.first_late = before.first_late if before else None
+    callbacks.session_begins()
 
 
 def _talk_of_agent(config: TrialSection, folder: Path, human: str) -> TalkOfAgent:

@@ -14,6 +14,7 @@ from hippodrome.bots import form_filling, forms
 from hippodrome.control.config import Config
 from hippodrome.control.config.config import StepFiles
 from hippodrome.control.participants import fragments
+from hippodrome.control.participants.sandbox import FragmentError
 from hippodrome.local.check import spans
 from hippodrome.protocol.answer import UNMATCHED
 
@@ -131,6 +132,19 @@ class EarlierAnswers:
             most[step.key], least[step.key] = _answered(self._source(step, group), person)
         return [most, least]
 
+    def made_up(self, group: int | None) -> dict[str, dict[str, Any]]:
+        """Return answers to all questions, by step, with values as participants' pages offer them.
+
+        Loops of a page are run, so that the values that they make are known; what depends on a participant is empty.
+        """
+        found: dict[str, dict[str, Any]] = {}
+        for step in self._steps:
+            if step.type.on_server:
+                found[step.key] = dict(_PLAYED)
+            elif step.files:
+                found[step.key] = _answers_to(_rendered(self._source(step, group)), 1)[0]
+        return found
+
     def _source(self, step: StepFiles, group: int | None) -> str:
         """The text of the version that this group sees. If its number of versions is another one, it is any version."""
         return source_of(self._folder / step.files[(group or 0) % len(step.files)].name)
@@ -183,9 +197,21 @@ def _forms(text: str) -> list[forms.Form]:
     return forms.read(f"<form>{every_branch(text).html}</form>")
 
 
+def _rendered(text: str) -> list[forms.Form]:
+    """The forms of a page as it is without a participant; with all branches, if it cannot be rendered so."""
+    try:
+        return forms.read(f"<form>{fragments.prepare(text).fill({}).html}</form>")
+    except FragmentError:
+        return _forms(text)
+
+
 def _answered(text: str, person: int = 1) -> tuple[dict[str, Any], dict[str, Any]]:
     """Answers to a page: to all questions, and to the required ones only."""
-    found = _forms(text)
+    return _answers_to(_forms(text), person)
+
+
+def _answers_to(found: list[forms.Form], person: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Answers to the first of these forms: to all questions, and to the required ones only."""
     if not found:
         return {}, {}
     controls = found[0].controls

@@ -73,18 +73,18 @@ class CheckedGame:
 
     def play(self, first_reset: Callable[[], Any]) -> bool:
         """Play until the last episode or the time is over; return False if a call failed, which is reported."""
-        progress, callbacks = self._progress, self._progress.callbacks
+        progress = self._progress
         for episode in range(1, self._config.max_episodes + 1):
             if not progress.call("reset", first_reset if episode == 1 else partial(self._adapter.reset, episode)):
                 return False
             now: Joint = progress.result[0]
             if not (progress.call("render", self._adapter.pictures) and self._reset_policies(episode)):
                 return False
-            callbacks.episode_began(episode, now.observations, now.infos)
+            progress.callbacks.episode_began(episode, now.observations, now.infos)
             steps = 0
             while not now.over and steps < self._config.most_steps:
                 if progress.time_over():
-                    callbacks.session_ended()
+                    progress.callbacks.session_ended()
                     return True
                 self._acted.add(now.to_act)
                 actions = self._actions(now, steps)
@@ -103,21 +103,21 @@ class CheckedGame:
                 progress.known["takeTurns"] = self._take_turns()
                 recorded = now.observations.values() if self._config.record_observations else ()
                 progress.returned(recorded, now.infos.values(), now.extra)
-                callbacks.stepped(actions, now.rewards, now.observations, now.infos)
+                progress.callbacks.stepped(actions, now.rewards, now.observations, now.infos)
             progress.episodes = episode
-            callbacks.episode_ended(now.why if now.over else "truncated")
-        callbacks.session_ended()
+            progress.callbacks.episode_ended(now.why if now.over else "truncated")
+        progress.callbacks.session_ended()
         return True
 
-    def begin_each(self, others: Sequence[Mapping[str, Any]], set_game: Callable[[Mapping[str, Any]], None]) -> bool:
+    def begin_each(self, others: Sequence[Mapping[str, Any]], begin: Callable[[Mapping[str, Any]], None]) -> bool:
         """Begin an episode of each other game and level; return False if a call failed.
 
-        Each has its `options` and `answers`, which `set_game` gives to the agent.
+        Each has its `options` and `answers`, with which `begin` begins the agent's session.
         """
         for game in others:
             if self._progress.time_over():
                 break
-            set_game(game)
+            begin(game)
             self._progress.known["game"] = game
             if not self._begin():
                 return False
@@ -132,6 +132,7 @@ class CheckedGame:
         now: Joint = progress.result[0]
         if not (progress.call("render", self._adapter.pictures) and self._reset_policies(1)):
             return False
+        progress.callbacks.episode_began(1, now.observations, now.infos)
         for step in range(BEGUN):
             actions = None if now.over else self._actions(now, step)
             if actions is None:
