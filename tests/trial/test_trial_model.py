@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 
 from hippodrome.local.fake_model import FakeModel, reply_to
+from hippodrome.protocol.session import assignment_key
 from hippodrome.trial.llm.ledger import text_hash
 from tests.trial.two_players import two_players
 
@@ -336,3 +338,15 @@ async def test_what_policies_asked_is_not_asked_again(launch: Any, open_client: 
         await client.start()
         await client.until(lambda: len(model.requests) >= before + 5)
     assert max(asked(model).values()) == 1
+
+
+async def test_a_game_may_have_a_model_of_its_own(launch: Any, open_client: Any, grid: Any, model: FakeModel) -> None:
+    own = {"chat": {"first": "ai"}, "llm": {"url": model.url, "model": "small", "system": "Be firm."}}
+    server = launch(agent=grid(), trial={}, ASSIGNMENT="on")
+    place = server.store / assignment_key("study", "P1")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(json.dumps({"games": {"3": {"step": "3", "trial": own}}}))
+    async with open_client(server.address) as client:
+        await client.enter()
+        await client.read(1)
+    assert model.requests[0][1]["messages"][0] == {"role": "system", "content": "Be firm."}

@@ -54,9 +54,9 @@ def command(
         tried = agent.try_agent(folder, config, seconds, _say, _say if sys.stdout.isatty() else lambda line: None)
         _print(tried)
         found += tried
-    sys.stdout.write(f"{_summary(found, config)}\n")
     if config and (cost := model_cost.sentence(config)):
         sys.stdout.write(f"{cost}\n")
+    sys.stdout.write(f"{_summary(found, config)}\n")
     if strict and found and not _mistakes(found):
         sys.stdout.write("With --strict, remarks count as mistakes.\n")
     raise typer.Exit(1 if _mistakes(found) or (strict and found) else 0)

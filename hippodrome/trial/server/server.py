@@ -91,7 +91,7 @@ class TrialServer:
         self._admission: Admission
         self._connections: dict[Connection, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._endpoint = Endpoint(settings.llm_key, settings.llm_url) if settings.asks_model else None
+        self._endpoint: Endpoint | None = None
         self._watchers = watch.Watchers()
         self._watching = 0  # the number of programs that watch
 
@@ -99,8 +99,8 @@ class TrialServer:
         """Serve until the last trial is over, no participant comes, the deadline passes, or `end` is called."""
         settings = self.settings
         log.addFilter(IdFilter(lambda: self.settings.private))
-        if self._endpoint is not None:
-            os.environ.update(self._endpoint.environment())  # before agent.py is imported
+        if settings.asks_model:
+            self._open_endpoint()  # before agent.py is imported
         self._lifetime = Lifetime(settings, saving=self._is_saving)
         self._store = await asyncio.to_thread(open_store, settings.store, settings.server, settings.credential)
         self._spool = await asyncio.to_thread(Spool, settings, self._store)
@@ -367,8 +367,11 @@ class TrialServer:
             return unstored
         if trial is not None and not trial.core.played:
             raise CloseConnection(4404, "another step's game is still going on")
+        settings = self._settings_of(step)
+        if settings.trial.llm is not None and self._endpoint is None:  # no other game has a model, and this one no key
+            self._open_endpoint()
         trial = TrialLoop(
-            self._settings_of(step),
+            settings,
             step,
             worker=self._worker,
             store=self._store,
@@ -407,6 +410,11 @@ class TrialServer:
         levels = {**game.levels, "position": game.position} if game.levels else {}
         condition = self._assigned.condition
         return replace(self.settings, trial=section, condition=condition, levels=levels, answers=game.answers)
+
+    def _open_endpoint(self) -> None:
+        """Open the way to the language model, and tell programs where it is."""
+        self._endpoint = Endpoint(self.settings.llm_key, self.settings.llm_url)
+        os.environ.update(self._endpoint.environment())
 
     def _next_step(self) -> str:
         steps = self.settings.game_steps
