@@ -19,7 +19,8 @@ const isTalk = Boolean(data.talk); // there is no game beside the panel
 const memory = `said-${data.project}-${document.body.dataset.user}-${data.step}`;
 const hasMouse = matchMedia("(hover: hover) and (pointer: fine)");
 
-const log = named(make("div", { id: "chat-log", tabIndex: 0 }), TEXT.messages, "log");
+const stack = make("div", { id: "chat-lines" });
+const log = named(make("div", { id: "chat-log", tabIndex: 0 }, stack), TEXT.messages, "log");
 const toNewest = make("button", { type: "button", id: "chat-newest", textContent: TEXT.newMessages, hidden: true });
 const doing = make("p", { id: "chat-doing" }); // who types, or whose turn it is
 const note = named(make("p", { id: "chat-note" }), "", "status");
@@ -69,10 +70,10 @@ function bubbleOf(by, text) {
 function put(bubble, number) {
   bubble.n = number;
   let next = null;
-  for (let each = log.lastElementChild; each && (each === bubble || !(each.n < number)); each = each.previousElementSibling) {
+  for (let each = stack.lastElementChild; each && (each === bubble || !(each.n < number)); each = each.previousElementSibling) {
     if (each !== bubble) next = each;
   }
-  if (!bubble.isConnected || bubble.nextElementSibling !== next) log.insertBefore(bubble, next);
+  if (!bubble.isConnected || bubble.nextElementSibling !== next) stack.insertBefore(bubble, next);
   bubble.classList.toggle("same", bubble.previousElementSibling?.by === bubble.by);
 }
 
@@ -100,14 +101,14 @@ function showLine({ n, by, text, id, more }) {
 
 function hearLines(message) {
   const isHistory = !open;
-  if (isHistory && message.lines.length > 1 && !log.querySelector(":not(.waiting)")) {
+  if (isHistory && message.lines.length > 1 && !bubbles.size) {
     log.setAttribute("aria-live", "off"); // after a reload, nobody wants to hear all of it again
     setTimeout(() => log.setAttribute("aria-live", "polite"), 1_000);
   }
   for (const line of message.lines) showLine(line);
-  while (log.childElementCount > KEPT) {
-    bubbles.delete(log.firstElementChild.n);
-    log.firstElementChild.remove();
+  while (stack.childElementCount > KEPT) {
+    bubbles.delete(stack.firstElementChild.n);
+    stack.firstElementChild.remove();
   }
   if ("turn" in message) writer = message.turn;
   if (isHistory) {
@@ -137,7 +138,7 @@ function addWaiting(line) {
   const bubble = bubbleOf(chat.me, line.text);
   bubble.classList.add("waiting");
   bubble.append(make("small", { textContent: TEXT.sending }));
-  log.append(bubble);
+  stack.append(bubble);
   unsent.push({ ...line, bubble });
 }
 
@@ -217,6 +218,7 @@ function setUp(said) {
   chat = { maxLength: 500, typing: true, ...said };
   form.hidden = !chat.typing;
   phraseButtons.hidden = !chat.phrases?.length;
+  panel.classList.toggle("phrases", !phraseButtons.hidden);
   if (isFirst) {
     phraseButtons.append(...(chat.phrases ?? []).map(phraseButton));
     field.value ||= stored.draft ?? "";
@@ -303,7 +305,8 @@ log.addEventListener("scroll", () => {
   if (atEnd) toNewest.hidden = true;
 });
 toNewest.addEventListener("click", () => { log.scrollTop = log.scrollHeight; });
-new ResizeObserver(follow).observe(log);
+const resized = new ResizeObserver(follow);
+for (const each of [log, stack]) resized.observe(each);
 
 // The keyboard of a phone covers the page: then the panel moves above it.
 const seen = window.visualViewport;
@@ -325,8 +328,10 @@ const readingPage = find("reading");
 const board = document.querySelector(".board");
 
 function settle() {
-  const parent = readingPage && !readingPage.hidden ? readingPage.parentElement : board;
+  const reads = Boolean(readingPage) && !readingPage.hidden;
+  const parent = reads ? readingPage.parentElement : board;
   if (panel.parentElement === parent) return;
+  document.body.classList.toggle("reads", reads);
   parent.append(panel);
   follow();
 }
