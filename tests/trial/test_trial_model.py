@@ -302,14 +302,17 @@ async def test_an_answer_under_way_when_a_server_is_taken_back_is_paid_for_once(
         await client.play(5)
         await say(client, 1, "One")
         await client.until(lambda: client.lines.get(2, {}).get("more"))
+        await say(client, 2, "Two")  # waits for the answer to the first
+        await client.read(3)
         first.terminate()
         await client.closed()
     assert first.wait() == 0
+    model.behaviour = {}
     second = launch(agent=grid(), trial=trial, SERVER="a-2")
     async with open_client(second.address) as client:
         await client.enter()
-        assert await client.read(2) == [("player_0", "One"), ("ai", reply_to("One"))]
-    assert len(model.requests) == 1
+        assert [text for by, text in await client.read(4) if by == "ai"] == [reply_to("One"), reply_to("Two")]
+    assert asked(model) == {"One": 1, "Two": 1}
 
 
 POLICY = """

@@ -32,6 +32,8 @@ PATHS = ("/chat/completions", "/responses", "/embeddings")
 """The paths below `/v1` that are passed on."""
 MAX_REQUEST = 4 * 1024 * 1024
 """The most bytes of a request."""
+CLOSED_SECONDS = 60.0
+"""A call waits so long if the server is ending: by then its process has ended."""
 _IDLE = 600.0  # seconds for which a client may keep a connection without a request
 _ROOT = "/v1"
 
@@ -90,7 +92,7 @@ class Endpoint:
             self._game = game
 
     def close(self, seconds: float) -> None:
-        """Take no further call, and wait at most `seconds` for those under way, which the tape then holds. Blocks."""
+        """Begin no further call, and wait at most `seconds` for those under way, which the tape then holds. Blocks."""
         with self._changed:
             self._closed = True
             self._changed.wait_for(lambda: not self._under_way, seconds)
@@ -110,7 +112,8 @@ class Endpoint:
     def begin(self) -> Game:
         """Begin a request, which `done` ends. Raises Refused."""
         with self._changed:
-            if self._closed:
+            if self._closed:  # an error would become a fallback that the participant reads; the next server asks again
+                self._changed.wait_for(lambda: False, CLOSED_SECONDS)
                 raise Refused(503, "closed", "this server is ending; another one asks the model")
             if self._game is None:
                 words = (

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from hippodrome.local.fake_model import FakeModel, reply_to
+from hippodrome.trial.llm import endpoint
 from hippodrome.trial.llm.ledger import Moment
 from tests.trial.llm.conftest import KEY, World, chat
 
@@ -207,7 +208,10 @@ def test_before_a_game_nothing_is_asked(world: Worlds) -> None:
     assert (status, answer["error"]["code"]) == (409, "no_game")
 
 
-def test_a_server_that_ends_waits_for_the_call_under_way(world: Worlds, model: FakeModel) -> None:
+def test_a_server_that_ends_waits_for_the_call_under_way(
+    world: Worlds, model: FakeModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(endpoint, "CLOSED_SECONDS", 0.1)
     model.behaviour = {"delay": 0.5}
     here = world()
     sending = threading.Thread(target=here.send, args=(chat("Hi"),))
