@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cached_property
 from typing import Any
 
 from hippodrome.protocol.answer import GAME, Answer, answers_in, to_json
@@ -43,8 +44,11 @@ class Recorder:
         self._flushing: asyncio.Task[None] | None = None
         self._uploads: set[asyncio.Task[None]] = set()
         self._hurried = asyncio.Event()
-        self.tape = Tape(settings, step, store, kept=not spool.local_only)
+
+    @cached_property
+    def tape(self) -> Tape:
         """The tape of what is said."""
+        return Tape(self._settings, self._step, self._store, kept=not self._spool.local_only)
 
     # ---- before
 
