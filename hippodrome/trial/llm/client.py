@@ -16,7 +16,7 @@ from hippodrome.trial.llm.errors import CapReached, ModelError, ModelRefused, Mo
 _AGAIN = (429, 500, 502, 503, 504)
 _PAUSES = (1.0, 3.0)  # seconds before a second and a third try
 _LONGEST_PAUSE = 10.0  # seconds for which an API may make us wait
-_OWN = "hippodrome"  # the type of the endpoint's own errors, which are not tried again
+_OWN = "hippodrome"  # the type of the endpoint's own errors
 _SECONDS = 700.0  # the endpoint ends each call before
 
 
@@ -96,14 +96,17 @@ def _opened(body: Mapping[str, Any]) -> tuple[http.client.HTTPConnection, http.c
         if response.status == 200:
             return connection, response
         try:
-            error = _error_of(response.status, json.loads(response.read()))
+            answer = json.loads(response.read())
         except (OSError, ValueError, http.client.HTTPException):
-            error = ModelUnavailable(f"the address answers with status {response.status}")
+            answer = None
         finally:
             connection.close()
-        final = response.getheader("X-Should-Retry") == "false" or response.status not in _AGAIN
-        if pause is None or final:
-            raise error
+        if (
+            pause is None
+            or response.status not in _AGAIN
+            or _own_error(answer).get("code") not in (None, "unavailable")
+        ):
+            raise _error_of(response.status, answer)
         time.sleep(_pause(response.getheader("Retry-After"), pause))
     raise AssertionError
 
@@ -117,15 +120,19 @@ def _pause(retry_after: str | None, pause: float) -> float:
 
 def _error_of(status: int, answer: Any) -> ModelError:
     """Return the error that an answer tells. Its message holds nothing of what an API says, which may quote prompts."""
-    error = answer.get("error") if isinstance(answer, Mapping) else None
-    error = error if isinstance(error, Mapping) else {}
-    code, own = str(error.get("code") or ""), error.get("type") == _OWN
-    words = str(error.get("message")) if own else f"the model's API answers with status {status}"
+    own = _own_error(answer)
+    code, words = own.get("code"), str(own.get("message") or f"the model's API answers with status {status}")
     if code == "cap_reached":
         return CapReached(words)
-    if status in _AGAIN or (own and code in ("not_on_tape", "no_game", "closed")):
+    if status in _AGAIN or code in ("not_on_tape", "no_game"):
         return ModelUnavailable(words)
     return ModelRefused(words)
+
+
+def _own_error(answer: Any) -> Mapping[str, Any]:
+    """Return the error of the endpoint's own that an answer tells; {} for one of the model's API."""
+    error = answer.get("error") if isinstance(answer, Mapping) else None
+    return error if isinstance(error, Mapping) and error.get("type") == _OWN else {}
 
 
 def _sent(method: str, path: str, body: Mapping[str, Any] | None) -> tuple[int, Any]:
