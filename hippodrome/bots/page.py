@@ -22,8 +22,8 @@ class VisitedPage:
     @property
     def game(self) -> dict[str, Any] | None:
         """The JSON data in the game page (docs/pages.md); None on other pages."""
-        found = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
-        data = json.loads(found[1]) if found else None
+        match = re.search(r'<script type="application/json" id="data">(.*?)</script>', self.text, re.DOTALL)
+        data = json.loads(match[1]) if match else None
         return data if isinstance(data, dict) else None
 
     @property
@@ -33,20 +33,20 @@ class VisitedPage:
     @property
     def step(self) -> str:
         """The key of the step that the page shows."""
-        found = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
-        return html.unescape(found[1]) if found else ""
+        match = re.search(r'<body[^>]*\bdata-step="([^"]*)"', self.text)
+        return html.unescape(match[1]) if match else ""
 
     @property
     def end(self) -> str:
         """The end before the last step that the page shows; "" if it shows none."""
-        found = re.search(r'<body[^>]*\bdata-end="([^"]*)"', self.text)
-        return html.unescape(found[1]) if found else ""
+        match = re.search(r'<body[^>]*\bdata-end="([^"]*)"', self.text)
+        return html.unescape(match[1]) if match else ""
 
     @property
     def least_seconds(self) -> float:
         """The seconds before which the page's answers are not taken."""
-        found = re.search(r'<body[^>]*\bdata-least="([0-9.]+)"', self.text)
-        return float(found[1]) if found else 0
+        match = re.search(r'<body[^>]*\bdata-least="([0-9.]+)"', self.text)
+        return float(match[1]) if match else 0
 
     @property
     def is_last(self) -> bool:
@@ -56,8 +56,8 @@ class VisitedPage:
     @property
     def code(self) -> str | None:
         """The text of the first element of class `code`: the completion code. None if there is no such element."""
-        found = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
-        return html.unescape(found[1]).strip() if found else None
+        match = re.search(r'class="code"[^>]*>([^<]+)<', self.text)
+        return html.unescape(match[1]).strip() if match else None
 
 
 def links(page: str) -> list[str]:

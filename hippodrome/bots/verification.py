@@ -108,32 +108,32 @@ def verify(
     `recorded`: whether the project keeps recordings. `last_error` gets a participant's id, and returns the last error
     in the log of their last server; "" if it is not known.
     """
-    found, read = Verification(), dict[Path, list[StoredRecording]]()
+    verification, read = Verification(), dict[Path, list[StoredRecording]]()
     for report in reports:
         folder = data / project_id / "users" / report.user_id
         membership = document(folder / "session.json")
         session = data / project_id / "sessions" / str(membership["session"]) if membership.get("session") else None
         if session is not None:
-            found.sessions[session.name] = found.sessions.get(session.name, 0) + 1
-        _look_at_answers(found, report, folder)
+            verification.sessions[session.name] = verification.sessions.get(session.name, 0) + 1
+        _look_at_answers(verification, report, folder)
         trials = (session or folder) / "trials"
-        _look_at_plays(found, report, folder, _recordings(trials, read), last_error, recorded=recorded)
+        _look_at_plays(verification, report, folder, _recordings(trials, read), last_error, recorded=recorded)
         for path in sorted(trials.rglob("*")):
             if path.is_file() and path.suffix != ".gz" and not _TAPE.fullmatch(path.name):
-                found.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
+                verification.missing.append(f"{report.user_id}: {path.name} lies among the recordings")
         code = membership.get("completionCode") or document(folder / "participant.json").get("completionCode")
         if code and str(code) in report.final_page:
-            found.codes += 1
+            verification.codes += 1
         elif any(map(leads_elsewhere, links(report.final_page))):
-            found.links += 1
-    owners = {report.user_id for report in reports} | found.sessions.keys()
+            verification.links += 1
+    owners = {report.user_id for report in reports} | verification.sessions.keys()
     for path in sorted((data / "_servers").glob("*.json")):
         record = document(path)
         if record.get("ready") and record.get("userId") in owners:
-            found.starts.append(_seconds(record["requested"], record["ready"]))
-    if 0 < found.codes < sum(report.finished for report in reports) - found.links:
-        found.missing.append("some final pages lack their completion code, or show another")
-    return found
+            verification.starts.append(_seconds(record["requested"], record["ready"]))
+    if 0 < verification.codes < sum(report.finished for report in reports) - verification.links:
+        verification.missing.append("some final pages lack their completion code, or show another")
+    return verification
 
 
 def _without_marks(answers: Any) -> Any:
@@ -143,19 +143,19 @@ def _without_marks(answers: Any) -> Any:
     return {name: value for name, value in answers.items() if name not in ("passed", "tries")}
 
 
-def _look_at_answers(found: Verification, report: BotReport, folder: Path) -> None:
+def _look_at_answers(verification: Verification, report: BotReport, folder: Path) -> None:
     """Compare the stored answers to pages with the answers that the bot has sent."""
     for step, sent in report.answers.items():
-        found.answers_sent += 1
+        verification.answers_sent += 1
         stored = document(folder / "answers" / f"{step}.json").get("answers")
         if _same(stored, sent) or _same(_without_marks(stored), sent):
-            found.answers += 1
+            verification.answers += 1
         else:
-            found.missing.append(f"{report.user_id}: the answers of step {step} are not what was sent")
+            verification.missing.append(f"{report.user_id}: the answers of step {step} are not what was sent")
 
 
 def _look_at_plays(
-    found: Verification,
+    verification: Verification,
     report: BotReport,
     folder: Path,
     recordings: list[StoredRecording],
@@ -168,13 +168,13 @@ def _look_at_plays(
         who, stored = f"{report.user_id}, step {play.step}", document(folder / "answers" / f"{play.step}.json")
         answers = stored.get("answers") or {}
         if play.unmatched:
-            _look_at_unmatched(found, who, play, answers)
+            _look_at_unmatched(verification, who, play, answers)
             continue
         of_step = [recording for recording in recordings if recording.step == play.step]
-        _look_at_game(found, who, play, answers, of_step)
-        _look_for_the_cause(found, who, answers, last_error(report.user_id))
+        _look_at_game(verification, who, play, answers, of_step)
+        _look_for_the_cause(verification, who, answers, last_error(report.user_id))
         if recorded and not of_step:
-            found.missing.append(f"{who}: no recording")
+            verification.missing.append(f"{who}: no recording")
 
 
 def _recordings(trials: Path, read: dict[Path, list[StoredRecording]]) -> list[StoredRecording]:
@@ -184,49 +184,56 @@ def _recordings(trials: Path, read: dict[Path, list[StoredRecording]]) -> list[S
     return read[trials]
 
 
-def _look_at_unmatched(found: Verification, who: str, play: PlayedStep, answers: dict[str, Any]) -> None:
+def _look_at_unmatched(verification: Verification, who: str, play: PlayedStep, answers: dict[str, Any]) -> None:
     """Check that the answer of a game says that its bot was unmatched."""
-    found.games_played += 1
+    verification.games_played += 1
     if answers.get("outcome") == play.outcome:
-        found.games += 1
+        verification.games += 1
     else:
-        found.missing.append(f"{who}: the game's answer does not say {play.outcome}")
+        verification.missing.append(f"{who}: the game's answer does not say {play.outcome}")
 
 
 def _look_at_game(
-    found: Verification, who: str, play: PlayedStep, answers: dict[str, Any], recordings: list[StoredRecording]
+    verification: Verification, who: str, play: PlayedStep, answers: dict[str, Any], recordings: list[StoredRecording]
 ) -> None:
     """Compare what a bot has received of a game with its answer and its recordings."""
-    found.games_played += 1
+    verification.games_played += 1
     if not answers:
-        found.missing.append(f"{who}: the game's answer is not there")
+        verification.missing.append(f"{who}: the game's answer is not there")
         return
-    found.games += 1
+    verification.games += 1
     if play.done and (answers.get("score"), answers.get("episodes")) != (play.score, play.episodes):
-        found.missing.append(f"{who}: the score shown is not the score stored")
+        verification.missing.append(f"{who}: the score shown is not the score stored")
     if play.lines > answers.get("talk", {}).get("lines", 0):
-        found.missing.append(f"{who}: {play.lines} lines said but not all are counted")
+        verification.missing.append(f"{who}: {play.lines} lines said but not all are counted")
     if not recordings:
         return
-    steps, pictures = sum(one.steps for one in recordings), sum(one.pictures for one in recordings)
-    uncounted = [one for one in recordings if not one.counted]  # the others were counted for another member
-    found.recordings += len(uncounted)
-    found.steps += sum(one.steps for one in uncounted)
-    found.missing += [f"{who}: {one.name} is cut off" for one in uncounted if not one.complete]
+    steps, pictures = (
+        sum(recording.steps for recording in recordings),
+        sum(recording.pictures for recording in recordings),
+    )
+    uncounted = [
+        recording for recording in recordings if not recording.counted
+    ]  # the others were counted for another member
+    verification.recordings += len(uncounted)
+    verification.steps += sum(one.steps for one in uncounted)
+    verification.missing += [f"{who}: {one.name} is cut off" for one in uncounted if not one.complete]
     for one in uncounted:
         one.counted = True
     if steps < answers.get("frames", 0):
-        found.missing.append(f"{who}: {steps} steps recorded of {answers.get('frames')} played")
+        verification.missing.append(f"{who}: {steps} steps recorded of {answers.get('frames')} played")
     if pictures < play.frames:
-        found.missing.append(f"{who}: {play.frames} frames seen but {pictures} recorded")
+        verification.missing.append(f"{who}: {play.frames} frames seen but {pictures} recorded")
 
 
-def _look_for_the_cause(found: Verification, who: str, answers: dict[str, Any], error: str) -> None:
+def _look_for_the_cause(verification: Verification, who: str, answers: dict[str, Any], error: str) -> None:
     """Add the last error in the server's log to `missing`, if the game failed or has no answer."""
     if answers.get("outcome") == "failed":
-        found.missing.append(f"{who}: the game ended with an error of the agent's{f': {error}' if error else ''}")
+        verification.missing.append(
+            f"{who}: the game ended with an error of the agent's{f': {error}' if error else ''}"
+        )
     elif not answers and error:
-        found.missing.append(f"{who}: its server said last: {error}")
+        verification.missing.append(f"{who}: its server said last: {error}")
 
 
 def _same(stored: object, sent: object) -> bool:

@@ -117,7 +117,7 @@ class Route53Dns:
             try:
                 return self._send(changes)
             except ClientError as error:
-                if errors.code(error) == _NO_ZONE and all(one["Action"] == "DELETE" for one in changes):
+                if errors.code(error) == _NO_ZONE and all(change["Action"] == "DELETE" for change in changes):
                     return ""
                 if errors.code(error) not in _REFUSALS:
                     raise

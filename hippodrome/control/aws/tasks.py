@@ -121,7 +121,9 @@ class EcsTasks:
         wanted = sorted(set(interfaces))
         while wanted:
             try:
-                found = self._ec2().describe_network_interfaces(NetworkInterfaceIds=wanted)["NetworkInterfaces"]
+                network_interfaces = self._ec2().describe_network_interfaces(NetworkInterfaceIds=wanted)[
+                    "NetworkInterfaces"
+                ]
             except ClientError as error:
                 if errors.code(error) != "InvalidNetworkInterfaceID.NotFound":
                     raise
@@ -131,7 +133,9 @@ class EcsTasks:
                     raise  # the message names none of these interfaces, so a repetition would fail too
                 wanted = existing
             else:
-                public = ((i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in found)
+                public = (
+                    (i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in network_interfaces
+                )
                 return {interface: Address(host) for interface, host in public if host}
         return {}
 
@@ -141,12 +145,12 @@ class EcsTasks:
         Like all listings of ECS, it may miss a task that was run a moment ago.
         """
         try:
-            found = self._ecs().list_tasks(cluster=cluster, startedBy=name)["taskArns"]
+            task_arns = self._ecs().list_tasks(cluster=cluster, startedBy=name)["taskArns"]
         except ClientError as error:
             if errors.code(error) == "ClusterNotFoundException":
                 return None
             raise
-        return str(found[0]) if found else None
+        return str(task_arns[0]) if task_arns else None
 
     def list(self) -> Iterator[RunningTask]:
         """Yield the tasks of the installation's cluster and participants' own clusters, except those told to stop."""

@@ -61,13 +61,13 @@ def missing(folder: Path) -> list[Diagnostic]:
     check` tries the agent without them.
     """
     image = _image(folder)
-    found: dict[tuple[str, str], Diagnostic] = {}
+    diagnostics: dict[tuple[str, str], Diagnostic] = {}
     for file, line, module in _imports(folder):
         name = module.partition(".")[0]
         message, sure = _lacking(module, image)
         if message:
-            found.setdefault((file, name), Diagnostic(file, line, "", message, remark=not sure))
-    return list(found.values())
+            diagnostics.setdefault((file, name), Diagnostic(file, line, "", message, remark=not sure))
+    return list(diagnostics.values())
 
 
 def missing_for_players(folder: Path, config: Config) -> list[Diagnostic]:
@@ -77,17 +77,17 @@ def missing_for_players(folder: Path, config: Config) -> list[Diagnostic]:
     a remark instead of a mistake if it is not certain that the image lacks the package.
     """
     image, source = _image(folder), read_source(folder)
-    found: dict[str, Diagnostic] = {}
+    diagnostics: dict[str, Diagnostic] = {}
     for path, user, line in _needed_by_players(folder, config):
         name = canonicalize_name(line.partition("==")[0])
-        if name in image.held or line in found:
+        if name in image.held or line in diagnostics:
             continue
         needs, reason = f"{user} needs the package {name}", _unknown(image)
         sentence = f"{needs}, which is not in the servers' image; write {line} into {REQUIREMENTS}"
         if reason:
             sentence = f"{needs}; whether it is in the servers' image is not checked, because {reason}"
-        found[line] = source.diagnostic(path, sentence, remark=bool(reason))
-    return list(found.values())
+        diagnostics[line] = source.diagnostic(path, sentence, remark=bool(reason))
+    return list(diagnostics.values())
 
 
 def _needed_by_players(folder: Path, config: Config) -> Iterator[tuple[KeyPath, str, str]]:
@@ -274,7 +274,9 @@ def _needs(name: str) -> Sequence[Requirement] | None:
 @cache
 def _distributions() -> dict[str, list[str]]:
     """The installed distributions, by their top-level modules."""
-    return {name: list(found) for name, found in metadata.packages_distributions().items()}
+    return {
+        name: list(packages_distribution) for name, packages_distribution in metadata.packages_distributions().items()
+    }
 
 
 # What the code imports

@@ -81,7 +81,7 @@ class Config:
             "steps": [_registered(step) for step in self.steps],
             **_registered_design(self.design),
             "texts": self.project.own_texts,
-            "gamePages": {each.key: each.variants for each in self.game_pages},
+            "gamePages": {game_page.key: game_page.variants for game_page in self.game_pages},
             "trial": self.trial.registered(),
         }
 
@@ -94,8 +94,8 @@ class Config:
     def models(self) -> list[Mapping[str, Any]]:
         """The sections `llm` of the study's games, at all levels; empty if no game has a language model."""
         own = [section.trial for step in self.design.steps for section in step.sections]
-        given = (section.get("llm") for section in (self.trial.registered(), *own))
-        return [section for section in given if section]
+        llms = (section.get("llm") for section in (self.trial.registered(), *own))
+        return [section for section in llms if section]
 
     @property
     def groups(self) -> int:

@@ -456,7 +456,7 @@ class _Reader:
             )
         given = settings.get("when")
         some = given if isinstance(given, list) else [] if is_blank(given) else [given]
-        found = [self._rule(rule, (*path, "when") if "when" in settings else path) for rule in some]
+        rules = [self._rule(rule, (*path, "when") if "when" in settings else path) for rule in some]
         minutes = self._number(settings.get("minutes"), (*path, "minutes"), 1, 100_000)
         if not some and minutes is None and name not in (COMPLETE, FAILED):
             self._wrong(path, f'nobody comes to this end: write {name}: answers.consent.agree == "no", or minutes: 60')
@@ -470,7 +470,7 @@ class _Reader:
                 page = step_file(page)
             except ValueError as error:
                 self._wrong((*path, "page"), str(error))
-        return End(name, tuple(filter(None, found)), minutes, page, code, link)
+        return End(name, tuple(filter(None, rules)), minutes, page, code, link)
 
     def _number(self, given: Any, path: KeyPath, least: int, most: int, *, whole: bool = False) -> float | None:
         if is_blank(given):
@@ -527,75 +527,75 @@ def _texts(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
 # The sections of games
 
 
-def with_sections(found: Design, base: TrialSection) -> list[Step]:
+def with_sections(design: Design, base: TrialSection) -> list[Step]:
     """Return the steps, with the sections that each game has at the levels that it names.
 
     `base` is the checked section `trial` at the first levels. Mistakes are added to `found`.
     """
     steps, count = [], 0
     plain = base.document()
-    for step in found.steps:
-        sections = [*_sections(found, step, plain)] if step.type.on_server else []
+    for step in design.steps:
+        sections = [*_sections(design, step, plain)] if step.type.on_server else []
         count += len(sections)
         steps.append(msgspec.structs.replace(step, sections=tuple(section for section in sections if section.trial)))
     if count > MAX_SECTIONS:
-        found.mistakes.append(
+        design.mistakes.append(
             Mistake(STEPS, f"the games have {count} different settings in all; at most {MAX_SECTIONS}")
         )
     return steps
 
 
-def _written(found: Design, step: Step) -> dict[str, Any]:
+def _written(design: Design, step: Step) -> dict[str, Any]:
     """The section `trial` of a game as written: the study's, with the game's own keys. Its options are added."""
-    study = found.trial if isinstance(found.trial, dict) else {}
-    own = found.own_trial.get(step.key, {})
+    study = design.trial if isinstance(design.trial, dict) else {}
+    own = design.own_trial.get(step.key, {})
     options = study.get("options"), own.get("options")
     both = all(isinstance(part, dict) for part in options)
     return {**study, **own, **({"options": {**options[0], **options[1]}} if both else {})}  # type: ignore[dict-item]
 
 
-def _sections(found: Design, step: Step, plain: Mapping[str, Any]) -> Iterator[Section]:
-    block = found.blocks[step.block] if step.block is not None else None
+def _sections(design: Design, step: Step, plain: Mapping[str, Any]) -> Iterator[Section]:
+    block = design.blocks[step.block] if step.block is not None else None
     within = block.factors if block else ()
-    known = {factor.name: factor for factor in (*found.conditions, *within)}
-    everywhere = {factor.name for other in found.blocks for factor in other.factors}
-    written = _written(found, step)
+    known = {factor.name: factor for factor in (*design.conditions, *within)}
+    everywhere = {factor.name for other in design.blocks for factor in other.factors}
+    written = _written(design, step)
     if known or everywhere:
         for path, text in _texts(written, ()):
             for name in _FACTOR.findall(text):
                 if name not in known:
-                    found.mistakes.append(_unknown_factor(found, step, path, name))
+                    design.mistakes.append(_unknown_factor(design, step, path, name))
                     return
     named = [known[name] for name in known if name in named_factors(written)]
     for cell in itertools.product(*(factor.levels.items() for factor in named)):
         levels = {factor.name: name for factor, (name, _) in zip(named, cell, strict=True)}
         given = filled(written, {factor.name: value for factor, (_, value) in zip(named, cell, strict=True)})
         section, problems = check_trial(given)
-        own = found.own_trial.get(step.key, {})
+        own = design.own_trial.get(step.key, {})
         mistakes = [problem for problem in problems if problem.path[:1] and (problem.path[0] in own or named)]
         if mistakes:
             at = f" (with {', '.join(f'{name}: {level}' for name, level in levels.items())})" if levels else ""
             for path, sentence, _ in mistakes[:1]:
-                where = (*found.paths[step.key], *path) if path[0] in own else ("trial", *path)
-                found.mistakes.append(Mistake(where, f"{sentence}{at}"))
+                where = (*design.paths[step.key], *path) if path[0] in own else ("trial", *path)
+                design.mistakes.append(Mistake(where, f"{sentence}{at}"))
             return
         document = section.document()
         yield Section(levels, {key: value for key, value in document.items() if value != plain.get(key)})
 
 
-def _unknown_factor(found: Design, step: Step, path: KeyPath, name: str) -> Mistake:
+def _unknown_factor(design: Design, step: Step, path: KeyPath, name: str) -> Mistake:
     """The mistake that a text of a game names a factor that the game does not have."""
-    within = {factor.name for block in found.blocks for factor in block.factors}
-    own = path[0] in found.own_trial.get(step.key, {})
-    where = (*found.paths[step.key], *path) if own else ("trial", *path)
+    within = {factor.name for block in design.blocks for factor in block.factors}
+    own = path[0] in design.own_trial.get(step.key, {})
+    where = (*design.paths[step.key], *path) if own else ("trial", *path)
     if name in within and not own:
         key = ".".join(map(str, path))
         return Mistake(
-            found.paths[step.key],
+            design.paths[step.key],
             f"the game {step.key} takes {key} from trial, with {{{name}}}, and is outside of each: {name}; "
             f"give it {path[0]} of its own",
         )
     return Mistake(
         where,
-        f"there is no factor {name}{did_you_mean(name, [*within, *(factor.name for factor in found.conditions)])}",
+        f"there is no factor {name}{did_you_mean(name, [*within, *(factor.name for factor in design.conditions)])}",
     )

@@ -49,10 +49,10 @@ def cpu_choices() -> str:
 
 def cpu(value: object) -> float:
     """Check a number of vCPUs: Fargate must offer it. Raises ValueError with what to write instead."""
-    found = _size(value, "vcpus?")
-    if found is not None and found in SIZES:
-        return found
-    hint = f" ({found:g} CPU units are {found / 1024:g} vCPU)" if found and found / 1024 in SIZES else ""
+    size = _size(value, "vcpus?")
+    if size is not None and size in SIZES:
+        return size
+    hint = f" ({size:g} CPU units are {size / 1024:g} vCPU)" if size and size / 1024 in SIZES else ""
     raise ValueError(f"must be a number of vCPUs: {cpu_choices()}, not {show(value)}{hint}")
 
 
@@ -61,10 +61,10 @@ def memory(value: object) -> float:
 
     Whether Fargate offers it with the number of vCPUs is checked by `fits`.
     """
-    found = _size(value, "gi?b")
-    if found is not None and 0.5 <= found <= 120:
-        return found
-    hint = f" ({found:g} MB are {found / 1024:g} GB)" if found and found >= 512 else ""
+    size = _size(value, "gi?b")
+    if size is not None and 0.5 <= size <= 120:
+        return size
+    hint = f" ({size:g} MB are {size / 1024:g} GB)" if size and size >= 512 else ""
     raise ValueError(f"must be a number of GB from 0.5 to 120, not {show(value)}{hint}")
 
 

@@ -216,11 +216,11 @@ def _of_end_pages(folder: Path, checked: Checked) -> Iterator[Mistake]:
 
 def _game_pages(folder: Path, checked: Checked, steps: list[StepFiles]) -> tuple[list[StepFiles], list[Mistake]]:
     """The pages that the game page shows, with their files, and the mistakes in files."""
-    found: list[StepFiles] = []
+    step_files: list[StepFiles] = []
     mistakes: list[Mistake] = []
     for key, page in checked.trial.pages.items() if any(step.type.on_server for step in steps) else ():
         try:
-            found.append(StepFiles(key, page, *open_folder(folder).find(page)))
+            step_files.append(StepFiles(key, page, *open_folder(folder).find(page)))
         except StepFileError as error:
             mistakes.append(Mistake(("trial", key), str(error)))
-    return found, mistakes
+    return step_files, mistakes

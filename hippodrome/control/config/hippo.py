@@ -169,10 +169,10 @@ def _page_names(adapted: Adapted) -> None:
 
 def _steps(adapted: Adapted) -> None:
     """Drops steps that HIPPO never shows, and numbers the others 1, 2, 3 …"""
-    given = adapted.section(STEPS)
-    if not given or not all(_is_page(page) for page in given.values()):
+    section = adapted.section(STEPS)
+    if not section or not all(_is_page(page) for page in section.values()):
         return
-    if all(is_blank(page) for page in given.values()):
+    if all(is_blank(page) for page in section.values()):
         _put_steps(adapted, {"1": "game", FINAL: CLOSING_PAGE}, {})
         text = (
             "no step has a page: participants play the game and then see a page that says that it is over; name pages "
@@ -180,18 +180,18 @@ def _steps(adapted: Adapted) -> None:
         )
         adapted.remark(STEPS, text)
         return
-    _drop_steps(adapted, [key for key in given if key.isdecimal() and int(key) == 0], "never shown, as in HIPPO Gym")
-    numbers = sorted((key for key in given if key.isdecimal() and len(key) < 4), key=int)
+    _drop_steps(adapted, [key for key in section if key.isdecimal() and int(key) == 0], "never shown, as in HIPPO Gym")
+    numbers = sorted((key for key in section if key.isdecimal() and len(key) < 4), key=int)
     if len(numbers) == int(numbers[-1] if numbers else 0):  # if a number is missing, another key may be its misspelling
-        others = [key for key in given if key != FINAL and not key.isdecimal() and not _like_final(key)]
+        others = [key for key in section if key != FINAL and not key.isdecimal() and not _like_final(key)]
         _drop_steps(adapted, others, f"never shown, as in HIPPO Gym; steps are called 1, 2, 3 … and {FINAL}")
-    without = [key for key in numbers if is_blank(given[key])]
+    without = [key for key in numbers if is_blank(section[key])]
     rest = [key for key in numbers if key not in without]
-    if not rest and not is_blank(given.get(FINAL)):
-        _put_steps(adapted, {"1": given[FINAL]}, {"1": FINAL})
+    if not rest and not is_blank(section.get(FINAL)):
+        _put_steps(adapted, {"1": section[FINAL]}, {"1": FINAL})
         adapted.remark((*STEPS, FINAL), "the study has this page only")
     elif without and len(numbers) == int(numbers[-1]):  # if a number is missing, the check reports it
-        unplayed = "game" not in given.values() and not is_blank(adapted.at(("trial", "game")))
+        unplayed = "game" not in section.values() and not is_blank(adapted.at(("trial", "game")))
         more = "; no step is game, so no participant plays: if this one is to be, write game" if unplayed else ""
         for key in without:
             adapted.remark((*STEPS, key), f"has no page: participants go on to the next step{more}")
@@ -215,13 +215,13 @@ def _drop_steps(adapted: Adapted, keys: Iterable[str], why: str) -> None:
 
 def _renumber(adapted: Adapted, with_page: list[str], before: list[str]) -> None:
     """Number the steps in `with_page` without gaps, also in `events`. `before` are all numbered steps."""
-    given = adapted.section(STEPS)
+    section = adapted.section(STEPS)
     now = {key: str(number) for number, key in enumerate(with_page, 1)}
     moved = [key for key in with_page if now[key] != key]
     if moved:
         adapted.remark((*STEPS, moved[0]), f"counts as step {now[moved[0]]}, since one before it has no page")
-    final = {FINAL: given[FINAL]} if not is_blank(given.get(FINAL)) else {}
-    _put_steps(adapted, {now[key]: given[key] for key in with_page} | final, {now[key]: key for key in moved})
+    final = {FINAL: section[FINAL]} if not is_blank(section.get(FINAL)) else {}
+    _put_steps(adapted, {now[key]: section[key] for key in with_page} | final, {now[key]: key for key in moved})
     events = adapted.section(("project", "events"))
     for event in ("startServerStep", "stopServerStep"):
         named = number_in(events.get(event))
@@ -340,8 +340,8 @@ def _instructions(adapted: Adapted) -> None:
 
 def _unknown(adapted: Adapted) -> None:
     """Removes unknown keys, or gives them to the agent. Typing errors and misplaced keys stay, for the check."""
-    for section, known in NAMES.items():
-        for key in [key for key in adapted.section(section) if key not in known]:
+    for section, name in NAMES.items():
+        for key in [key for key in adapted.section(section) if key not in name]:
             path = (*section, key)
             if path == ("trial", RATE_CHANGE_MISSPELT) or _is_mistake(adapted, path):
                 continue

@@ -33,8 +33,8 @@ def adapt(text: str, label: str, present: Iterable[str]) -> tuple[str, list[Diag
     in_image = {canonicalize_name(name) for name in present}
     lines, replaced, already_there = [], [], []
     for line in text.splitlines():
-        found = _NAME.fullmatch(line)
-        name = canonicalize_name(found["name"]) if found else ""
+        match = _NAME.fullmatch(line)
+        name = canonicalize_name(match["name"]) if match else ""
         lines.append("" if name in _REPLACED or name in in_image else line)
         if name in _REPLACED:
             replaced.append(f"{name} ({_REPLACED[name]})")

@@ -123,12 +123,12 @@ def page_origin(value: object) -> str:
 
 def step_key(value: object) -> str:
     """Check a key of `steps`: a number from 1, or finalStep."""
-    found = value.text if isinstance(value, Plain) else value
-    if isinstance(found, str) and (found == FINAL or (_STEP_NUMBER.fullmatch(found) and int(found) <= MAX_STEPS)):
-        return found
-    if isinstance(found, str) and found.lower().replace("_", "") == FINAL.lower():
+    text = value.text if isinstance(value, Plain) else value
+    if isinstance(text, str) and (text == FINAL or (_STEP_NUMBER.fullmatch(text) and int(text) <= MAX_STEPS)):
+        return text
+    if isinstance(text, str) and text.lower().replace("_", "") == FINAL.lower():
         raise ValueError(f"write {FINAL}")
-    if isinstance(found, str) and found.isdecimal() and len(found) < 18 and int(found) > MAX_STEPS:
+    if isinstance(text, str) and text.isdecimal() and len(text) < 18 and int(text) > MAX_STEPS:
         raise ValueError(f"a project has at most {MAX_STEPS} steps")
     raise ValueError(f"a step's key is 1, 2, 3 … or {FINAL}")
 

@@ -136,8 +136,8 @@ def _names_a_certificate(config: Config) -> bool:
 
 def without_observations(source: ConfigSource, config: Config) -> Iterator[Remark]:
     """Yield a remark if a project of HIPPO's layout has no `recordObservations`: HIPPO saved observations."""
-    given = source.names(("trial", "recordObservations"))
-    if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not given:
+    names = source.names(("trial", "recordObservations"))
+    if source.layout.of_hippo and config.game_steps and config.trial.s3upload and not names:
         message = "recordObservations is not given: recordings hold no observations, which HIPPO Gym saved"
         yield Remark(("trial",), f"{message}; write recordObservations: true to have them, or false")
 

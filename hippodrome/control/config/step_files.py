@@ -53,7 +53,7 @@ class StepFolder:
 
     def _groups(self, page: str) -> set[int]:
         pattern = re.compile(re.escape(page) + r"-(0|[1-9][0-9]{0,5})\.html")
-        return {int(found[1]) for name in self.names if (found := pattern.fullmatch(name))}
+        return {int(match[1]) for name in self.names if (match := pattern.fullmatch(name))}
 
     def _nearest(self, wanted: str) -> str:
         """The end of the message about a missing page: the page that was probably meant, as config.yml names it."""

@@ -28,13 +28,13 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
         elif wrong := [found for found in _BRACES.findall(text) if found[1:-1] not in places(ENGLISH[name])]:
             yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")
-        elif left := re.search("[{}]", _BRACES.sub("", text)):
-            yield Mistake((*TEXTS, name), f"participants would read {left[0]}, a brace too many; {_known(name)}")
+        elif match := re.search("[{}]", _BRACES.sub("", text)):
+            yield Mistake((*TEXTS, name), f"participants would read {match[0]}, a brace too many; {_known(name)}")
 
 
 def _known(name: str) -> str:
     """A clause that names the placeholders which this text may have."""
-    known = [f"{{{found}}}" for found in places(ENGLISH[name])]
+    known = [f"{{{place}}}" for place in places(ENGLISH[name])]
     if not known:
         return "this text has no placeholders"
     *first, last = known
@@ -44,8 +44,8 @@ def _known(name: str) -> str:
 def shown_as_they_are(config: Config) -> Iterator[Remark]:
     """Yield remarks on texts with HTML or quotation marks, which participants would read as characters."""
     for name, text in config.project.own_texts.items():
-        if found := _HTML.search(text):
-            yield Remark((*TEXTS, name), f"participants read {found[0]} as it stands here: a text is no HTML")
+        if match := _HTML.search(text):
+            yield Remark((*TEXTS, name), f"participants read {match[0]} as it stands here: a text is no HTML")
         elif _QUOTED.fullmatch(text):
             message = f'participants read the quotation marks, too; YAML\'s own are "…", not {text[0]}…{text[-1]}'
             yield Remark((*TEXTS, name), message)
@@ -55,7 +55,7 @@ def left_in_english(config: Config) -> Iterator[Remark]:
     """Yield a remark if the study names another language, in `texts` or a page, and leaves texts in English."""
     own = config.project.own_texts
     pages = [file.read_text(encoding="utf-8", errors="replace") for step in config.steps for file in step.files]
-    languages = [found[1] for page in pages if (found := _PAGE_LANGUAGE.search(page))]
+    languages = [match[1] for page in pages if (match := _PAGE_LANGUAGE.search(page))]
     has_chat = config.trial.registered().get("chat") is not None
     needed = texts_of(has_game=bool(config.game_steps), has_sessions=config.project.has_sessions, has_chat=has_chat)
     yield from _left(own, languages, needed)
@@ -64,7 +64,7 @@ def left_in_english(config: Config) -> Iterator[Remark]:
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
     """The remark on a study that names another language, and does not translate all texts that it needs."""
     named = own.get(LANGUAGE)
-    foreign = [each for each in (named, *languages) if each and not _is_english(each)]
+    foreign = [language for language in (named, *languages) if language and not _is_english(language)]
     if not foreign or (named and _is_english(named)):
         return
     missing = [name for name in needed if name not in own or _is_untouched(name, own[name])]

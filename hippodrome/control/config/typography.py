@@ -46,11 +46,11 @@ def in_line(line: str) -> str:
 
 
 def _of_space(text: str) -> str:
-    found = _INVISIBLE.search(text)
-    if found is None:
+    match = _INVISIBLE.search(text)
+    if match is None:
         return ""
-    name = unicodedata.name(found[0]).lower()
-    return f"an invisible character stands here, U+{ord(found[0]):04X} ({name}); delete it, or write a plain space"
+    name = unicodedata.name(match[0]).lower()
+    return f"an invisible character stands here, U+{ord(match[0]):04X} ({name}); delete it, or write a plain space"
 
 
 def _of_quotes(text: str) -> str:

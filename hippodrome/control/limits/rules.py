@@ -135,8 +135,8 @@ class ServerSlots(Record, frozen=True):
         If an earlier attempt's slot is still held, this attempt takes it over.
         """
         mine = self.slots.get(server.label)
-        wanted = ServerSlot(server.attempt, seconds_reserved(server), server.is_warm_server)
-        if mine == wanted:
+        server_slot = ServerSlot(server.attempt, seconds_reserved(server), server.is_warm_server)
+        if mine == server_slot:
             return self
         others = {label: held for label, held in self.slots.items() if label != server.label}
         before_it = [held for held in others.values() if server.is_warm_server or not held.is_warm_server]
@@ -145,9 +145,9 @@ class ServerSlots(Record, frozen=True):
         if mine is None and project.max_servers is not None and len(before_it) >= project.max_servers:
             return None
         hours = project.max_server_hours
-        if hours is not None and used + sum(h.reserved for h in before_it) + wanted.reserved > hours * 3600:
+        if hours is not None and used + sum(h.reserved for h in before_it) + server_slot.reserved > hours * 3600:
             return None
-        return ServerSlots({**others, server.label: wanted}, used)
+        return ServerSlots({**others, server.label: server_slot}, used)
 
     def free_slots(self, project: Project, seconds: int) -> int | None:
         """Return how many more servers that reserve `seconds` each would get a slot.

@@ -105,15 +105,15 @@ class Slots:
     def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:
         """By key, the record in every document of participants' slots; None if it cannot be read."""
         shards = {limits.participant_slots_key(project_id, shard) for shard in range(SHARDS)}
-        found: dict[str, ParticipantSlots | None] = {}
+        participant_slots: dict[str, ParticipantSlots | None] = {}
         for entry in self._platform.documents.list(limits.participant_slots_folder(project_id)):
             if entry.key in shards:
                 try:
-                    found[entry.key] = self._shared.read(entry.key, ParticipantSlots)
+                    participant_slots[entry.key] = self._shared.read(entry.key, ParticipantSlots)
                 except ValueError as error:
                     failure("participants' slots cannot be read", error, project=project_id)
-                    found[entry.key] = None
-        return found
+                    participant_slots[entry.key] = None
+        return participant_slots
 
     def release_participant(self, project_id: str, user_id: str) -> None:
         """Release the slot of a participant whose data are erased."""

@@ -122,27 +122,29 @@ class Decisions(Record, frozen=True):
         """Return the labels of all participants in the document."""
         return frozenset(
             [
-                *(label for each in self.proposed for label in each.labels),
+                *(label for proposal in self.proposed for label in proposal.labels),
                 *self.labels_formed(),
-                *(each.label for each in self.unmatched),
+                *(member.label for member in self.unmatched),
             ]
         )
 
     def labels_formed(self) -> frozenset[str]:
         """Return the labels of the members of all formed sessions in the document."""
-        return frozenset(member.label for each in self.formed for member in each.members)
+        return frozenset(member.label for session in self.formed for member in session.members)
 
     def proposal_of(self, label: str) -> Proposal | None:
         """Return the proposal with this participant; None if there is none."""
-        return next((each for each in self.proposed if label in each.labels), None)
+        return next((proposal for proposal in self.proposed if label in proposal.labels), None)
 
     def formed_of(self, label: str) -> Formed | None:
         """Return the formed session with this participant; None if there is none."""
-        return next((each for each in self.formed if any(member.label == label for member in each.members)), None)
+        return next(
+            (session for session in self.formed if any(member.label == label for member in session.members)), None
+        )
 
     def unmatched_of(self, label: str) -> Unmatched | None:
         """Return the entry which says that this participant is unmatched; None if there is none."""
-        return next((each for each in self.unmatched if each.label == label), None)
+        return next((member for member in self.unmatched if member.label == label), None)
 
     def is_decided(self, label: str) -> bool:
         """Return whether the participant is unmatched, or a member of a session that has its server for good."""
@@ -156,20 +158,20 @@ class Decisions(Record, frozen=True):
 
     def without_server(self) -> list[Formed]:
         """Return the formed sessions that wait for a server, in the order in which they were formed."""
-        return sorted((each for each in self.formed if each.waits_for), key=lambda each: each.at)
+        return sorted((session for session in self.formed if session.waits_for), key=lambda each: each.at)
 
     def for_good(self) -> Decisions:
         """Return the part of the document that is decided for good.
 
         These are the sessions that have their server, and the unmatched participants.
         """
-        has_server = tuple(each for each in self.formed if each.waits_for is None)
+        has_server = tuple(session for session in self.formed if session.waits_for is None)
         return Decisions(formed=has_server, unmatched=self.unmatched)
 
     def session_ids(self) -> frozenset[str]:
         """Return the ids of all sessions in the document that may have a server."""
-        proposed = (each.session_id for each in self.proposed if each.ahead)
-        return frozenset([*(each.id for each in self.open), *proposed, *(each.id for each in self.formed)])
+        proposed = (proposal.session_id for proposal in self.proposed if proposal.ahead)
+        return frozenset([*(server.id for server in self.open), *proposed, *(session.id for session in self.formed)])
 
 
 def key(project_id: str) -> str:
@@ -184,4 +186,4 @@ def next_version(before: Decisions, after: Decisions) -> Decisions:
 
 def by_age(sessions: Iterable[OpenSession]) -> tuple[OpenSession, ...]:
     """Return these open sessions in the order in which their servers were requested. The first is used first."""
-    return tuple(sorted(sessions, key=lambda each: (each.requested, each.id)))
+    return tuple(sorted(sessions, key=lambda session: (session.requested, session.id)))

@@ -90,10 +90,10 @@ class Entries:
     keys: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # by label: the keys of the participant's entries
     outdated: tuple[str, ...] = ()  # the keys of old entries, which may be deleted
 
-    def with_waiting(self, one: Waiting) -> Entries:
+    def with_waiting(self, waiting: Waiting) -> Entries:
         """Return the listing with this participant, who waits now, added."""
-        left = {label: each for label, each in self.left.items() if label != one.label}
-        return replace(self, waiting={**self.waiting, one.label: one}, left=left)
+        left = {label: each for label, each in self.left.items() if label != waiting.label}
+        return replace(self, waiting={**self.waiting, waiting.label: waiting}, left=left)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
         """Return the listing with this confirmation, which has just been written, added."""
@@ -109,7 +109,7 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
     prefix = folder(project_id)
     waiting: dict[str, Waiting] = {}
     confirmed: dict[str, set[str]] = {}
-    left: dict[str, Departure] = {}
+    departures: dict[str, Departure] = {}
     under_way: set[str] = set()
     keys: dict[str, list[str]] = {}
     outdated: list[str] = []
@@ -119,11 +119,11 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
         if is_done := _DONE.fullmatch(name):
             done.add(is_done[1])
             continue
-        found = _NAME.fullmatch(name)
-        if found is None:
+        match = _NAME.fullmatch(name)
+        if match is None:
             continue
         age = now - entry.modified
-        label, is_way, kind, text, joined, trait = found.groups()
+        label, is_way, kind, text, joined, trait = match.groups()
         if age >= (way if is_way else DELETED):
             outdated.append(entry.key)
             continue
@@ -133,14 +133,14 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
         elif kind == "yes" and is_session_id(text):  # a proposal's id has the form of a session's
             confirmed.setdefault(text, set()).add(label)
         elif kind == "left" and text.isdecimal():
-            left[label] = Departure(int(text), entry.modified)
+            departures[label] = Departure(int(text), entry.modified)
         elif joined and age <= REMEMBERED:
             one = Waiting(label, int(joined), trait, entry.modified)
             waiting[label] = _earlier(waiting[label], one) if label in waiting else one
     return Entries(
-        waiting={label: one for label, one in waiting.items() if label not in left},
+        waiting={label: person for label, person in waiting.items() if label not in departures},
         confirmed={sid: frozenset(labels) for sid, labels in confirmed.items()},
-        left=left,
+        left=departures,
         under_way=frozenset(under_way),
         done=frozenset(done),
         keys={label: tuple(found) for label, found in keys.items()},
@@ -148,10 +148,10 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
     )
 
 
-def _earlier(one: Waiting, other: Waiting) -> Waiting:
+def _earlier(waiting: Waiting, other: Waiting) -> Waiting:
     """Join the two entries of a participant who opened two pages at once: the earlier `joined`, the later `seen`."""
-    first = min(one, other, key=lambda each: each.joined)
-    return replace(first, seen=max(one.seen, other.seen))
+    first = min(waiting, other, key=lambda each: each.joined)
+    return replace(first, seen=max(waiting.seen, other.seen))
 
 
 def folder(project_id: str) -> str:
@@ -164,9 +164,9 @@ def prefix_of(project_id: str, label: str) -> str:
     return f"{folder(project_id)}{label}."
 
 
-def waiting_key(project_id: str, one: Waiting) -> str:
+def waiting_key(project_id: str, waiting: Waiting) -> str:
     """Return the key of the entry which says that this participant waits."""
-    return f"{prefix_of(project_id, one.label)}{one.joined:013}.{one.trait}"
+    return f"{prefix_of(project_id, waiting.label)}{waiting.joined:013}.{waiting.trait}"
 
 
 def confirmation_key(project_id: str, label: str, proposal_id: str) -> str:
@@ -205,10 +205,10 @@ def seconds_since(joined: int, now: datetime) -> float:
 def read_body(body: bytes) -> WaitingDocument | None:
     """Read the content of the entry which says that a participant waits; None if it cannot be read."""
     try:
-        found = from_json(body, WaitingDocument)
+        waiting_document = from_json(body, WaitingDocument)
     except ValueError:
         return None
-    return found if ids.is_user_id(found.user_id) else None
+    return waiting_document if ids.is_user_id(waiting_document.user_id) else None
 
 
 def body(document: WaitingDocument) -> bytes:

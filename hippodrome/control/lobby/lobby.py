@@ -251,24 +251,24 @@ class Lobby:
         return LobbyState(here, seconds, is_proposed)
 
     def _begin_to_wait(
-        self, project: Project, known: Decisions, after: Decisions, entries: Entries, servers: StartedAhead
+        self, project: Project, decisions: Decisions, after: Decisions, entries: Entries, servers: StartedAhead
     ) -> None:
         """Delete the entries of members whose sessions were formed by this run and wait for a server.
 
         If such a server has no record, its start message may be lost, and is sent again.
         """
-        fresh = [each for each in after.without_server() if known.labels_formed().isdisjoint(each.labels)]
-        self._store.delete(key for each in fresh for label in each.labels for key in entries.keys.get(label, ()))
+        fresh = [each for each in after.without_server() if decisions.labels_formed().isdisjoint(each.labels)]
+        self._store.delete(key for session in fresh for label in session.labels for key in entries.keys.get(label, ()))
         for each in fresh:
             if servers.records.get(each.id, ...) is None:
                 self._store.start_server(project, each.id, each.players)
 
     def _wait_for_server(
-        self, project: Project, me: _Asker, known: Decisions, formed: Formed
+        self, project: Project, me: _Asker, decisions: Decisions, formed: Formed
     ) -> NoServerYet | Membership:
         """One run, for a member of a formed session that waits for a server. The members' entries are deleted."""
-        now, before = self._platform.now(), known
-        servers = self._lookups.servers(project, known, me.label, ())
+        now, before = self._platform.now(), decisions
+        servers = self._lookups.servers(project, decisions, me.label, ())
         open_for = sessions.open_for(project, self._platform.settings)
 
         def settle(document: Decisions) -> Decisions:
@@ -276,33 +276,33 @@ class Lobby:
             before = document
             return servers.given(document, now, open_for)
 
-        if settle(known) is known:  # the usual case: nothing changes
+        if settle(decisions) is decisions:  # the usual case: nothing changes
             return _no_server_yet(formed, servers)
-        after = self._change(project, known, settle)
-        made = self._store.carry_out(project, _due(me.label, known, before, after), Entries())
+        after = self._change(project, decisions, settle)
+        made = self._store.carry_out(project, _due(me.label, decisions, before, after), Entries())
         if me.label in made:
             return made[me.label]
         return _no_server_yet(after.formed_of(me.label) or formed, servers)
 
-    def _change(self, project: Project, known: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
+    def _change(self, project: Project, decisions: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
         """Change the document; return `known` if others change it all the time. The next request then decides."""
         try:
             return self._store.change(project, settle)
         except RetryLater:
             logger.info("the lobby's document keeps changing", extra={"project": project.id})
-            return known
+            return decisions
 
     def _write_entry(self, project: Project, me: _Asker, entries: Entries) -> Entries:
         """Write the participant's entry, at most once in `SEEN_ANEW`; return `entries` with it."""
-        now, found, left = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
-        if found is not None and now - found.seen < SEEN_ANEW:
+        now, waiting, left = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
+        if waiting is not None and now - waiting.seen < SEEN_ANEW:
             return entries
-        if found is None:
+        if waiting is None:
             is_back = left is not None and now - left.at < lobby_entries.PRESENT
             joined = left.joined if left is not None and is_back else lobby_entries.milliseconds(now)
             answers = me.answers() if field_of(project.matching) is not None else {}
-            found = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
-        one = Waiting(found.label, found.joined, found.trait, now)
+            waiting = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
+        one = Waiting(waiting.label, waiting.joined, waiting.trait, now)
         own_key = lobby_entries.waiting_key(project.id, one)
         self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != own_key and ".yes." not in key)
@@ -337,5 +337,5 @@ def _due(label: str, known: Decisions, before: Decisions, after: Decisions) -> D
     """
     own = after.decided_for(label) if known.is_decided(label) or not before.is_decided(label) else Decisions()
     waited = {each.labels for each in before.without_server()}
-    given = [each for each in after.for_good().formed if each.labels in waited and each not in own.formed]
+    given = [session for session in after.for_good().formed if session.labels in waited and session not in own.formed]
     return Decisions(formed=(*own.formed, *given), unmatched=own.unmatched)

@@ -38,7 +38,7 @@ class Lookups:
     def run(
         self,
         project: Project,
-        known: Decisions,
+        decisions: Decisions,
         entries: Entries,
         proposals: Sequence[Proposal],
         *,
@@ -51,37 +51,43 @@ class Lookups:
         """
         members, broken = self._members(project, proposals, entries)
         now, open_for = self._platform.now(), sessions.open_for(project, self._platform.settings)
-        return LobbyRun(project, known, entries, members, broken, now, open_for, servers, chosen)
+        return LobbyRun(project, decisions, entries, members, broken, now, open_for, servers, chosen)
 
-    def proposals_to_form(self, known: Decisions, entries: Entries, label: str) -> list[Proposal]:
+    def proposals_to_form(self, decisions: Decisions, entries: Entries, label: str) -> list[Proposal]:
         """Return the confirmed proposals that this participant's request forms.
 
         These are their own, and some that have waited for long: in a crowd more participants come than the document
         takes writes, so one write decides on several sessions.
         """
         now = self._platform.now()
-        confirmed = rules.confirmed(known, entries)
-        own = [each for each in confirmed if label in each.labels]
-        late = [each for each in confirmed if label not in each.labels and now - each.at > FORMED_LATE]
+        confirmed = rules.confirmed(decisions, entries)
+        own = [proposal for proposal in confirmed if label in proposal.labels]
+        late = [proposal for proposal in confirmed if label not in proposal.labels and now - proposal.at > FORMED_LATE]
         return [*own, *late[:FORMED_AT_ONCE]]
 
     # Servers that were started ahead
 
-    def servers(self, project: Project, known: Decisions, label: str, proposals: Sequence[Proposal]) -> StartedAhead:
+    def servers(
+        self, project: Project, decisions: Decisions, label: str, proposals: Sequence[Proposal]
+    ) -> StartedAhead:
         """Read the records of the servers that this participant's request may give to sessions.
 
         The result is empty unless the participant's session (formed, or one of `proposals`) waits for a server that was
         started ahead. Then it has the record of that server, and the records of open sessions' servers: of some
         (`LOOKED_AT`) if no other session has waited for longer, of more (`LOOKED_AT_IN_NEED`) if that server has ended.
         """
-        formed = known.formed_of(label)
-        own = formed.waits_for if formed else next((each.ahead for each in proposals if label in each.labels), None)
+        formed = decisions.formed_of(label)
+        own = (
+            formed.waits_for
+            if formed
+            else next((proposal.ahead for proposal in proposals if label in proposal.labels), None)
+        )
         if own is None:
             return StartedAhead({})
-        waiting, now = known.without_server(), self._platform.now()
+        waiting, now = decisions.without_server(), self._platform.now()
         is_first = not waiting or waiting[0] is formed
         open_for = sessions.open_for(project, self._platform.settings)
-        usable = [each.id for each in known.open if each.is_usable(own.players, now, open_for)]
+        usable = [server.id for server in decisions.open if server.is_usable(own.players, now, open_for)]
         some = usable[:LOOKED_AT] if is_first else []
         found = self._records(project, [own.id, *some])
         if own.id in found.over:
@@ -90,7 +96,7 @@ class Lookups:
         return found
 
     def _records(self, project: Project, session_ids: Sequence[str]) -> StartedAhead:
-        acts = [partial(self._server, project, each) for each in session_ids]
+        acts = [partial(self._server, project, session_id) for session_id in session_ids]
         return StartedAhead(dict(zip(session_ids, self._platform.run_all(acts), strict=True)))
 
     def _server(self, project: Project, session_id: str) -> Server | None:
@@ -112,9 +118,9 @@ class Lookups:
         have brought them back into the lobby), or if the project has been registered with another number of players
         since it was proposed. A proposal with a member who cannot be read is in neither: the next run reads again.
         """
-        waiting = [entries.waiting[label] for each in proposals for label in each.labels]
-        looked = self._platform.run_all([partial(self._member, project, one) for one in waiting])
-        found = {one.label: member for one, member in zip(waiting, looked, strict=True)}
+        waiting = [entries.waiting[label] for proposal in proposals for label in proposal.labels]
+        looked = self._platform.run_all([partial(self._member, project, person) for person in waiting])
+        found = {person.label: member for person, member in zip(waiting, looked, strict=True)}
         members, broken = {}, []
         for each in proposals:
             known = [found[label] for label in each.labels]
@@ -127,12 +133,12 @@ class Lookups:
                 broken.append(each.id)
         return members, broken
 
-    def _member(self, project: Project, one: Waiting) -> Matched | Exception | None:
+    def _member(self, project: Project, waiting: Waiting) -> Matched | Exception | None:
         """The participant who waits, as a member; None if they have left or have a membership; the error of a read."""
         try:
-            found = self._platform.documents.get(lobby_entries.waiting_key(project.id, one))
+            found = self._platform.documents.get(lobby_entries.waiting_key(project.id, waiting))
             written = lobby_entries.read_body(found.body) if found else None
-            if written is None or ids.server_label(project.id, written.user_id) != one.label:
+            if written is None or ids.server_label(project.id, written.user_id) != waiting.label:
                 return None
             membership = self._repository.membership(project.id, written.user_id)
         except Exception as error:  # noqa: BLE001 - `run_all` takes functions that do not raise
@@ -141,5 +147,8 @@ class Lookups:
         if membership:
             return None
         return Matched(
-            one.label, written.user_id, written.group, lobby_entries.seconds_since(one.joined, self._platform.now())
+            waiting.label,
+            written.user_id,
+            written.group,
+            lobby_entries.seconds_since(waiting.joined, self._platform.now()),
         )

@@ -50,8 +50,8 @@ class Matcher:
         question = self._read(key, project)
         answer = self._answer(project, question)
         free = rules.free(document, entries, now)
-        labels = {one.label for one in free}
-        chosen = [each for each in answer.sessions if labels.issuperset(each)] if answer else []
+        labels = {person.label for person in free}
+        chosen = [session for session in answer.sessions if labels.issuperset(session)] if answer else []
         matched = {one for each in chosen for one in each}
         new: Candidate | None = None
         if label in entries.waiting and label not in question.candidates() and not questions.is_full(question):

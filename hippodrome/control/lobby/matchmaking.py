@@ -31,9 +31,11 @@ def choose(
     `free` are the participants who are in no session, in the order of arrival. `chosen` are the sessions that the
     function `match` has chosen, each as its members' labels.
     """
-    over = [one for one in free if patience_is_over(one.joined, project, now)]
+    over = [person for person in free if patience_is_over(person.joined, project, now)]
     with_policies = project.after_patience == "policies"
-    candidates = free if with_policies else [one for one in free if not patience_is_over(one.joined, project, now)]
+    candidates = (
+        free if with_policies else [person for person in free if not patience_is_over(person.joined, project, now)]
+    )
     if project.asks_match:
         sessions = _of_match(candidates, project, chosen)
     elif traits.together(project):
@@ -48,20 +50,20 @@ def choose(
 
 def _of_match(free: Sequence[Waiting], project: Project, chosen: Sequence[Sequence[str]]) -> list[Sequence[Waiting]]:
     """The chosen sessions that have `players` different members, all of whom are free."""
-    waiting = {one.label: one for one in free}
+    waiting = {person.label: person for person in free}
     sessions: list[Sequence[Waiting]] = []
     for labels in chosen:
         if len(set(labels)) == project.players and all(label in waiting for label in labels):
             members = [waiting.pop(label) for label in dict.fromkeys(labels)]
-            sessions.append(members if project.seats == "match" else sorted(members, key=lambda one: one.order))
+            sessions.append(members if project.seats == "match" else sorted(members, key=lambda member: member.order))
     return sessions
 
 
 def _of_one_trait(free: Sequence[Waiting], players: int) -> list[Sequence[Waiting]]:
     """Full sessions, each of one trait, in the order of arrival."""
     by_trait: dict[str, list[Waiting]] = {}
-    for one in free:
-        by_trait.setdefault(one.trait, []).append(one)
+    for person in free:
+        by_trait.setdefault(person.trait, []).append(person)
     sessions = [
         found[start : start + players]
         for found in by_trait.values()
@@ -74,8 +76,8 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
     """Full sessions, in the order of arrival. In none of them is a trait more often than it may be."""
     most = traits.most_of_one(project)
     by_trait: dict[str, deque[Waiting]] = {}
-    for one in free:
-        by_trait.setdefault(one.trait, deque()).append(one)
+    for person in free:
+        by_trait.setdefault(person.trait, deque()).append(person)
     heads = [(found[0].order, trait) for trait, found in by_trait.items()]  # in the order of arrival, so it is a heap
     while heads:
         members: list[Waiting] = []
@@ -91,7 +93,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
                 heapq.heappush(heads, (by_trait[trait][0].order, trait))
         if len(members) < project.players:
             return
-        yield sorted(members, key=lambda one: one.order)
+        yield sorted(members, key=lambda member: member.order)
         for trait in spent:
             if by_trait[trait]:
                 heapq.heappush(heads, (by_trait[trait][0].order, trait))
@@ -101,28 +103,28 @@ def _short_sessions(
     free: Sequence[Waiting], over: Sequence[Waiting], sessions: Iterable[Sequence[Waiting]], project: Project
 ) -> list[Sequence[Waiting]]:
     """A session for each participant in `over` without one, at most `PROPOSED_AT_ONCE`: with free ones, or alone."""
-    taken = {one.label for members in sessions for one in members}
+    labels = {member.label for members in sessions for member in members}
     found: list[Sequence[Waiting]] = []
-    for one in over:
-        if one.label in taken or len(found) == PROPOSED_AT_ONCE:
+    for person in over:
+        if person.label in labels or len(found) == PROPOSED_AT_ONCE:
             continue
-        members = around(one, [other for other in free if other.label not in taken], project)
-        taken |= {member.label for member in members}
+        members = around(person, [other for other in free if other.label not in labels], project)
+        labels |= {member.label for member in members}
         found.append(members)
     return found
 
 
-def around(one: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
+def around(waiting: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:
     """Return this participant and others who may play with them, in the order of arrival.
 
     There are at most `players`, and fewer if not enough fit.
     """
-    members, most = [one], None if traits.together(project) else traits.most_of_one(project)
+    members, most = [waiting], None if traits.together(project) else traits.most_of_one(project)
     for other in free:
         if len(members) == project.players:
             break
         same = sum(other.trait == member.trait for member in members)
-        fits = other.trait == one.trait if most is None else same < most
-        if other.label != one.label and fits:
+        fits = other.trait == waiting.trait if most is None else same < most
+        if other.label != waiting.label and fits:
             members.append(other)
-    return sorted(members, key=lambda each: each.order)
+    return sorted(members, key=lambda member: member.order)

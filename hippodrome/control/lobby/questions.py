@@ -53,7 +53,7 @@ class Question(Record, frozen=True):
 
     def candidates(self) -> dict[str, Candidate]:
         """Return all participants in the document, in the question or in `came`, by label."""
-        return {each.id: each for each in (*self.waiting, *self.came)}
+        return {person.id: person for person in (*self.waiting, *self.came)}
 
 
 class _Groups(msgspec.Struct, frozen=True):
@@ -74,14 +74,14 @@ def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candida
     return found if len(to_json(found)) <= MAX_ANSWERS else Candidate(label, group=group)
 
 
-def with_candidate(question: Question, one: Candidate) -> Question:
+def with_candidate(question: Question, candidate: Candidate) -> Question:
     """Return the document with this participant added to `came`, for the next question.
 
     It is unchanged if the participant is in the document, or if `came` has `MAX_CAME` participants already.
     """
-    if one.id in question.candidates() or is_full(question):
+    if candidate.id in question.candidates() or is_full(question):
         return question
-    return msgspec.structs.replace(question, came=(*question.came, one))
+    return msgspec.structs.replace(question, came=(*question.came, candidate))
 
 
 def is_full(question: Question) -> bool:
@@ -92,14 +92,14 @@ def is_full(question: Question) -> bool:
 def read(body: bytes, question: Question) -> MatchAnswer:
     """Read the answer to `question` in a document that a server has written. The document may hold anything."""
     try:
-        found = from_json(body, _Groups).groups
+        groups = from_json(body, _Groups).groups
     except ValueError:
         return MatchAnswer(problem="the answer of match cannot be read")
-    asked, matched, sessions, problem = {each.id for each in question.waiting}, set[str](), [], ""
-    for labels in found[:MAX_WAITING]:
+    ids, matched, sessions, problem = {person.id for person in question.waiting}, set[str](), [], ""
+    for labels in groups[:MAX_WAITING]:
         if len(labels) != question.players or len(set(labels)) != len(labels):
             problem = problem or f"match chose other members than {question.players} different participants"
-        elif not asked.issuperset(labels):
+        elif not ids.issuperset(labels):
             problem = problem or "match chose a participant who does not wait"
         elif not matched.isdisjoint(labels):
             problem = problem or "match chose a participant for two sessions"
@@ -124,16 +124,19 @@ def next_question(
     `waiting`: the labels of all participants who wait; others are dropped from the document. `matched`: the labels in
     the answer to `question`. The new question leaves them out; a later one has them again if they are still free.
     """
-    candidates = {label: each for label, each in question.candidates().items() if label in waiting}
+    candidates = {label: candidate for label, candidate in question.candidates().items() if label in waiting}
     asked = sorted(
-        (one for one in free if one.label in candidates and one.label not in matched), key=lambda one: one.order
+        (person for person in free if person.label in candidates and person.label not in matched),
+        key=lambda one: one.order,
     )
     asked = asked[:MAX_WAITING]
     if not _is_due(question, project, {one.label for one in asked}, answered=answered, now=now):
         return question
     in_question = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)
     labels = {each.id for each in in_question}
-    rest = tuple(msgspec.structs.replace(each, waited=0) for label, each in candidates.items() if label not in labels)
+    rest = tuple(
+        msgspec.structs.replace(candidate, waited=0) for label, candidate in candidates.items() if label not in labels
+    )
     made = Question(players=project.players, asked=now, waiting=in_question, came=rest)
     return msgspec.structs.replace(made, id=hashlib.sha256(to_json(made)).hexdigest()[:20])
 
@@ -141,7 +144,7 @@ def next_question(
 def _is_due(question: Question, project: Project, free: set[str], *, answered: bool, now: datetime) -> bool:
     """Whether another question should replace this one. `free`: the labels of the participants it would have."""
     age = now - question.asked if question.asked else timedelta.max
-    is_new = free != {each.id for each in question.waiting}
+    is_new = free != {person.id for person in question.waiting}
     if len(question.waiting) < project.players:  # too few for a session, so no server answers it
         return is_new
     if not answered and age < ANSWERED_WITHIN:
@@ -149,6 +152,6 @@ def _is_due(question: Question, project: Project, free: set[str], *, answered: b
     return is_new or age >= timedelta(seconds=WAITED_STEPS)
 
 
-def _waited(one: Waiting, now: datetime) -> int:
-    seconds = int(seconds_since(one.joined, now))
+def _waited(waiting: Waiting, now: datetime) -> int:
+    seconds = int(seconds_since(waiting.joined, now))
     return seconds - seconds % WAITED_STEPS

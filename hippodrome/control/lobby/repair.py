@@ -51,11 +51,11 @@ class Repair:
         if may_finish:
             self._store.finish_sessions(project)
         self._store.carry_out(project, rules.without_done(known, entries.done).for_good(), entries)
-        ahead = [*known.open, *(each.waits_for for each in known.formed if each.waits_for)]
+        ahead = [*known.open, *(session.waits_for for session in known.formed if session.waits_for)]
         servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
         entries = self._store.entries(project)  # again, for the marks of what was just carried out
         run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=StartedAhead(servers))
-        closed = {name: each.closed for name, each in servers.items() if each and each.closed}
+        closed = {name: server.closed for name, server in servers.items() if server and server.closed}
         over = [name for name, since in closed.items() if run.now - since > CLOSED_FOR_GOOD]
         wanted = servers_ahead.sessions_wanted(known, entries, project)
         ended = servers_ahead.surplus(known, wanted, over, run.now, players=project.players, open_for=run.open_for)
@@ -79,13 +79,13 @@ class Repair:
         self._store.forget_done(project, after, entries)
         for session_id in sorted(ended - after.session_ids()):
             self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, session_id)))
-        waits_for = (each.waits_for for each in after.formed if each.waits_for)
+        waits_for = (session.waits_for for session in after.formed if session.waits_for)
         for each in [*after.open, *waits_for]:
             is_new = each.by == "" and each.requested == run.now
             is_lost = each.id in servers and servers[each.id] is None and run.now - each.requested > NO_RECORD_AFTER
             if is_new or is_lost:
                 self._store.start_server(project, each.id, each.players)
-        formed = tuple(each for each in after.for_good().formed if each not in known.formed)
+        formed = tuple(session for session in after.for_good().formed if session not in known.formed)
         self._store.carry_out(project, Decisions(formed=formed), entries)
         if ended:
             logger.info(

@@ -47,7 +47,7 @@ def decide(
     if document.renewed is not None:
         return settled
     before = seen.labels()
-    among = [one for one in free(settled, entries, now) if one.label not in before]
+    among = [person for person in free(settled, entries, now) if person.label not in before]
     sessions = choose(among, project, now, chosen)
     return _with_proposals(settled, sessions, now, new_id, players=project.players, open_for=open_for)
 
@@ -55,17 +55,17 @@ def decide(
 def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
     """Return the participants who are present and in no session, in the order of arrival."""
     busy = document.labels()
-    found = (one for one in entries.waiting.values() if one.label not in busy and one.is_present(now))
+    found = (person for person in entries.waiting.values() if person.label not in busy and person.is_present(now))
     return sorted(found, key=lambda one: one.order)
 
 
 def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
     """Return the proposals that all members have confirmed and no member has left."""
     return [
-        each
-        for each in document.proposed
-        if entries.confirmed.get(each.id, frozenset()) >= set(each.labels)
-        and all(label in entries.waiting for label in each.labels)
+        proposal
+        for proposal in document.proposed
+        if entries.confirmed.get(proposal.id, frozenset()) >= set(proposal.labels)
+        and all(label in entries.waiting for label in proposal.labels)
     ]
 
 
@@ -81,17 +81,19 @@ def number_here(document: Decisions, entries: Entries, project: Project, label: 
     if me is None:
         return 1
     among = [
-        one
-        for one in free(document, entries, now)
-        if project.after_patience == "policies" or not patience_is_over(one.joined, project, now)
+        person
+        for person in free(document, entries, now)
+        if project.after_patience == "policies" or not patience_is_over(person.joined, project, now)
     ]
     return len(around(me, among, project))
 
 
-def _without_fallen(document: Decisions, entries: Entries, seen: Decisions, now: datetime) -> Decisions:
+def _without_fallen(document: Decisions, entries: Entries, decisions: Decisions, now: datetime) -> Decisions:
     """The document without the proposals in `seen` that have fallen apart."""
-    before = {each.id for each in seen.proposed}
-    fallen = [each.id for each in document.proposed if each.id in before and _has_fallen(each, entries, now)]
+    before = {proposal.id for proposal in decisions.proposed}
+    fallen = [
+        proposal.id for proposal in document.proposed if proposal.id in before and _has_fallen(proposal, entries, now)
+    ]
     return without_proposals(document, fallen)
 
 
@@ -101,17 +103,17 @@ def _has_fallen(proposal: Proposal, entries: Entries, now: datetime) -> bool:
         return True
     labels = entries.confirmed.get(proposal.id, frozenset())
     members = (entries.waiting.get(label) for label in proposal.labels)
-    return any(one is None or not (one.label in labels or one.is_present(now)) for one in members)
+    return any(member is None or not (member.label in labels or member.is_present(now)) for member in members)
 
 
 def without_proposals(document: Decisions, ids: Collection[str]) -> Decisions:
     """Return the document without these proposals. The open sessions that they had are open again."""
-    if not any(each.id in ids for each in document.proposed):
+    if not any(proposal.id in ids for proposal in document.proposed):
         return document
-    opened = [each.ahead for each in document.proposed if each.id in ids and each.ahead]
+    opened = [proposal.ahead for proposal in document.proposed if proposal.id in ids and proposal.ahead]
     return msgspec.structs.replace(
         document,
-        proposed=tuple(each for each in document.proposed if each.id not in ids),
+        proposed=tuple(proposal for proposal in document.proposed if proposal.id not in ids),
         open=by_age([*document.open, *opened]),
     )
 
@@ -126,19 +128,19 @@ def _with_proposals(
     open_for: timedelta,
 ) -> Decisions:
     """The document with a proposal for each of these sessions. They get open sessions, the oldest first."""
-    usable = deque(each for each in document.open if each.is_usable(players, now, open_for))
+    usable = deque(server for server in document.open if server.is_usable(players, now, open_for))
     added = []
     for members in sessions:
         ahead = usable.popleft() if usable else None
-        labels = tuple(one.label for one in members)
+        labels = tuple(member.label for member in members)
         added.append(Proposal(new_id(), labels, now, ahead, players))
     if not added:
         return document
-    used = {each.ahead.id for each in added if each.ahead}
+    used = {addition.ahead.id for addition in added if addition.ahead}
     return msgspec.structs.replace(
         document,
         proposed=(*document.proposed, *added),
-        open=tuple(each for each in document.open if each.id not in used),
+        open=tuple(server for server in document.open if server.id not in used),
     )
 
 
@@ -152,14 +154,14 @@ def form(
 
     `seats` says which member plays which player (`project.seats`).
     """
-    found = next((each for each in document.proposed if each.id == proposal_id), None)
+    found = next((proposal for proposal in document.proposed if proposal.id == proposal_id), None)
     if found is None or found.labels != tuple(member.label for member in members):
         return document
     seated = _seated(members, found.session_id, seats)
     formed = Formed(found.session_id, seated, now, found.ahead is not None, found.ahead, found.players)
     return msgspec.structs.replace(
         document,
-        proposed=tuple(each for each in document.proposed if each is not found),
+        proposed=tuple(proposal for proposal in document.proposed if proposal is not found),
         formed=(*document.formed, formed),
     )
 
@@ -190,14 +192,14 @@ def without_done(document: Decisions, done: Collection[str]) -> Decisions:
 
     `done` holds the ids of sessions, and the labels of unmatched participants.
     """
-    if not any(each.id in done for each in document.formed) and not any(
-        each.label in done for each in document.unmatched
+    if not any(session.id in done for session in document.formed) and not any(
+        member.label in done for member in document.unmatched
     ):
         return document
     return msgspec.structs.replace(
         document,
-        formed=tuple(each for each in document.formed if each.id not in done),
-        unmatched=tuple(each for each in document.unmatched if each.label not in done),
+        formed=tuple(session for session in document.formed if session.id not in done),
+        unmatched=tuple(member for member in document.unmatched if member.label not in done),
     )
 
 
@@ -212,17 +214,17 @@ def without(document: Decisions, label: str) -> Decisions:
 
     formed = (
         msgspec.structs.replace(
-            each,
-            members=tuple(Matched("", "") if member.label == label else member for member in each.members),
-            waits_for=unnamed(each.waits_for),
+            session,
+            members=tuple(Matched("", "") if member.label == label else member for member in session.members),
+            waits_for=unnamed(session.waits_for),
         )
-        for each in document.formed
+        for session in document.formed
     )
-    kept = without_proposals(document, [each.id for each in document.proposed if label in each.labels])
+    kept = without_proposals(document, [proposal.id for proposal in document.proposed if label in proposal.labels])
     return msgspec.structs.replace(
         kept,
-        open=tuple(found for each in kept.open if (found := unnamed(each))),
-        proposed=tuple(msgspec.structs.replace(each, ahead=unnamed(each.ahead)) for each in kept.proposed),
-        formed=tuple(each for each in formed if any(member.label for member in each.members)),
-        unmatched=tuple(each for each in kept.unmatched if each.label != label),
+        open=tuple(found for server in kept.open if (found := unnamed(server))),
+        proposed=tuple(msgspec.structs.replace(proposal, ahead=unnamed(proposal.ahead)) for proposal in kept.proposed),
+        formed=tuple(session for session in formed if any(member.label for member in session.members)),
+        unmatched=tuple(member for member in kept.unmatched if member.label != label),
     )

@@ -23,18 +23,18 @@ class StartedAhead:
     @property
     def ready(self) -> frozenset[str]:
         """The ids of sessions whose servers are ready."""
-        return frozenset(name for name, each in self.records.items() if each and each.state is ServerState.READY)
+        return frozenset(name for name, record in self.records.items() if record and record.state is ServerState.READY)
 
     @property
     def over(self) -> frozenset[str]:
         """The ids of sessions whose servers have ended and are not replaced."""
-        closed = ((name, each) for name, each in self.records.items() if each and each.is_closed)
+        closed = ((name, record) for name, record in self.records.items() if record and record.is_closed)
         return frozenset(name for name, each in closed if next_attempt(each) is None)
 
     @property
     def coming(self) -> frozenset[str]:
         """The ids of sessions whose servers start now or are replaced, and so may become ready."""
-        return frozenset(name for name, each in self.records.items() if each) - self.ready - self.over
+        return frozenset(name for name, record in self.records.items() if record) - self.ready - self.over
 
     def given(self, document: Decisions, now: datetime, open_for: timedelta) -> Decisions:
         """Return the document after these servers have been given to the sessions that wait for a server."""
@@ -61,8 +61,8 @@ class LobbyRun:
         """Return the document with all decisions that this run can make."""
         document = rules.without_done(document, self.entries.done)
         document = rules.without_proposals(document, self.broken)
-        for proposal_id, found in self.members.items():
-            document = rules.form(document, proposal_id, found, self.now, self.project.seats)
+        for proposal_id, member in self.members.items():
+            document = rules.form(document, proposal_id, member, self.now, self.project.seats)
         document = rules.decide(
             document,
             self.entries,

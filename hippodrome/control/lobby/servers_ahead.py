@@ -40,7 +40,7 @@ def open_sessions(
     open_for: timedelta,
 ) -> Decisions:
     """Return the document with new open sessions for `players`, as many as are needed to have `wanted` usable ones."""
-    usable = sum(each.is_usable(players, now, open_for) for each in document.open)
+    usable = sum(server.is_usable(players, now, open_for) for server in document.open)
     added = [OpenSession(new_id(), now, by, players) for _ in range(wanted - usable)]
     return msgspec.structs.replace(document, open=by_age([*document.open, *added])) if added else document
 
@@ -67,14 +67,14 @@ def with_ready_servers(
     sessions = document.without_server()
     if not ready and not over and not (sessions and now - sessions[0].at >= SERVER_WITHIN):
         return document
-    servers = [each.waits_for for each in sessions if each.waits_for]
+    servers = [session.waits_for for session in sessions if session.waits_for]
     opened = list(document.open)
-    usable = {each.id for each in opened if each.is_usable(each.players, now, open_for)}
-    left = len({*usable, *(each.id for each in servers)} & set(ready))  # ready servers that no session has got yet
+    usable = {server.id for server in opened if server.is_usable(server.players, now, open_for)}
+    left = len({*usable, *(server.id for server in servers)} & set(ready))  # ready servers that no session has got yet
     given: dict[tuple[str, ...], str] = {}  # by the labels of a session's members: the id of its server
     for at, session in enumerate(sessions):
         players = servers[at].players
-        fits = [n for n, each in enumerate(opened) if each.id in usable and each.players == players]
+        fits = [n for n, server in enumerate(opened) if server.id in usable and server.players == players]
         if left and servers[at].id not in ready:
             fresh = (n for n in fits if opened[n].id in ready)
             later = (n for n in range(len(servers) - 1, at, -1) if servers[n].id in ready)
@@ -89,17 +89,19 @@ def with_ready_servers(
         left -= is_ready
         if is_ready or servers[at].id in over or now - session.at >= SERVER_WITHIN:
             given[session.labels] = servers[at].id
-    if not given and servers == [each.waits_for for each in sessions]:
+    if not given and servers == [session.waits_for for session in sessions]:
         return document
-    having = {each.labels: server for each, server in zip(sessions, servers, strict=True)}
+    having = {session.labels: server for session, server in zip(sessions, servers, strict=True)}
 
-    def bound(each: Formed) -> Formed:
-        server = having.get(each.labels) if each.waits_for else None
+    def bound(formed: Formed) -> Formed:
+        server = having.get(formed.labels) if formed.waits_for else None
         if server is None:
-            return each
-        return msgspec.structs.replace(each, id=server.id, waits_for=None if each.labels in given else server)
+            return formed
+        return msgspec.structs.replace(formed, id=server.id, waits_for=None if formed.labels in given else server)
 
-    return msgspec.structs.replace(document, open=by_age(opened), formed=tuple(bound(each) for each in document.formed))
+    return msgspec.structs.replace(
+        document, open=by_age(opened), formed=tuple(bound(session) for session in document.formed)
+    )
 
 
 def surplus(
@@ -116,10 +118,12 @@ def surplus(
     They are the sessions that can no longer be used, the sessions in `over`, and all but `wanted` of the others. Of the
     others, the sessions stay whose servers were requested first, since these will be ready first.
     """
-    usable = [each.id for each in document.open if each.is_usable(players, now, open_for) and each.id not in over]
-    return frozenset(each.id for each in document.open) - frozenset(usable[: max(0, wanted)])
+    usable = [
+        server.id for server in document.open if server.is_usable(players, now, open_for) and server.id not in over
+    ]
+    return frozenset(server.id for server in document.open) - frozenset(usable[: max(0, wanted)])
 
 
 def without_open(document: Decisions, ids: Collection[str]) -> Decisions:
     """Return the document without these open sessions."""
-    return msgspec.structs.replace(document, open=tuple(each for each in document.open if each.id not in ids))
+    return msgspec.structs.replace(document, open=tuple(server for server in document.open if server.id not in ids))

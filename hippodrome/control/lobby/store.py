@@ -89,11 +89,11 @@ class LobbyStore:
         made: dict[str, Membership] = {}
         for formed in decided.formed:
             made |= self._write_session(project, formed)
-        for one in decided.unmatched:
-            membership = Membership(unmatched=True, completion_code=one.completion_code, waited=one.waited)
-            made[one.label] = self._write_membership(project, one.user_id, membership)
+        for member in decided.unmatched:
+            membership = Membership(unmatched=True, completion_code=member.completion_code, waited=member.waited)
+            made[member.label] = self._write_membership(project, member.user_id, membership)
         self.delete(key for label in made for key in entries.keys.get(label, ()))
-        for name in [*(each.id for each in decided.formed), *(each.label for each in decided.unmatched)]:
+        for name in [*(formed.id for formed in decided.formed), *(member.label for member in decided.unmatched)]:
             self._documents.put(lobby_entries.done_key(project.id, name), b"")
         return made
 
@@ -117,18 +117,20 @@ class LobbyStore:
             if found is not None:
                 self._finish_session(project, found)
 
-    def _finish_session(self, project: Project, found: SessionDocument) -> None:
-        missing = [each for each in found.members if each.user_id]
-        missing = [each for each in missing if self._repository.membership(project.id, each.user_id) is None]
-        if missing and self._repository.server_of(project.id, found.id) is None:
-            self.start_server(project, found.id, found.players)
+    def _finish_session(self, project: Project, session_document: SessionDocument) -> None:
+        missing = [member for member in session_document.members if member.user_id]
+        missing = [name for name in missing if self._repository.membership(project.id, name.user_id) is None]
+        if missing and self._repository.server_of(project.id, session_document.id) is None:
+            self.start_server(project, session_document.id, session_document.players)
         for each in missing:
-            membership = Membership(found.id, each.seat, len(found.members), players=found.players)
+            membership = Membership(
+                session_document.id, each.seat, len(session_document.members), players=session_document.players
+            )
             self._write_membership(project, each.user_id, membership)
 
     def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
         """Delete the marks of decisions that are not in `document`, which must have been read after the listing."""
-        kept = {*(each.id for each in document.formed), *(each.label for each in document.unmatched)}
+        kept = {*(session.id for session in document.formed), *(member.label for member in document.unmatched)}
         self.delete(lobby_entries.done_key(project.id, name) for name in sorted(entries.done - kept))
 
     def answer_as_unmatched(self, project: Project, user_id: str) -> None:
@@ -144,25 +146,27 @@ class LobbyStore:
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, session_id, players=players)))
 
     def _write_session(self, project: Project, formed: Formed) -> Mapping[str, Membership]:
-        members = tuple(session.Member(each.user_id, each.group, seat) for seat, each in enumerate(formed.members))
-        made = SessionDocument(
+        members = tuple(
+            session.Member(member.user_id, member.group, seat) for seat, member in enumerate(formed.members)
+        )
+        session_document = SessionDocument(
             formed.id,
             formed.players,
             members,
-            group=next((each.group for each in formed.members if each.label), None),
+            group=next((member.group for member in formed.members if member.label), None),
             formed=time_text(formed.at),
         )
-        self._create(session_key(project.id, formed.id), made.to_json())
+        self._create(session_key(project.id, formed.id), session_document.to_json())
         if not formed.ahead or self._repository.server_of(project.id, formed.id) is None:
-            self.start_server(project, formed.id, made.players)
+            self.start_server(project, formed.id, session_document.players)
         return {
-            each.label: self._write_membership(
+            member.label: self._write_membership(
                 project,
-                each.user_id,
-                Membership(formed.id, seat, len(members), waited=each.waited, players=made.players),
+                member.user_id,
+                Membership(formed.id, seat, len(members), waited=member.waited, players=session_document.players),
             )
-            for seat, each in enumerate(formed.members)
-            if each.label
+            for seat, member in enumerate(formed.members)
+            if member.label
         }
 
     def _write_membership(self, project: Project, user_id: str, membership: Membership) -> Membership:

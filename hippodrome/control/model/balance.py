@@ -162,4 +162,4 @@ def outcome_of(
 def most_active(outcomes: Sequence[tuple[Outcome, datetime]], now: datetime) -> tuple[Outcome, datetime]:
     """Return what became of a session, from what became of its members; it has left if there are none any more."""
     ranks = list(Outcome)
-    return min(outcomes, key=lambda known: ranks.index(known[0]), default=(Outcome.LEFT, now))
+    return min(outcomes, key=lambda outcome: ranks.index(outcome[0]), default=(Outcome.LEFT, now))

@@ -75,7 +75,7 @@ class Step(Record, frozen=True):
 
     def section(self, levels: Levels) -> Mapping[str, Any]:
         """Return the keys of `trial` that this game has for itself at these levels."""
-        fitting = (one.trial for one in self.sections if one.levels.items() <= levels.items())
+        fitting = (section.trial for section in self.sections if section.levels.items() <= levels.items())
         return next(fitting, {})
 
 

@@ -69,8 +69,8 @@ def server_name(label: str, attempt: int) -> str:
 
 def parse_server_name(name: str) -> tuple[str, int] | None:
     """Return the label and the attempt in a server's name; None if this is no server's name."""
-    found = _SERVER_NAME.fullmatch(name)
-    return (found[1], int(found[2])) if found else None
+    match = _SERVER_NAME.fullmatch(name)
+    return (match[1], int(match[2])) if match else None
 
 
 def delayed_timer(name: str) -> str:

@@ -130,8 +130,8 @@ class Standing:
 
     def _is_due(self, rule: str, last: Step) -> bool:
         """Whether an end's rule is looked at now: it asks about the last answer, and has all answers that it needs."""
-        asked = rules.steps_mentioned(rule)
-        return last.step_name in asked and all(self._answered_runs(name) for name in asked)
+        steps_mentioned = rules.steps_mentioned(rule)
+        return last.step_name in steps_mentioned and all(self._answered_runs(name) for name in steps_mentioned)
 
     def _facts(self, rule: str, step: Step) -> Mapping[str, Any]:
         """What the rule asks about, for a participant at this step."""

@@ -201,7 +201,7 @@ class Project(Record, frozen=True):
 
         These are taken from `before`, the present registration, which this one replaces.
         """
-        kept = {each.players: each for each in (before.other_numbers if before else ())}
+        kept = {other_number.players: other_number for other_number in (before.other_numbers if before else ())}
         if before is not None:
             kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
         others = tuple(kept[players] for players in sorted(kept.keys() - {self.players}))
@@ -215,7 +215,7 @@ class Project(Record, frozen=True):
         """
         if players in (0, self.players):
             return self
-        found = next((each for each in self.other_numbers if each.players == players), None)
+        found = next((other_number for other_number in self.other_numbers if other_number.players == players), None)
         if found is None:
             return None
         return msgspec.structs.replace(self, **msgspec.structs.asdict(found), warm_servers=0)

@@ -134,9 +134,9 @@ def _tree(rule: str) -> ast.expr:
     return tree
 
 
-def _with_numeric_levels(found: re.Match[str]) -> str:
+def _with_numeric_levels(match: re.Match[str]) -> str:
     """Write `answers.trust.60.q1` as Python can read it: a level may be a number."""
-    return found[0] if found["quoted"] else re.sub(r"\.(\d\w*)", r'["\1"]', found[0])
+    return match[0] if match["quoted"] else re.sub(r"\.(\d\w*)", r'["\1"]', match[0])
 
 
 def _why_unread(rule: str) -> str:

@@ -310,9 +310,9 @@ def may_go_without(record: Server) -> bool:
     return record.reason in FAILED or (none_left and any(past.reason in FAILED for past in record.earlier))
 
 
-def replacing(before: Server, wanted: Server) -> Server:
+def replacing(before: Server, server: Server) -> Server:
     """Return the record `wanted` of the next attempt, with the closed attempt `before` added to its `earlier`."""
-    return msgspec.structs.replace(wanted, earlier=(*before.earlier, past_attempt(before)))
+    return msgspec.structs.replace(server, earlier=(*before.earlier, past_attempt(before)))
 
 
 def found_no_slot(server: Server, attempt: int) -> bool:
@@ -320,9 +320,9 @@ def found_no_slot(server: Server, attempt: int) -> bool:
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
-def repeating(before: Server, wanted: Server) -> Server:
+def repeating(before: Server, server: Server) -> Server:
     """Return the record `wanted` with the earlier attempts of `before`, an attempt without a slot that it repeats."""
-    return msgspec.structs.replace(wanted, earlier=before.earlier)
+    return msgspec.structs.replace(server, earlier=before.earlier)
 
 
 def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:

@@ -59,12 +59,12 @@ class Files:
         )
         name = composed(parts[-1])
         is_valid = is_served(name) and name.isprintable() and not name.startswith(".") and len(name) <= MAX_NAME
-        found = self._project_cache.document(f"{project.id}/steps/{name}") if project and is_valid else None
-        if found is None:
+        document = self._project_cache.document(f"{project.id}/steps/{name}") if project and is_valid else None
+        if document is None:
             raise PageError(404, "Page not found", "Please open your study link again.")
         if "range" in request.headers and "if-range" not in request.headers:
-            return _part(found.body, request.headers["range"], _headers(name))
-        return Response(200, found.body, _headers(name))
+            return _part(document.body, request.headers["range"], _headers(name))
+        return Response(200, document.body, _headers(name))
 
 
 def _part(body: bytes, asked: str, headers: dict[str, str]) -> Response:

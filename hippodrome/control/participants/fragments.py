@@ -122,15 +122,15 @@ class _Preparation:
         out: list[str] = []
         at = start = 0
         unclosed: set[str] = set()
-        while found := _JINJA_START.search(source, at):
-            at = found.end()
-            if closer := _JINJA_END.get(found[0]):
+        while match := _JINJA_START.search(source, at):
+            at = match.end()
+            if closer := _JINJA_END.get(match[0]):
                 if closer in unclosed or (end := source.find(closer, at)) == -1:
                     unclosed.add(closer)
                     continue
                 at = end + 2
-            out += [source[start : found.start()], f"\ue000{len(self._aside)}\ue001"]
-            self._aside.append(source[found.start() : at])
+            out += [source[start : match.start()], f"\ue000{len(self._aside)}\ue001"]
+            self._aside.append(source[match.start() : at])
             start = at
         return "".join([*out, source[start:]])
 
@@ -143,7 +143,7 @@ class _Preparation:
         if name in LINKS and self._base:
             attributes = self._link(attributes)
         if name in ADDRESSES and self._base:
-            attributes = _ATTRIBUTE.sub(lambda each: self._relocated(each, *ADDRESSES[name]), attributes)
+            attributes = _ATTRIBUTE.sub(lambda attribute: self._relocated(attribute, *ADDRESSES[name]), attributes)
         if name == "script" and self._may_run(address):
             attributes = f' nonce="{_MARK}"{attributes}'
         return f"<{token['start']}{attributes}>"
@@ -162,23 +162,23 @@ class _Preparation:
         relocated = self._relocate(given.get("href", ""))
         if not relocated.startswith(self._base) or not is_served(re.split(r"[?#]", relocated, maxsplit=1)[0]):
             return attributes
-        attributes = _ATTRIBUTE.sub(lambda each: self._relocated(each, "href"), attributes)
+        attributes = _ATTRIBUTE.sub(lambda attribute: self._relocated(attribute, "href"), attributes)
         return (
             attributes if "target" in given or "download" in given else f' target="_blank" rel="noopener"{attributes}'
         )
 
-    def _relocated(self, found: re.Match[str], *names: str) -> str:
+    def _relocated(self, match: re.Match[str], *names: str) -> str:
         """This attribute with an address of the project's files, if it is one of `names`."""
-        attribute, value = found["name"].lower(), found["value"]
+        attribute, value = match["name"].lower(), match["value"]
         if value is None or attribute not in names:
-            return found[0]
+            return match[0]
         quote = value[0] if value[0] in "\"'" else ""
         inner = value[1:-1] if quote else value
         if attribute == "srcset":
             inner = _SRCSET.sub(lambda part: part[1] + self._relocate(part[2]), inner)
         else:
             inner = self._relocate(inner)
-        return f"{found['name']}={quote}{inner}{quote}"
+        return f"{match['name']}={quote}{inner}{quote}"
 
     def _relocate(self, address: str) -> str:
         bare = address.strip()

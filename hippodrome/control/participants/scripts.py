@@ -37,6 +37,6 @@ def _add(module: Path, found: dict[Path, str], above: tuple[Path, ...] = ()) -> 
         if module.with_name(name) not in found:
             _add(module.with_name(name), found, (*above, module))
     script = _EXPORT.sub("", _IMPORT.sub("", source))
-    if left := _LEFT.search(script):
-        raise ValueError(f"{module.name} cannot be joined: {left[0]}")
+    if match := _LEFT.search(script):
+        raise ValueError(f"{module.name} cannot be joined: {match[0]}")
     found[module] = script

@@ -47,9 +47,9 @@ def _in_html(text: str, named: tuple[str, ...]) -> str:
 
 def _filled(code: str, texts: dict[str, str]) -> str:
     done, at = "", 0
-    while found := NAMED.search(code, at):
-        done += code[at : found.start()]
-        name, at = found[1], found.end()
+    while match := NAMED.search(code, at):
+        done += code[at : match.start()]
+        name, at = match[1], match.end()
         values: dict[str, str] = {}
         if named := places(ENGLISH[name]):
             given, at = _arguments(code, at)

@@ -127,10 +127,16 @@ class Certifying:
         self._shared.change(ADDRESS_ORDERS, AddressOrders, lambda orders: orders.with_order(now, server))
         return {"address": address, "order": order.url, "token": order.token, "proof": order.proof}
 
-    def _advance(self, record: Server, wanted: CertificateRequest, address: str) -> dict[str, str | bool]:
+    def _advance(self, record: Server, certificate_request: CertificateRequest, address: str) -> dict[str, str | bool]:
         seen = record.host == address
         try:
-            chain = self._client().advance(wanted.order, address, wanted.csr, answer=wanted.answer, may_issue=seen)
+            chain = self._client().advance(
+                certificate_request.order,
+                address,
+                certificate_request.csr,
+                answer=certificate_request.answer,
+                may_issue=seen,
+            )
         except PermissionError:
             raise Refusal(403, "That order is for another address.") from None
         except ValueError:

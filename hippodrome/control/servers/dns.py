@@ -86,8 +86,8 @@ class DnsRecords:
         """
         soon = [event for event in events if event.interface and event.looked < MAX_ADDRESS_CHECKS]
         for event in soon:
-            seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
-            self._platform.bus.send_delayed(to_message(seen), RETRY_PAUSE)
+            task_seen = TaskSeen(event.task, event.cluster, event.name, event.interface or "", event.looked + 1)
+            self._platform.bus.send_delayed(to_message(task_seen), RETRY_PAUSE)
         return [event for event in events if event not in soon]
 
     def _create(self, servers: Sequence[Server], looked: int = 0) -> list[Server]:
@@ -99,13 +99,13 @@ class DnsRecords:
         unregistered: list[Server] = []
         servers = [record for record in servers if record.dns]  # the others wait for a certificate (`certifying.py`)
         for batch in (servers[n : n + MAX_SERVERS_PER_CHANGE] for n in range(0, len(servers), MAX_SERVERS_PER_CHANGE)):
-            named = [_attempt_of(record) for record in batch]
+            attempts = [_attempt_of(record) for record in batch]
             try:
                 change = self._platform.dns.change(add=[record.dns_record for record in batch if record.dns_record])
             except ServiceBusy:
                 if looked >= MAX_CHECKS:
                     raise
-                unmade = DnsChanged("", named, looked + 1, unmade=True)
+                unmade = DnsChanged("", attempts, looked + 1, unmade=True)
                 self._platform.bus.send_delayed(to_message(unmade), RETRY_PAUSE)
             except RefusedDnsRecords as refused:
                 created = [_attempt_of(record) for record in batch if record.dns_record not in refused.records]
@@ -114,7 +114,7 @@ class DnsRecords:
                 to_rename = [record for record in batch if record.dns_record in refused.records]
                 unregistered += self._rename(to_rename, looked)
             else:
-                self._after_change(DnsChanged(change, named))
+                self._after_change(DnsChanged(change, attempts))
         return unregistered
 
     def _rename(self, servers: Sequence[Server], looked: int) -> list[Server]:
@@ -181,7 +181,7 @@ class DnsRecords:
         in_sync, again = for_each(self._platform, made, self._check, "a DNS change could not be checked")
         again += self._retry_create(unmade) if unmade else []
         try:
-            self._complete({named: message.looked for message, _ in in_sync for named in message.servers})
+            self._complete({server: message.looked for message, _ in in_sync for server in message.servers})
         except Exception as error:  # noqa: BLE001 - messages for which the next check was sent must not come again
             failure("servers are not ready yet", error)
             again += [message for message, _ in in_sync]
@@ -191,7 +191,7 @@ class DnsRecords:
         """Create the DNS records for which the zone was busy, with one change; return the messages to deliver again."""
         waiting, failed = for_each(
             self._platform,
-            dict.fromkeys(named for message in unmade for named in message.servers),
+            dict.fromkeys(server for message in unmade for server in message.servers),
             self._waiting_record,
             "a DNS record is not created yet",
             lambda named: ids.server_name(named.label, named.attempt),
@@ -202,12 +202,12 @@ class DnsRecords:
             failure("DNS records are not created yet", error)
             return list(unmade)
         failed += map(_attempt_of, unregistered)
-        return [message for message in unmade if any(named in failed for named in message.servers)]
+        return [message for message in unmade if any(server in failed for server in message.servers)]
 
-    def _waiting_record(self, named: ServerAttempt) -> Server | None:
+    def _waiting_record(self, server_attempt: ServerAttempt) -> Server | None:
         """The record of a server that is still in state `naming`; else None."""
-        stored = self._repository.server(named.label)
-        waits = stored and stored.server.is_open(named.attempt) and stored.server.state is ServerState.NAMING
+        stored = self._repository.server(server_attempt.label)
+        waits = stored and stored.server.is_open(server_attempt.attempt) and stored.server.state is ServerState.NAMING
         return stored.server if stored and waits else None
 
     def _check(self, message: DnsChanged) -> bool | None:
@@ -245,16 +245,16 @@ class DnsRecords:
             servers,
             self._make_ready,
             "a server is not ready yet",
-            lambda named: ids.server_name(named.label, named.attempt),
+            lambda server: ids.server_name(server.label, server.attempt),
         )
         delete_dns_records(self._platform, [record for _, record in late])
         if failed:  # the next check only tries these servers again, since the change is INSYNC
             self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
 
-    def _make_ready(self, named: ServerAttempt) -> DnsRecord | None:
+    def _make_ready(self, server_attempt: ServerAttempt) -> DnsRecord | None:
         """Write `ready`, and mark a warm server ready in its pool. If the server was closed, return its DNS record."""
-        name = ids.server_name(named.label, named.attempt)
-        made = self._write_ready(named)
+        name = ids.server_name(server_attempt.label, server_attempt.attempt)
+        made = self._write_ready(server_attempt)
         if made:
             logger.info("server ready", extra={"server": name})
         found = made or self._repository.owner(name)
@@ -266,13 +266,17 @@ class DnsRecords:
             self._pools.mark_ready(record.project_id, record.user_id)
         return record.dns_record if record.state in DRAINING_OR_CLOSED else None
 
-    def _write_ready(self, named: ServerAttempt) -> Versioned | None:
+    def _write_ready(self, server_attempt: ServerAttempt) -> Versioned | None:
         """Write `ready` if the state is still `naming`. The version written last is used first, without a read."""
         now = self._platform.now()
-        stored = self._written.pop((named.label, named.attempt), None) or self._repository.server(named.label)
+        stored = self._written.pop((server_attempt.label, server_attempt.attempt), None) or self._repository.server(
+            server_attempt.label
+        )
         return self._repository.update(
             stored,
-            lambda r: server.ready(r, now) if r.is_open(named.attempt) and r.state is ServerState.NAMING else None,
+            lambda r: (
+                server.ready(r, now) if r.is_open(server_attempt.attempt) and r.state is ServerState.NAMING else None
+            ),
         )
 
 

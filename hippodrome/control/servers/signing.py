@@ -169,15 +169,15 @@ class ServerAccess:
         """Return whether presigned requests are still made for the server at this time."""
         return self.closed is None or (not self.is_unassigned and now < self.closed + STORE_AFTER_CLOSE)
 
-    def allows(self, wanted: DocumentRequest) -> bool:
+    def allows(self, document_request: DocumentRequest) -> bool:
         """Return whether the server may send this request."""
-        if wanted.method is Method.GET:
-            return self.closed is None and self._allows_reading(wanted.key)
-        if self.is_unassigned or wanted.size is None or wanted.size < 0:
+        if document_request.method is Method.GET:
+            return self.closed is None and self._allows_reading(document_request.key)
+        if self.is_unassigned or document_request.size is None or document_request.size < 0:
             return False
-        if self._is_answer(wanted.key, self.game_steps) or self._is_groups(wanted.key):
-            return wanted.size <= MAX_ANSWER
-        return self.is_recording(wanted.key) and wanted.size <= MAX_RECORDING
+        if self._is_answer(document_request.key, self.game_steps) or self._is_groups(document_request.key):
+            return document_request.size <= MAX_ANSWER
+        return self.is_recording(document_request.key) and document_request.size <= MAX_RECORDING
 
     def is_recording(self, key: str) -> bool:
         """Return whether this is the key of one of the server's own recordings."""
@@ -227,8 +227,8 @@ class ServerAccess:
         return label == self.label and attempt < self.attempt and self._names_recording(file)
 
     def _names_recording(self, file: str) -> bool:
-        found = _RECORDING.fullmatch(file)
-        return found is not None and found[1] in self.game_steps
+        match = _RECORDING.fullmatch(file)
+        return match is not None and match[1] in self.game_steps
 
 
 def access_of(record: Server, name: str, certificate: Sequence[str]) -> ServerAccess | None:
@@ -276,16 +276,18 @@ class Signing:
         requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
         return answer_of(200, {"seconds": VALID_SECONDS, "requests": requests})
 
-    def _authenticate(self, asked: SigningRequest) -> ServerAccess:
+    def _authenticate(self, signing_request: SigningRequest) -> ServerAccess:
         """The access of the server with this credential. Raises the same `Refusal` for any mistake."""
-        record = record_of(asked.server, asked.credential, self._repository, self._secrets)
-        found = self._access(record, asked.server)
-        if found is not None and found.is_of_session:
-            found = replace(found, members=members_of(self._repository, found.project_id, found.user_id))
-        if found is None or not found.is_open(self._platform.now()):
-            logger.info("a server that has ended asked for requests", extra={"server": asked.server})
+        record = record_of(signing_request.server, signing_request.credential, self._repository, self._secrets)
+        authenticate = self._access(record, signing_request.server)
+        if authenticate is not None and authenticate.is_of_session:
+            authenticate = replace(
+                authenticate, members=members_of(self._repository, authenticate.project_id, authenticate.user_id)
+            )
+        if authenticate is None or not authenticate.is_open(self._platform.now()):
+            logger.info("a server that has ended asked for requests", extra={"server": signing_request.server})
             raise refused()
-        return found
+        return authenticate
 
     def _access(self, record: Server, name: str) -> ServerAccess | None:
         keys = location(record.domain)
@@ -299,13 +301,15 @@ class Signing:
             return None
         return ServerAccess(name, record.project_id, certificate=certificate)
 
-    def _sign(self, access: ServerAccess, asked: Sequence[DocumentRequest]) -> list[Presigned]:
+    def _sign(self, access: ServerAccess, document_requests: Sequence[DocumentRequest]) -> list[Presigned]:
         """Sign all requests. Raises `Refusal` and signs none if one of them is not allowed."""
-        if not all(access.allows(wanted) for wanted in asked):
+        if not all(access.allows(wanted) for wanted in document_requests):
             logger.warning("a server asked for a document that is not its own", extra={"server": access.name})
             raise Refusal(403, "That is none of this server's documents.")
         announced = [
-            wanted.size or 0 for wanted in asked if wanted.method is Method.PUT and access.is_recording(wanted.key)
+            wanted.size or 0
+            for wanted in document_requests
+            if wanted.method is Method.PUT and access.is_recording(wanted.key)
         ]
         if announced:
             stored = [entry.size for entry in self._platform.documents.list(access.folder)]
@@ -319,7 +323,7 @@ class Signing:
             signer.presign_get(wanted.key, VALID_SECONDS)
             if wanted.method is Method.GET
             else signer.presign_put(wanted.key, wanted.size or 0, VALID_SECONDS)
-            for wanted in asked
+            for wanted in document_requests
         ]
 
 

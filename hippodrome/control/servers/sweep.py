@@ -102,7 +102,9 @@ class Sweep:
             self._try("names", partial(delete_dns_records, platform, stale), len(stale))
         self._remove("timers", left.timers, self._end_timer)
         self._remove("clusters", left.clusters, platform.tasks.delete_cluster)
-        documents = [one for one in handovers if leftovers.why_left_over(one[1], owners.get(one[1]), scope)]
+        documents = [
+            handover for handover in handovers if leftovers.why_left_over(handover[1], owners.get(handover[1]), scope)
+        ]
         self._remove("handovers", documents, lambda document: self._pools.delete_handover(*document))
         for project_id, running in slots.items():
             read = [name for name in running.names if name not in self._unread]
@@ -152,13 +154,13 @@ class Sweep:
         live, its server may never have been closed. Only a few sweeps read each record, even if there are many.
         """
         ages = (RETRY_AFTER, timedelta(minutes=self._platform.settings.max_runtime) + OVERDUE_AFTER)
-        known = {stored.server.label for stored in self._owners.values()}
-        known |= {label for label, _ in filter(None, map(ids.parse_server_name, self._unread))}
+        labels = {stored.server.label for stored in self._owners.values()}
+        labels |= {label for label, _ in filter(None, map(ids.parse_server_name, self._unread))}
         wanted = []
         for entry in self._platform.documents.list(RECORDS):
             label = entry.key.removeprefix(RECORDS).removesuffix(".json")
             age = self._begun - entry.modified
-            due = any(since < age <= since + CHECKED_FOR for since in ages) and label not in known
+            due = any(since < age <= since + CHECKED_FOR for since in ages) and label not in labels
             if due and entry.key == server_key(label) and ids.parse_server_name(f"{label}-1"):
                 wanted.append(label)
         found, unread = for_each(

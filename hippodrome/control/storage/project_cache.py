@@ -52,15 +52,15 @@ class ProjectCache:
         return sorted({project.id for project in listed.projects} | {e.id for e in listed.unreadable if e.id})
 
     def _list(self, fresh: timedelta) -> MasterList:
-        found = self.document(MASTER_LIST, fresh)
-        if found is None:
+        document = self.document(MASTER_LIST, fresh)
+        if document is None:
             return MasterList()
         parsed = self._parsed  # read from the attribute once, since another thread may replace it
-        if parsed is None or parsed[0] != found.etag:
-            listed = read_list(found.body)
+        if parsed is None or parsed[0] != document.etag:
+            listed = read_list(document.body)
             for entry in listed.unreadable:
                 logger.error("a project cannot be read and counts as closed", extra={"project": entry.id})
-            parsed = self._parsed = (found.etag, listed)
+            parsed = self._parsed = (document.etag, listed)
         return parsed[1]
 
     def is_unreadable(self, project_id: str) -> bool:
@@ -82,8 +82,8 @@ class ProjectCache:
 
     def page(self, project: Project, file: str) -> str | None:
         """Return the source of a step page; None if the file is missing. `file` is its name without `.html`."""
-        found = self.document(project.page_key(file), PAGE_FRESH, project.version)
-        return None if found is None else found.body.decode("utf-8", "replace")
+        document = self.document(project.page_key(file), PAGE_FRESH, project.version)
+        return None if document is None else document.body.decode("utf-8", "replace")
 
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
         """Return the document, at most `fresh` old and read for this version of its project; None if it is missing."""

@@ -32,7 +32,7 @@ def located(documents: Documents, project: Project) -> tuple[Project, list[str]]
     below = {entry.key for entry in documents.list(f"{project.id}/{STEPS_FOLDER}/")}
     names = {"": _names(top, project.id, ""), STEPS_FOLDER: _names(below, project.id, STEPS_FOLDER)}
     missing = {
-        folder: sum(not (page in found or f"{page}-0" in found) for page in pages) for folder, found in names.items()
+        folder: sum(not (page in name or f"{page}-0" in name) for page in pages) for folder, name in names.items()
     }
     folder = STEPS_FOLDER if missing[STEPS_FOLDER] < missing[""] else ""
     steps, problems = [], []
@@ -54,7 +54,7 @@ def _names(keys: Iterable[str], project_id: str, folder: str) -> set[str]:
 def _groups(names: Iterable[str], step: Step) -> int:
     """The number of a page's variants: the highest number plus 1, so that a missing one is noticed; 0 without `-0`."""
     pattern = re.compile(re.escape(step.page) + r"-(0|[1-9][0-9]{0,2})")
-    numbers = {int(found[1]) for name in names if (found := pattern.fullmatch(name))}
+    numbers = {int(match[1]) for name in names if (match := pattern.fullmatch(name))}
     return max(numbers) + 1 if 0 in numbers else 0
 
 

@@ -51,10 +51,10 @@ def _zones_of(account: Account, subnets: Sequence[str]) -> list[str]:
 
 def _fargate_zones(account: Account) -> list[str]:
     """Return the region's zones that run Fargate and that this account can use, sorted, without local zones."""
-    found = account.client("ec2").describe_availability_zones()["AvailabilityZones"]
+    availability_zones = account.client("ec2").describe_availability_zones()["AvailabilityZones"]
     return sorted(
         str(zone["ZoneName"])
-        for zone in found
+        for zone in availability_zones
         if zone.get("State") == "available"
         and zone.get("ZoneType", "availability-zone") == "availability-zone"
         and zone.get("OptInStatus") != "not-opted-in"

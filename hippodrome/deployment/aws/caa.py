@@ -36,7 +36,7 @@ class Caa:
         """
         wild = [record for record in self.records if record[0] == "issuewild"] if wildcard else []
         counting = wild or [record for record in self.records if record[0] == "issue"]
-        allowed = any(_allows(value, one, acme) for _, value in counting for one in authorities)
+        allowed = any(_allows(value, authority, acme) for _, value in counting for authority in authorities)
         return [] if allowed else counting
 
 

@@ -91,15 +91,17 @@ def read_zone(account: Account, zone_id: str) -> Zone:
             "Give the id of the domain's public zone.",
         )
     servers = found.get("DelegationSet", {}).get("NameServers", [])
-    return Zone(zone_id, found["HostedZone"]["Name"].rstrip("."), tuple(sorted(one.rstrip(".") for one in servers)))
+    return Zone(
+        zone_id, found["HostedZone"]["Name"].rstrip("."), tuple(sorted(server.rstrip(".") for server in servers))
+    )
 
 
 def record_in(account: Account, zone: Zone, name: str) -> dict[str, Any] | None:
     """Return the zone's A, AAAA or CNAME record of `name`; None if there is none."""
-    found = account.client("route53").list_resource_record_sets(
+    records = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="10"
     )
-    for record in found["ResourceRecordSets"]:
+    for record in records["ResourceRecordSets"]:
         if record["Name"].rstrip(".").lower() == name and record["Type"] in {"A", "AAAA", "CNAME"}:
             return dict(record)
     return None
@@ -113,10 +115,10 @@ def leading_away(account: Account, zone: Zone, name: str) -> tuple[str, str] | N
     """
     labels = name.removesuffix(f".{zone.domain}").split(".")
     for above in (f"{'.'.join(labels[n:])}.{zone.domain}" for n in range(len(labels))):
-        found = account.client("route53").list_resource_record_sets(
+        records = account.client("route53").list_resource_record_sets(
             HostedZoneId=zone.id, StartRecordName=f"{above}.", MaxItems="10"
         )
-        for record in found["ResourceRecordSets"]:
+        for record in records["ResourceRecordSets"]:
             types = {"NS", "CNAME"} if above == name else {"NS"}
             if record["Name"].rstrip(".").lower() == above and record["Type"] in types:
                 return above, record["Type"]
@@ -134,7 +136,7 @@ def exists(account: Account, zone: Zone, name: str) -> bool:
         return True
     labels = name.removesuffix(f".{zone.domain}").split(".")
     wildcards = [f"*.{'.'.join([*labels[n:], zone.domain])}" for n in range(1, len(labels) + 1)]
-    return any(_has_records(account, zone, one) for one in (name, *wildcards))
+    return any(_has_records(account, zone, wildcard) for wildcard in (name, *wildcards))
 
 
 def _has_records(account: Account, zone: Zone, name: str) -> bool:
@@ -142,10 +144,10 @@ def _has_records(account: Account, zone: Zone, name: str) -> bool:
 
     One record tells: in Route 53's order, the names below a name come next after it.
     """
-    found = account.client("route53").list_resource_record_sets(
+    records = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="1"
     )
-    names = [record["Name"].replace(r"\052", "*").rstrip(".").lower() for record in found["ResourceRecordSets"]]
+    names = [record["Name"].replace(r"\052", "*").rstrip(".").lower() for record in records["ResourceRecordSets"]]
     return any(one == name or one.endswith(f".{name}") for one in names)
 
 
@@ -174,7 +176,7 @@ def delegation(zone: Zone) -> Delegation:
     except (dns.exception.DNSException, OSError, ValueError) as error:
         return Delegation((), f"Whether {zone.domain} is delegated could not be asked: {type(error).__name__}.", False)
     found = tuple(sorted(str(one.target).rstrip(".").lower() for one in answer))
-    if zone.name_servers and not set(found) & {one.lower() for one in zone.name_servers}:
+    if zone.name_servers and not set(found) & {name_server.lower() for name_server in zone.name_servers}:
         return Delegation(found, f"{zone.domain} is delegated to other name servers: {', '.join(found)}.")
     return Delegation(found)
 

@@ -53,8 +53,8 @@ def code_bucket(stack: str, account_id: str, region: str) -> str:
 
 def code_bucket_region(stack: str, bucket: str) -> str | None:
     """Return the region of a bucket of that name; None if it is not the code bucket of a stack of that name."""
-    found = re.fullmatch(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)", bucket)
-    return found[1] if found else None
+    match = re.fullmatch(rf"{re.escape(stack.lower())}-code-\d{{12}}-(.+)", bucket)
+    return match[1] if match else None
 
 
 def secret(stack: str, name: str) -> str:

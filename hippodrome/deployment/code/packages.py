@@ -70,10 +70,10 @@ class Target:
     @classmethod
     def from_env(cls) -> Target:
         """Return Lambda's platform; this machine if HIPPODROME_TARGET is `here`. Raises `Problem` for another value."""
-        wanted = os.environ.get("HIPPODROME_TARGET", "")
-        if wanted not in {"", "here", "lambda"}:
-            raise Problem(f"HIPPODROME_TARGET is {wanted!r}.", "It may be `here`, `lambda` or unset.")
-        return cls.here() if wanted == "here" else cls()
+        hippodrome_target = os.environ.get("HIPPODROME_TARGET", "")
+        if hippodrome_target not in {"", "here", "lambda"}:
+            raise Problem(f"HIPPODROME_TARGET is {hippodrome_target!r}.", "It may be `here`, `lambda` or unset.")
+        return cls.here() if hippodrome_target == "here" else cls()
 
     def __str__(self) -> str:
         return f"{'here-' + sys.platform + '-' if self.local else ''}py{self.python}-{self.machine}"
@@ -164,8 +164,10 @@ class Wheel:
         """Return the normalized names of the distributions that the wheel needs on this target, without extras."""
         from packaging.utils import canonicalize_name
 
-        wanted = self._requirements
-        return {canonicalize_name(one.name) for one in wanted if not one.marker or one.marker.evaluate(target.markers)}
+        requirements = self._requirements
+        return {
+            canonicalize_name(one.name) for one in requirements if not one.marker or one.marker.evaluate(target.markers)
+        }
 
     @cached_property
     def _requirements(self) -> Sequence[Requirement]:
@@ -205,12 +207,12 @@ class Wheel:
     @cached_property
     def _record(self) -> dict[str, str]:
         """Read RECORD: by file, the sha256 in hexadecimal; "" for RECORD itself."""
-        found = {}
+        record = {}
         for row in csv.reader(io.StringIO(self._text("RECORD"))):
             if row:
                 kind, _, value = row[1].partition("=")
-                found[row[0]] = base64.urlsafe_b64decode(value + "==").hex() if kind == "sha256" else ""
-        return found
+                record[row[0]] = base64.urlsafe_b64decode(value + "==").hex() if kind == "sha256" else ""
+        return record
 
 
 def _place(name: str) -> str:

@@ -51,10 +51,10 @@ class Template:
         keys = {function.name: function.key for function in functions}
         missing: set[str] = set()
 
-        def key(found: re.Match[str]) -> str:
-            if found[3] not in keys:
-                missing.add(found[3])
-            return f"{found[1]}{keys.get(found[3], found[3])}"
+        def key(match: re.Match[str]) -> str:
+            if match[3] not in keys:
+                missing.add(match[3])
+            return f"{match[1]}{keys.get(match[3], match[3])}"
 
         text = _KEY.sub(key, self.text)
         if missing:

@@ -84,7 +84,7 @@ def count_participants(
     participant's record, and ids that are not well formed, are not counted.
     """
     own = project.own(None)  # nobody's assignment is read: in a block, people are counted as if in the file's order
-    found = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
+    participant_counts = ParticipantCounts(by_step={step.key: 0 for step in project.steps})
     for user_id, entries in folders(documents, project.id):
         arrived: datetime | None = None
         listed: list[Entry] = []
@@ -97,16 +97,16 @@ def count_participants(
             continue
         progress = Progress.from_listing(participant_folder(project.id, user_id), listed)
         at = progress.due_step(own)
-        found.participants += 1
-        found.ended += progress.has_ended
+        participant_counts.participants += 1
+        participant_counts.ended += progress.has_ended
         if not progress.has_ended:
-            found.by_step[at.step_name] += 1
-            found.finished += at.key == project.final.key
-        found.arrived_today += arrived >= today
-        found.last_arrival = max(arrived, found.last_arrival or arrived)
+            participant_counts.by_step[at.step_name] += 1
+            participant_counts.finished += at.key == project.final.key
+        participant_counts.arrived_today += arrived >= today
+        participant_counts.last_arrival = max(arrived, participant_counts.last_arrival or arrived)
         if advance:
-            advance(found.participants)
-    return found
+            advance(participant_counts.participants)
+    return participant_counts
 
 
 def folders(documents: Documents, project_id: str) -> Iterator[tuple[str, Iterator[Entry]]]:

@@ -175,10 +175,10 @@ def _no_effect(config: Config, installation: Installation) -> Iterator[tuple[Key
         )
 
 
-def _with_lines(folder: Path, found: list[tuple[KeyPath, str]], remark: bool = False) -> list[str]:
+def _with_lines(folder: Path, key_paths: list[tuple[KeyPath, str]], remark: bool = False) -> list[str]:
     """Put before each text its line in config.yml."""
-    source = read_source(folder) if found else None
-    return [str(source.diagnostic(path, text, remark=remark)) for path, text in found] if source else []
+    source = read_source(folder) if key_paths else None
+    return [str(source.diagnostic(path, text, remark=remark)) for path, text in key_paths] if source else []
 
 
 def _agent(folder: Path, config: Config) -> Iterator[str]:

@@ -75,7 +75,9 @@ def stored(account: Account, stack: str) -> dict[str, datetime]:
     prefix = resource_names.secret(stack, "")
     filters = [{"Key": "Path", "Option": "OneLevel", "Values": [prefix.rstrip("/")]}]
     pages = account.client("ssm").get_paginator("describe_parameters").paginate(ParameterFilters=filters)
-    found = {str(one["Name"]): one["LastModifiedDate"] for page in pages for one in page["Parameters"]}
+    found = {
+        str(parameter["Name"]): parameter["LastModifiedDate"] for page in pages for parameter in page["Parameters"]
+    }
     return {name.removeprefix(prefix): when for name, when in sorted(found.items())}
 
 

@@ -103,7 +103,9 @@ def _read(folder: Path) -> Config:
         return read_project(folder)
     except ConfigErrors as errors:
         raise Problem(
-            f"The project in {folder} has mistakes.", "Correct them first.", [str(one) for one in errors.diagnostics]
+            f"The project in {folder} has mistakes.",
+            "Correct them first.",
+            [str(diagnostic) for diagnostic in errors.diagnostics],
         ) from None
 
 
@@ -160,7 +162,7 @@ def _before(study: StudyToEstimate, waiting: Sequence[WarmCost], prices: Prices,
                 "study": [_line(line) for line in lines],
                 "total": total(lines).as_json(),
                 "perParticipant": (total(lines) * (1 / study.participants)).as_json(),
-                "warmServers": [_warm(one) for one in waiting],
+                "warmServers": [_warm(person) for person in waiting],
                 "month": [_line(line) for line in monthly],
                 "monthTotal": total(monthly).as_json(),
                 "assumptions": notes,
@@ -192,9 +194,9 @@ def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
 def _show_warm(waiting: Sequence[WarmCost]) -> None:
     """Print what warm servers cost in an hour and in a day, since it is not known how long their studies stay live."""
     rows: list[Sequence[object]] = []
-    for one in waiting:
-        size = f"{one.servers} of {one.cpu:g} vCPU, {one.memory:g} GB"
-        kinds = ((one.project_id, f"{size}, on Spot", one.spot), ("", "the same on demand", one.on_demand))
+    for person in waiting:
+        size = f"{person.servers} of {person.cpu:g} vCPU, {person.memory:g} GB"
+        kinds = ((person.project_id, f"{size}, on Spot", person.spot), ("", "the same on demand", person.on_demand))
         rows += [(name, what, _money(hour.likely), _money(hour.likely * 24)) for name, what, hour in kinds]
     if rows:
         title = "Servers that are kept warm, for as long as the study is live, even without participants"
@@ -216,14 +218,14 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     with screen.ProgressBars() as progress:
         bar = progress.add_task("Reading the records of servers", total=None)
         every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
-    sizes = {one.id: (one.size.cpu, one.size.memory) for one in projects}
-    owned = {one.id: [r for r in every if r.project_id == one.id] for one in projects}
+    sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
+    owned = {project.id: [r for r in every if r.project_id == project.id] for project in projects}
     by_project = {name: spent(found, prices, at, sizes) for name, found in owned.items() if project or found}
     waited = {name: spent([r for r in owned[name] if r.is_warm_server], prices, at, sizes) for name in by_project}
     now_warm = [
-        warm(one.id, one.warm_servers, one.size.cpu, one.size.memory, prices)
-        for one in projects
-        if one.live and one.warm_servers
+        warm(project.id, project.warm_servers, project.size.cpu, project.size.memory, prices)
+        for project in projects
+        if project.live and project.warm_servers
     ]
     mine = [r for r in every if project in (None, r.project_id)]
     bill, no_bill = _bill(account, stack, mine, at) if ask_aws else (None, "")
@@ -324,12 +326,12 @@ def _line(line: CostLine) -> dict[str, Any]:
     return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
 
 
-def _warm(one: WarmCost) -> dict[str, Any]:
+def _warm(warm_cost: WarmCost) -> dict[str, Any]:
     return {
-        "project": one.project_id,
-        "servers": one.servers,
-        "spotHour": one.spot.as_json(),
-        "onDemandHour": one.on_demand.as_json(),
+        "project": warm_cost.project_id,
+        "servers": warm_cost.servers,
+        "spotHour": warm_cost.spot.as_json(),
+        "onDemandHour": warm_cost.on_demand.as_json(),
     }
 
 

@@ -164,7 +164,11 @@ def _delete_failed(prepared: Prepared) -> None:
     assert found
     screen.info(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
     screen.info("It is deleted and made anew.")
-    buckets = [one["PhysicalResourceId"] for one in stack.resources() if one["ResourceType"] == "AWS::S3::Bucket"]
+    buckets = [
+        resource["PhysicalResourceId"]
+        for resource in stack.resources()
+        if resource["ResourceType"] == "AWS::S3::Bucket"
+    ]
     StackDeletion(prepared.account, stack, Executor()).run("Deleting the failed stack")
     s3 = prepared.account.client("s3")
     for bucket in filter(None, buckets):
@@ -185,9 +189,12 @@ def _delete_old_change_sets(prepared: Prepared) -> None:
     client = prepared.account.client("cloudformation")
     try:
         for page in client.get_paginator("list_change_sets").paginate(StackName=prepared.stack.name):
-            for one in page["Summaries"]:
-                if one["ChangeSetName"].startswith(PREFIX) and one.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
-                    client.delete_change_set(ChangeSetName=one["ChangeSetId"], StackName=prepared.stack.name)
+            for summary in page["Summaries"]:
+                if (
+                    summary["ChangeSetName"].startswith(PREFIX)
+                    and summary.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS"
+                ):
+                    client.delete_change_set(ChangeSetName=summary["ChangeSetId"], StackName=prepared.stack.name)
     except ClientError as error:
         if errors.code(error) != "ValidationError":  # the stack does not exist any more
             raise

@@ -50,16 +50,16 @@ def command(
     return remains.conclude(options.same_place(account.region, profile))
 
 
-def _tell(account: Account, stack: str, found: FoundInstallation, data: bool, as_json: bool) -> int:
+def _tell(account: Account, stack: str, installation: FoundInstallation, data: bool, as_json: bool) -> int:
     if as_json:
-        screen.result_json(_as_json(found))
-    elif found:
-        _show(found, data)
+        screen.result_json(_as_json(installation))
+    elif installation:
+        _show(installation, data)
     else:
         screen.result(f"There is nothing of {stack} in {account.region}.")
         if hint := elsewhere(account, stack):
             screen.warning(hint)
-    to_do = found.stack or found.things or (data and found.data)
+    to_do = installation.stack or installation.things or (data and installation.data)
     return Exit.CHANGES if to_do else Exit.DONE
 
 
@@ -83,11 +83,11 @@ def _show(found: FoundInstallation, data: bool) -> None:
         )
 
 
-def _as_json(found: FoundInstallation) -> dict[str, Any]:
+def _as_json(installation: FoundInstallation) -> dict[str, Any]:
     return {
-        "stack": found.stack["StackStatus"] if found.stack else None,
-        "things": [{"kind": thing.kind, "name": thing.name} for thing in found.things],
-        "data": list(found.data),
+        "stack": installation.stack["StackStatus"] if installation.stack else None,
+        "things": [{"kind": thing.kind, "name": thing.name} for thing in installation.things],
+        "data": list(installation.data),
     }
 
 

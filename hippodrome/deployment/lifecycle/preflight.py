@@ -88,9 +88,9 @@ def _bad_last(found: Iterable[Finding]) -> list[Finding]:
     return sorted(found, key=lambda one: one.mark is Mark.BAD)
 
 
-def _stop(found: Sequence[Finding], anyway: bool = False) -> None:
-    show(_bad_last(found), screen.err)
-    bads = sum(one.mark is Mark.BAD for one in found)
+def _stop(findings: Sequence[Finding], anyway: bool = False) -> None:
+    show(_bad_last(findings), screen.err)
+    bads = sum(one.mark is Mark.BAD for one in findings)
     if bads and not anyway:
         raise Problem(
             f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
@@ -353,10 +353,10 @@ def _left_over(prepared: Prepared) -> Iterator[Finding]:
     if prepared.found is not None:
         return
     name = prepared.stack.name
-    if left := inventory.log_groups(prepared.account, name):
+    if log_groups := inventory.log_groups(prepared.account, name):
         yield bad(
             "left over",
-            f"An earlier installation {name} has left {count(len(left), 'log group')}, such as {left[0]}.",
+            f"An earlier installation {name} has left {count(len(log_groups), 'log group')}, such as {log_groups[0]}.",
             f"Finish its removal: `hippodrome destroy --stack {name}`. The data stay.",
         )
 

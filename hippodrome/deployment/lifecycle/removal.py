@@ -91,20 +91,20 @@ class Removal:
             [*filter(None, attached)],
         )
 
-    def plan(self, found: FoundInstallation, data: bool) -> list[PlanStep]:
+    def plan(self, installation: FoundInstallation, data: bool) -> list[PlanStep]:
         """Plan the steps in their order: the stack, the resources outside of it, and with `data` also the data."""
-        steps: list[PlanStep] = [step(self._prepare_stack, found.stack)] if found.stack else []
-        steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
-        steps += [step(self._remember, found), step(self._delete_stack, found)]
-        steps += [step(self._acme_records, addresses) for addresses in found.addresses]
+        steps: list[PlanStep] = [step(self._prepare_stack, installation.stack)] if installation.stack else []
+        steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in installation.data]
+        steps += [step(self._remember, installation), step(self._delete_stack, installation)]
+        steps += [step(self._acme_records, addresses) for addresses in installation.addresses]
         steps += [step(self._validation_records), step(self._task_definitions), step(self._log_groups)]
         steps.append(step(self._secrets))
         steps.append(step(self._bucket, self._code.name, "code"))
         return steps + ([step(self._data_buckets)] if data else [])
 
-    def run(self, found: FoundInstallation, data: bool) -> None:
+    def run(self, installation: FoundInstallation, data: bool) -> None:
         """Remove everything, the data only with `data`. Raises `Problem` if AWS or another resource prevents it."""
-        self.executor.execute(self.plan(found, data))
+        self.executor.execute(self.plan(installation, data))
 
     # -- steps
 
@@ -119,18 +119,18 @@ class Removal:
         if described["StackStatus"] != "CREATE_IN_PROGRESS":  # a creation may take hours, and can be deleted
             self._stack.attach()
 
-    def _remember(self, found: FoundInstallation) -> None:
+    def _remember(self, installation: FoundInstallation) -> None:
         """Write down the validation records of the site's certificate, while ACM still knows them."""
-        if not found.stack or not found.addresses:
+        if not installation.stack or not installation.addresses:
             return
-        arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(found)
+        arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(installation)
         self._records = [one for arn in arns for one in acm_records.of_certificate(self.account, arn, zone)]
         acm_records.remember(self._code, self._records)
 
-    def _delete_stack(self, found: FoundInstallation) -> None:
-        stop_servers = partial(self._stop_servers, found.installation)
+    def _delete_stack(self, installation: FoundInstallation) -> None:
+        stop_servers = partial(self._stop_servers, installation.installation)
         StackDeletion(self.account, self._stack, self.executor, stop_servers).run()
-        if found.stack:
+        if installation.stack:
             screen.success(f"The stack {self.name} is deleted.")
 
     def _stop_servers(self, installation: Installation | None) -> None:
@@ -150,10 +150,10 @@ class Removal:
         tasks = EcsTasks(lambda: ecs, lambda: self.account.client("ec2"), installation.__getitem__)
 
         def running() -> Sequence[str]:
-            found = tasks.arns(cluster)
-            for arn in found:
+            arns = tasks.arns(cluster)
+            for arn in arns:
                 _remove(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
-            return found
+            return arns
 
         if left_running := self.executor.wait(running, STOPPING):
             raise Problem(
@@ -239,10 +239,10 @@ def _remove(call: Callable[..., Any], **arguments: Any) -> None:
             raise
 
 
-def _zone(found: FoundInstallation) -> str:
+def _zone(installation: FoundInstallation) -> str:
     """Return the hosted zone of the present stack; without a stack, of the stack of its name that was deleted last."""
-    standing = inventory.addresses([found.stack] if found.stack else [])
-    return (standing or found.addresses)[0].zone
+    standing = inventory.addresses([installation.stack] if installation.stack else [])
+    return (standing or installation.addresses)[0].zone
 
 
 def _installation(account: Account, found: Mapping[str, Any] | None) -> Installation | None:

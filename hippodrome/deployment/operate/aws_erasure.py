@@ -76,7 +76,7 @@ def _new_receipt(began: datetime) -> Path:
     """Choose a file name that is free in this folder, since a script may erase several participants in a second."""
     name = f"erased-{began:%Y%m%dT%H%M%SZ}"
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(path for path in map(Path, (f"{each}.json" for each in names)) if not path.exists())
+    return next(path for path in map(Path, (f"{name}.json" for name in names)) if not path.exists())
 
 
 def _projects(account: Account, installation: Installation) -> list[str]:
@@ -95,11 +95,11 @@ def _must_be_known(project: str, known: list[str], stack: str) -> None:
         )
 
 
-def _erase(erasers: list[Eraser], found: Mapping[str, FoundOfParticipant]) -> None:
+def _erase(erasers: list[Eraser], participants_data: Mapping[str, FoundOfParticipant]) -> None:
     with screen.ProgressBars() as bars:
-        bar = bars.add_task("Erasing", total=sum(one.documents for one in found.values()))
+        bar = bars.add_task("Erasing", total=sum(one.documents for one in participants_data.values()))
         for eraser in erasers:
-            if found[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):
+            if participants_data[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):
                 raise Problem(
                     f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
                     "The participant's link is in use. Close the study with `register --no-live`, and run this again.",
@@ -119,27 +119,27 @@ def _advance(bars: Progress, bar: TaskID, count: int) -> None:
     bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
 
 
-def _show(found: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
+def _show(participants_data: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
     if json:
-        screen.result_json({"found": {name: one.counts() for name, one in found.items()}})
+        screen.result_json({"found": {name: one.counts() for name, one in participants_data.items()}})
         return
-    rows = [(name, *one.counts().values()) for name, one in found.items() if one]
+    rows = [(name, *one.counts().values()) for name, one in participants_data.items() if one]
     if rows:
-        heads = max((list(one.counts()) for one in found.values()), key=len)
+        heads = max((list(one.counts()) for one in participants_data.values()), key=len)
         screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
-        _warn_of_others(found)
+        _warn_of_others(participants_data)
     elif dry_run:
-        screen.result(f"There is nothing of this participant in {', '.join(found) or 'any project'}.")
+        screen.result(f"There is nothing of this participant in {', '.join(participants_data) or 'any project'}.")
 
 
-def _warn_of_others(found: Mapping[str, FoundOfParticipant]) -> None:
+def _warn_of_others(participants_data: Mapping[str, FoundOfParticipant]) -> None:
     """Warn that the servers of sessions will be stopped on which other participants still play."""
-    playing = sum(not each.is_closed for one in found.values() for each in one.of_sessions)
+    playing = sum(not each.is_closed for one in participants_data.values() for each in one.of_sessions)
     if playing:
         screen.warning(
             f"They play with others now: {count(playing, 'session')} will be stopped, for all who play there."
         )
 
 
-def _words(found: FoundOfParticipant) -> str:
-    return ", ".join(f"{count:,} {what}" for what, count in found.counts().items() if count)
+def _words(participant_data: FoundOfParticipant) -> str:
+    return ", ".join(f"{count:,} {what}" for what, count in participant_data.counts().items() if count)

@@ -70,7 +70,7 @@ class FoundOfParticipant:
     @property
     def runs(self) -> bool:
         """Whether a server runs, or resources of one are left."""
-        return bool(self.resources or self.draining or any(not each.is_closed for each in self.records))
+        return bool(self.resources or self.draining or any(not record.is_closed for record in self.records))
 
     @property
     def records(self) -> list[Server]:
@@ -131,8 +131,8 @@ class Eraser:
         """Find everything about this participant. Changes nothing."""
         record = self._record(self._record_key)
         sessions = self._sessions.sessions()
-        labels = {each.id: ids.server_label(self.project, each.id) for each in sessions}
-        of_sessions = [each for label in labels.values() if (each := self._record(server.key(label)))]
+        labels = {session.id: ids.server_label(self.project, session.id) for session in sessions}
+        of_sessions = [of_session for label in labels.values() if (of_session := self._record(server.key(label)))]
         self._warm_servers = self._warm_servers.union(warm_servers_of(record))
         names = self._warm_servers.union(*map(warm_servers_of, of_sessions))
         self._scope = Scope(labels=frozenset({self._label, *labels.values()}), names=names)
@@ -140,7 +140,7 @@ class Eraser:
         own_name = record.dns_record if record else None
         if own_name and own_name not in left.dns_records and self._is_in_zone(own_name):
             left.dns_records.append(own_name)
-        found = FoundOfParticipant(
+        participant_data = FoundOfParticipant(
             documents=sum(1 for _ in itertools.chain(self._lobby.look(), self._cells.look(), *self._documents())),
             record=record,
             resources=left,
@@ -149,25 +149,31 @@ class Eraser:
             sessions=sessions,
             of_sessions=of_sessions,
         )
-        self.receipt.remains, self.receipt.looked = found.counts(), self._platform.now()
-        return found
+        self.receipt.remains, self.receipt.looked = participant_data.counts(), self._platform.now()
+        return participant_data
 
-    def plan(self, found: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
+    def plan(
+        self, participant_data: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None
+    ) -> list[PlanStep]:
         """Plan one round's steps: server, documents, and last the slot, so that no newcomer takes it too early."""
         steps: list[PlanStep] = [step(self._begin_round)]
-        if found.runs:
-            steps += [step(self._stop, found), *removal_steps(self._platform, found.resources), step(self._wait)]
-            steps += cluster_steps(self._platform, found.resources)
-        if not found.resources.tasks and any(map(self._settling, found.records)):
+        if participant_data.runs:
+            steps += [
+                step(self._stop, participant_data),
+                *removal_steps(self._platform, participant_data.resources),
+                step(self._wait),
+            ]
+            steps += cluster_steps(self._platform, participant_data.resources)
+        if not participant_data.resources.tasks and any(map(self._settling, participant_data.records)):
             steps += [step(self._settle), step(self._wait)]
-        if self._late and found.of_sessions:
-            steps.append(step(self._outlast_sessions, found.sessions))
-        steps += [step(self._leave_session, each, advance) for each in found.sessions]
+        if self._late and participant_data.of_sessions:
+            steps.append(step(self._outlast_sessions, participant_data.sessions))
+        steps += [step(self._leave_session, session, advance) for session in participant_data.sessions]
         steps += [step(self._leave_lobby, advance), step(self._delete, advance)]
-        if found.slots:
+        if participant_data.slots:
             steps.append(step(self._slots().release_participant, self.project, self._user))
-        if self._late and found.record:
-            steps.append(step(self._outlast, found.record))
+        if self._late and participant_data.record:
+            steps.append(step(self._outlast, participant_data.record))
         return steps
 
     def unreadable(self) -> list[str]:
@@ -239,15 +245,17 @@ class Eraser:
     def _begin_round(self) -> None:
         self.receipt.rounds += 1
 
-    def _stop(self, found: FoundOfParticipant) -> None:
+    def _stop(self, participant_data: FoundOfParticipant) -> None:
         """Count the resources for the receipt, and stop the servers as `stop_server` does."""
         from hippodrome.control.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.control.servers.termination import Termination  # noqa: PLC0415 - the same
 
-        for kind, number in found.resources.counts().items():
+        for kind, number in participant_data.resources.counts().items():
             self.receipt.removed[kind] += number
         stops = [
-            StopServer(self.project, each.user_id, None, Reason.STOPPED) for each in found.records if not each.is_closed
+            StopServer(self.project, record.user_id, None, Reason.STOPPED)
+            for record in participant_data.records
+            if not record.is_closed
         ]
         if stops:
             with functions_log():  # the following steps do again what fails here
@@ -283,8 +291,8 @@ class Eraser:
         if not found.others:
             record = self._record(key)
             if record is None or record.is_closed:
-                for each in (*keys_of_warm_servers(self.project, warm_servers_of(record)), key):
-                    self._bucket.delete(self._bucket.versions_of(each), note)
+                for keys_of_warm_server in (*keys_of_warm_servers(self.project, warm_servers_of(record)), key):
+                    self._bucket.delete(self._bucket.versions_of(keys_of_warm_server), note)
                 self._sessions.delete_session(found, note)
             return
         self._sessions.take_out(found, note)
@@ -322,8 +330,8 @@ class Eraser:
         """Wait until the sessions' servers get no presigned requests any more, and all earlier ones are invalid."""
         from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
 
-        records = (self._record(server.key(ids.server_label(self.project, each.id))) for each in sessions)
-        ends = [each.closed for each in records if each is not None and each.closed is not None]
+        records = (self._record(server.key(ids.server_label(self.project, session.id))) for session in sessions)
+        ends = [record.closed for record in records if record is not None and record.closed is not None]
         if ends:
             over = (self._platform.now() - max(ends)).total_seconds()
             self._sleep(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING - over)

@@ -76,10 +76,10 @@ class FolderEraser:
             def note(versions: Sequence[Version]) -> None:
                 done.files += len(versions)
 
-            for found in sessions:
-                if not found.others:
-                    self._folder.delete(self._of_server(ids.server_label(self.project, found.id)), note)
-                self._sessions.leave(found, note)
+            for session in sessions:
+                if not session.others:
+                    self._folder.delete(self._of_server(ids.server_label(self.project, session.id)), note)
+                self._sessions.leave(session, note)
             self._lobby.erase(note)
             self._cells.erase(note)
             self._release_slot()
@@ -149,7 +149,7 @@ class FolderEraser:
 
     def _must_be_over(self, sessions: Sequence[FoundSession]) -> None:
         """Raise `Problem` if a killed `run` has left a running server, or recordings that it has not moved."""
-        theirs = [session_folder(self.project, found.id) for found in sessions]
+        theirs = [session_folder(self.project, session.id) for session in sessions]
         folders = {participant_folder(self.project, self._user), *theirs}
         runs = any(_runs(path, folders) for path in sorted((self._state / "tasks").glob("*")))
         spool = DataFolder(self._state / "spool")

@@ -133,10 +133,10 @@ def _of_text(text: str, time: datetime, source: str, stream: str) -> LogLine:
         return LogLine(time, source, "ERROR", text.strip(), stream=stream)
     if _PLATFORM_TEXT.match(text) and source != TRIAL:
         return LogLine(time, source, "", text.strip(), platform=True, stream=stream)
-    found = _TEXT.match(text)
-    if found:
-        level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(found[1], found[1])
-        return LogLine(time, source, level, found[2].rstrip("\n"), stream=stream)
+    match = _TEXT.match(text)
+    if match:
+        level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(match[1], match[1])
+        return LogLine(time, source, level, match[2].rstrip("\n"), stream=stream)
     return LogLine(time, source, "", text.rstrip("\n"), stream=stream)
 
 

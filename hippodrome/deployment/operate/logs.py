@@ -45,7 +45,7 @@ class Reader:
         """
         groups = self._client.get_paginator("describe_log_groups")
         try:
-            found = [
+            log_sources = [
                 resource_names.log_source(self._stack, group["logGroupName"])
                 for prefix in resource_names.log_prefixes(self._stack)
                 for page in groups.paginate(logGroupNamePrefix=prefix)
@@ -55,7 +55,7 @@ class Reader:
             if aws_errors.code(error) != "AccessDeniedException":
                 raise
             return sorted([*Template.read().functions, TRIAL])
-        return sorted(found)
+        return sorted(log_sources)
 
     def events(
         self, sources: Iterable[str], since: datetime, project_id: str | None = None
@@ -65,7 +65,7 @@ class Reader:
         With each line comes its event's id, by which `follow` recognises new events.
         """
         streams = [self._events(source, since, project_id) for source in sources]
-        for _, _, event, source in heapq.merge(*streams, key=lambda one: one[:2]):
+        for _, _, event, source in heapq.merge(*streams, key=lambda stream: stream[:2]):
             yield f"{source}/{_id_of(event)}", read(event, source)
 
     def _events(

@@ -81,7 +81,7 @@ class SessionEraser:
             return
         member = parsed.member(self._user)
         if member is not None:
-            others = any(each.user_id not in ("", self._user) for each in parsed.members)
+            others = any(member.user_id not in ("", self._user) for member in parsed.members)
             before = found.get(session)
             found[session] = FoundSession(session, member.seat, others and (before is None or before.others))
 
@@ -100,8 +100,8 @@ class SessionEraser:
 
     def leave_sessions(self, note: Note = lambda _: None) -> None:
         """Take the participant out of all their sessions. No server of these sessions may run."""
-        for found in self.sessions():
-            self.leave(found, note)
+        for session in self.sessions():
+            self.leave(session, note)
 
     def leave(self, found: FoundSession, note: Note) -> None:
         """Take the participant out of one session, whose server must not run."""
@@ -136,14 +136,14 @@ class SessionEraser:
         self._storage.delete(older(self._storage, key), note)
 
     def _without(self, parsed: SessionDocument) -> bytes:
-        members = (replace(each, user_id="") if each.user_id == self._user else each for each in parsed.members)
+        members = (replace(member, user_id="") if member.user_id == self._user else member for member in parsed.members)
         return replace(parsed, members=tuple(members)).to_json()
 
     def delete_session(self, found: FoundSession, note: Note) -> None:
         """Delete all documents of a session without other members; the session's own document comes last."""
         folder, last = session_folder(self._project, found.id), session_key(self._project, found.id)
         self._storage.delete([*self._storage.uploads(folder)], note)
-        self._storage.delete([each for each in self._storage.versions(folder) if each.key != last], note)
+        self._storage.delete([version for version in self._storage.versions(folder) if version.key != last], note)
         self._storage.delete([*self._storage.versions_of(last)], note)
 
     def _rewrite(self, key: str, seat: int) -> None:

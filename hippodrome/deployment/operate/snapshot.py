@@ -120,8 +120,8 @@ class Snapshot:
                 if cause and one.closed and one.closed >= self.at - DAY:
                     name = one.warm_server_name or ids.server_name(record.label, one.attempt)
                     found.setdefault((record.project_id, cause), []).append((one.closed, name))
-        made = [ServerFailure(*key, len(ends), *max(ends)) for key, ends in found.items()]
-        return sorted(made, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
+        server_failures = [ServerFailure(*key, len(ends), *max(ends)) for key, ends in found.items()]
+        return sorted(server_failures, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
 
     def warm(self, project_id: str) -> WarmServers:
         """Count the warm servers of a project."""

@@ -174,8 +174,8 @@ def as_data(look: Snapshot, installation: Installation, bill: Billed | None = No
 
 def _warm(look: Snapshot, project: Project) -> Mapping[str, int]:
     found = look.warm(project.id)
-    wanted = project.warm_servers if project.live else 0
-    return {"wanted": wanted, "ready": found.ready, "there": found.there, "assignedToday": found.assigned_today}
+    warm_servers = project.warm_servers if project.live else 0
+    return {"wanted": warm_servers, "ready": found.ready, "there": found.there, "assignedToday": found.assigned_today}
 
 
 def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
@@ -218,10 +218,10 @@ def picture(look: Snapshot, installation: Installation) -> RenderableType:
 
 
 def _table(*columns: str) -> Table:
-    made = Table(box=None, pad_edge=False, header_style="bold")
+    table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
-        made.add_column(column, overflow="fold")
-    return made
+        table.add_column(column, overflow="fold")
+    return table
 
 
 def _projects(look: Snapshot) -> list[RenderableType]:

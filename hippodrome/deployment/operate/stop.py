@@ -110,11 +110,11 @@ class Stopper:
             [task for task in draining if self._scope.covers(owners.get(task.name))],
         )
 
-    def plan(self, found: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
+    def plan(self, servers: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
         """Plan the steps that stop and remove what was found; empty if only tasks that are stopping are left."""
-        steps = [step(self._stop_servers, found.servers, advance)] if found.servers else []
-        steps += removal_steps(self._platform, found.leftovers)
-        return steps + cluster_steps(self._platform, found.leftovers)
+        steps = [step(self._stop_servers, servers.servers, advance)] if servers.servers else []
+        steps += removal_steps(self._platform, servers.leftovers)
+        return steps + cluster_steps(self._platform, servers.leftovers)
 
     def _stop_servers(self, servers: Sequence[Server], advance: Callable[[int], None]) -> None:
         """Stop the servers in chunks. `Termination` reads each record again and decides by what it finds then."""
@@ -132,7 +132,10 @@ class Stopper:
 
     def _stop_chunk(self, servers: Sequence[Server]) -> list[str]:
         """Stop servers with one call, and return the names of the servers that are stopped."""
-        stops = {StopServer(one.project_id, one.user_id, one.attempt, Reason.STOPPED): one.name for one in servers}
+        stops = {
+            StopServer(server.project_id, server.user_id, server.attempt, Reason.STOPPED): server.name
+            for server in servers
+        }
         again = self._termination.stop([*stops])
         return [name for stop, name in stops.items() if stop not in again]
 

@@ -56,5 +56,5 @@ def newest(storage: Storage, key: str) -> Version | None:
 def older(storage: Storage, key: str) -> list[Version]:
     """Return all versions of a document except the newest; all of them if the newest is a delete marker."""
     versions = [*storage.versions_of(key)]
-    deleted = any(each.latest and each.marker for each in versions)
-    return [each for each in versions if deleted or not each.latest]
+    deleted = any(version.latest and version.marker for version in versions)
+    return [version for version in versions if deleted or not version.latest]

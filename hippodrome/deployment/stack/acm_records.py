@@ -53,10 +53,10 @@ def in_use_by(account: Account, arn: str) -> list[str]:
     return list(_describe(account, arn, account.region).get("InUseBy", ()))
 
 
-def remember(bucket: CodeBucket, found: Iterable[Validation]) -> None:
+def remember(bucket: CodeBucket, validations: Iterable[Validation]) -> None:
     """Write into the code bucket which records have to be deleted after the stack."""
     known = remembered(bucket)
-    wanted = list(dict.fromkeys([*known, *found]))
+    wanted = list(dict.fromkeys([*known, *validations]))
     if wanted != known and bucket.exists():
         bucket.put(NOTE, json.dumps([one._asdict() for one in wanted]).encode())
 
@@ -67,12 +67,12 @@ def remembered(bucket: CodeBucket) -> list[Validation]:
     return [Validation(**one) for one in json.loads(body)] if body else []
 
 
-def present(account: Account, one: Validation) -> dict[str, Any] | None:
+def present(account: Account, validation: Validation) -> dict[str, Any] | None:
     """Return the record in the zone; None if it is gone or has changed."""
     client = account.client("route53")
     try:
         answer = client.list_resource_record_sets(
-            HostedZoneId=one.zone, StartRecordName=f"{one.name}.", StartRecordType="CNAME", MaxItems="1"
+            HostedZoneId=validation.zone, StartRecordName=f"{validation.name}.", StartRecordType="CNAME", MaxItems="1"
         )
     except ClientError as error:
         if errors.code(error) in _GONE:
@@ -80,7 +80,7 @@ def present(account: Account, one: Validation) -> dict[str, Any] | None:
         raise
     for record in answer["ResourceRecordSets"]:
         values = [_plain(item["Value"]) for item in record.get("ResourceRecords", ())]
-        if _plain(record["Name"]) == one.name and record["Type"] == "CNAME" and values == [one.value]:
+        if _plain(record["Name"]) == validation.name and record["Type"] == "CNAME" and values == [validation.value]:
             return dict(record)
     return None
 
@@ -89,21 +89,21 @@ def of_domain(account: Account, zone: str, domain: str) -> list[Validation]:
     """Return all records in a zone that prove this domain to ACM, for any account."""
     if not domain:
         return []
-    found: list[Validation] = []
+    validations: list[Validation] = []
     try:
         pages = account.client("route53").get_paginator("list_resource_record_sets")
         for page in pages.paginate(HostedZoneId=zone, StartRecordName=f"{domain}."):
             for record in page["ResourceRecordSets"]:
                 if _plain(record["Name"]) != domain and not _plain(record["Name"]).endswith(f".{domain}"):
-                    return found  # the listing has passed the domain: its subdomains follow it directly
+                    return validations  # the listing has passed the domain: its subdomains follow it directly
                 values = [_plain(item["Value"]) for item in record.get("ResourceRecords", ())]
-                one = Validation(zone, _plain(record["Name"]), values[0] if len(values) == 1 else "")
-                if record["Type"] == "CNAME" and one.domain == domain and one.value.endswith(_ACM):
-                    found.append(one)
+                validation = Validation(zone, _plain(record["Name"]), values[0] if len(values) == 1 else "")
+                if record["Type"] == "CNAME" and validation.domain == domain and validation.value.endswith(_ACM):
+                    validations.append(validation)
     except ClientError as error:
         if errors.code(error) not in _GONE:
             raise
-    return found
+    return validations
 
 
 def removal(zone: str, record: Mapping[str, Any]) -> str:
@@ -117,43 +117,45 @@ def deletion(record: Mapping[str, Any]) -> dict[str, Any]:
     return {"Changes": [{"Action": "DELETE", "ResourceRecordSet": record}]}
 
 
-def remove(account: Account, one: Validation) -> bool:
+def remove(account: Account, validation: Validation) -> bool:
     """Delete the record. Return False if there was none."""
-    record = present(account, one)
+    record = present(account, validation)
     if record is None:
         return False
     try:
-        account.client("route53").change_resource_record_sets(HostedZoneId=one.zone, ChangeBatch=deletion(record))
+        account.client("route53").change_resource_record_sets(
+            HostedZoneId=validation.zone, ChangeBatch=deletion(record)
+        )
     except ClientError as error:
         if errors.code(error) not in {"InvalidChangeBatch", *_GONE}:  # another run was faster
             raise
     return True
 
 
-def users(account: Account, one: Validation) -> list[str]:
+def users(account: Account, validation: Validation) -> list[str]:
     """Find what needs the record: ARNs of this account's certificates; in words, regions that were not asked."""
     try:
         regions = _regions(account)
     except ClientError:
         return ["whatever is in other regions, which these credentials may not list"]
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        found = pool.map(lambda region: [*_users_in(account, region, one)], regions)
+        found = pool.map(lambda region: [*_users_in(account, region, validation)], regions)
         return [user for users_of_region in found for user in users_of_region]
 
 
 def _regions(account: Account) -> Sequence[str]:
     """Return the regions that are enabled for this account."""
-    return sorted(one["RegionName"] for one in account.client("ec2").describe_regions()["Regions"])
+    return sorted(region["RegionName"] for region in account.client("ec2").describe_regions()["Regions"])
 
 
-def _users_in(account: Account, region: str, one: Validation) -> Iterator[str]:
-    names = {one.domain, f"*.{one.domain}"}
+def _users_in(account: Account, region: str, validation: Validation) -> Iterator[str]:
+    names = {validation.domain, f"*.{validation.domain}"}
     try:
         pages = account.client("acm", region).get_paginator("list_certificates")
         for page in pages.paginate(Includes={"keyTypes": list(KEY_TYPES)}):
             for found in page["CertificateSummaryList"]:
                 arn = found["CertificateArn"]
-                if _may_name(found, names) and _needs(account, arn, region, one):
+                if _may_name(found, names) and _needs(account, arn, region, validation):
                     yield arn
     except (ClientError, BotoCoreError):  # a region that the organization has forbidden, or that does not answer
         yield f"whatever is in {region}, where these credentials may not look"
@@ -164,17 +166,17 @@ def _may_name(found: dict[str, Any], names: Collection[str]) -> bool:
     return bool(listed & set(names)) or bool(found.get("HasAdditionalSubjectAlternativeNames"))
 
 
-def _needs(account: Account, arn: str, region: str, one: Validation) -> bool:
+def _needs(account: Account, arn: str, region: str, validation: Validation) -> bool:
     """Whether the record validates the certificate. A certificate whose record ACM has not made yet counts as well."""
     described = _describe(account, arn, region)
     options = described.get("DomainValidationOptions", ())
     waiting = any(
         option.get("ValidationMethod") == "DNS"
         and "ResourceRecord" not in option
-        and option["DomainName"].removeprefix("*.") == one.domain
+        and option["DomainName"].removeprefix("*.") == validation.domain
         for option in options
     )
-    return waiting or any(name == one.name for name, _ in _records(described))
+    return waiting or any(name == validation.name for name, _ in _records(described))
 
 
 def _describe(account: Account, arn: str, region: str) -> dict[str, Any]:

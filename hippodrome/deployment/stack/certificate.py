@@ -301,8 +301,8 @@ def _show(report: Report, dry_run: bool) -> None:
     if stored and not dry_run and report.ordered:
         screen.success(f"A new certificate for {', '.join(stored.names)} is in place until {_day(stored.not_after)}.")
     elif stored:
-        left = report.days_left or 0
-        when = f"{left} days left" if stored.not_after > report.now else "it has expired"
+        days_left = report.days_left or 0
+        when = f"{days_left} days left" if stored.not_after > report.now else "it has expired"
         names = ", ".join(stored.names) or "nothing that can be read"
         screen.result(f"Certificate for {names}: until {_day(stored.not_after)}, {when}.")
     else:

@@ -35,15 +35,15 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
     if documents.get(privkey) is not None:
         return None
     names, now = names_of(installation.servers_domain), datetime.now(UTC)
-    found: list[tuple[StoredCertificate, str, bytes]] = []
+    stored_certificates: list[tuple[StoredCertificate, str, bytes]] = []
     for bucket in _kept(account, installation):
         body = _read(account, bucket, privkey)
         stored = read_stored(body) if body else None
         if stored and stored.names == names and now < renew_at(stored.not_before, stored.not_after):
-            found.append((stored, bucket, body))
-    if not found:
+            stored_certificates.append((stored, bucket, body))
+    if not stored_certificates:
         return None
-    stored, bucket, body = max(found, key=lambda one: (one[0].directory == PRODUCTION, one[0].not_after))
+    stored, bucket, body = max(stored_certificates, key=lambda one: (one[0].directory == PRODUCTION, one[0].not_after))
     _write(documents, ACCOUNT, _read(account, bucket, ACCOUNT))
     if not _write(documents, privkey, body):
         return None

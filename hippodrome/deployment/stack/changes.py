@@ -159,10 +159,10 @@ def change_set(prepared: Prepared, keep: bool) -> Iterator[ChangeSet]:
             _discard(client, made, prepared)
 
 
-def _wait(client: Any, made: ChangeSet) -> list[dict[str, Any]]:
+def _wait(client: Any, change_set: ChangeSet) -> list[dict[str, Any]]:
     pause = 0.2
     while True:
-        answer = client.describe_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
+        answer = client.describe_change_set(ChangeSetName=change_set.arn, StackName=change_set.stack_id)
         if answer["Status"] == "CREATE_COMPLETE":
             break
         if answer["Status"] in {"FAILED", "DELETE_COMPLETE"}:
@@ -171,20 +171,20 @@ def _wait(client: Any, made: ChangeSet) -> list[dict[str, Any]]:
                 return []
             raise Problem(
                 f"CloudFormation cannot make a plan of this: {reason or answer['Status']}",
-                details=_findings(client, made, "FAIL"),
+                details=_findings(client, change_set, "FAIL"),
             )
         time.sleep(pause)
         pause = min(3.0, pause * 1.5)
     changes = list(answer.get("Changes", ()))
     while answer.get("NextToken"):
         answer = client.describe_change_set(
-            ChangeSetName=made.arn, StackName=made.stack_id, NextToken=answer["NextToken"]
+            ChangeSetName=change_set.arn, StackName=change_set.stack_id, NextToken=answer["NextToken"]
         )
         changes += answer.get("Changes", ())
     return changes
 
 
-def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
+def _findings(client: Any, change_set: ChangeSet, mode: str) -> list[str]:
     """Read the first five findings of CloudFormation's validation of a change set; empty if they cannot be read.
 
     `mode` is FAIL for findings that made the change set fail, WARN for other ones, such as a quota that is used up
@@ -192,7 +192,7 @@ def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
     """
     found: list[str] = []
     with contextlib.suppress(ClientError):
-        for page in client.get_paginator("describe_events").paginate(ChangeSetName=made.arn):
+        for page in client.get_paginator("describe_events").paginate(ChangeSetName=change_set.arn):
             found += [
                 f"{event.get('LogicalResourceId', '')}: {event.get('ValidationStatusReason', '')}"
                 for event in page["OperationEvents"]
@@ -203,12 +203,12 @@ def _findings(client: Any, made: ChangeSet, mode: str) -> list[str]:
     return found[:5]
 
 
-def _discard(client: Any, made: ChangeSet, prepared: Prepared) -> None:
+def _discard(client: Any, change_set: ChangeSet, prepared: Prepared) -> None:
     """Delete the change set, and the empty stack that comes with a first one."""
     with contextlib.suppress(ClientError):
-        client.delete_change_set(ChangeSetName=made.arn, StackName=made.stack_id)
+        client.delete_change_set(ChangeSetName=change_set.arn, StackName=change_set.stack_id)
     if prepared.existing is None:
         with contextlib.suppress(ClientError):
-            found = client.describe_stacks(StackName=made.stack_id)["Stacks"][0]
+            found = client.describe_stacks(StackName=change_set.stack_id)["Stacks"][0]
             if found["StackStatus"] == "REVIEW_IN_PROGRESS":
-                client.delete_stack(StackName=made.stack_id)
+                client.delete_stack(StackName=change_set.stack_id)

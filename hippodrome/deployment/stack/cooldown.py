@@ -64,10 +64,10 @@ def wait(account: Account, stack: str) -> None:
 
 def _group_is_deleting(account: Account, group: str) -> bool:
     try:
-        found = account.client("scheduler").get_schedule_group(Name=group)
+        schedule_group = account.client("scheduler").get_schedule_group(Name=group)
     except ClientError:  # there is none, or these credentials may not look: CloudFormation will say
         return False
-    return bool(found["State"] == "DELETING")
+    return bool(schedule_group["State"] == "DELETING")
 
 
 def _deleted(client: Any, stack_id: str, now: datetime) -> Iterator[tuple[str, datetime]]:

@@ -49,7 +49,7 @@ class StackDeletion:
         """Wait for what blocks the deletion, or remove it. Return False if neither is possible."""
         if not isinstance(error, NotDeleted) or not (needed := recoveries(error.failures)):
             return False
-        self._without = [one.logical_id for one in error.failures if recovery_from(one) is Recovery.GONE]
+        self._without = [failure.logical_id for failure in error.failures if recovery_from(failure) is Recovery.GONE]
         for recovery in needed:
             screen.info(f"This has to wait until {recovery.value}; then the rest is deleted.")
             self._help(recovery, error.failures)
@@ -111,7 +111,7 @@ class StackDeletion:
 
         def interfaces() -> list[str]:
             pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
-            found = [one for page in pages for one in page["NetworkInterfaces"]] if where["Values"] else []
+            found = [interface for page in pages for interface in page["NetworkInterfaces"]] if where["Values"] else []
             for one in found:
                 if instance := one.get("Attachment", {}).get("InstanceId"):
                     raise Problem(

@@ -77,10 +77,10 @@ def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
 def resources(account: Account, described: Iterable[Mapping[str, Any]]) -> list[Resource]:
     """List the resources of these installations, which `stacks` has described, each once."""
     found = [
-        Resource(one["ResourceType"], one["PhysicalResourceId"])
+        Resource(resource["ResourceType"], resource["PhysicalResourceId"])
         for stack in described
-        for one in Stack(account, stack["StackName"]).resources(stack["StackId"])
-        if one.get("PhysicalResourceId")
+        for resource in Stack(account, stack["StackName"]).resources(stack["StackId"])
+        if resource.get("PhysicalResourceId")
     ]
     return list(dict.fromkeys(found))
 

@@ -54,8 +54,8 @@ def must_be_no_boundary(account: Account, arn: str) -> None:
     """Raise `Problem` if the policy is a permissions boundary: without it, its user or role could do more."""
     listed = attached(account, arn, "PermissionsBoundary")
     iam = account.client("iam")
-    users = [one for one in listed.users if _bound(iam.get_user(UserName=one)["User"], arn)]
-    roles = [one for one in listed.roles if _bound(iam.get_role(RoleName=one)["Role"], arn)]
+    users = [user for user in listed.users if _bound(iam.get_user(UserName=user)["User"], arn)]
+    roles = [role for role in listed.roles if _bound(iam.get_role(RoleName=role)["Role"], arn)]
     if users or roles:
         bound = PolicyAttachments(listed.name, tuple(users), (), tuple(roles))
         raise Problem(
@@ -89,14 +89,14 @@ def free_role(account: Account, name: str) -> None:
     iam = account.client("iam")
     try:
         given = [
-            one["PolicyArn"]
+            attached_policy["PolicyArn"]
             for page in iam.get_paginator("list_attached_role_policies").paginate(RoleName=name)
-            for one in page["AttachedPolicies"]
+            for attached_policy in page["AttachedPolicies"]
         ]
         own = [
-            one
+            policy_name
             for page in iam.get_paginator("list_role_policies").paginate(RoleName=name)
-            for one in page["PolicyNames"]
+            for policy_name in page["PolicyNames"]
         ]
     except ClientError as error:
         if errors.code(error) == _MISSING:
@@ -111,7 +111,7 @@ def free_role(account: Account, name: str) -> None:
 def _other_versions(iam: Any, arn: str) -> Iterator[str]:
     try:
         for page in iam.get_paginator("list_policy_versions").paginate(PolicyArn=arn):
-            yield from (one["VersionId"] for one in page["Versions"] if not one["IsDefaultVersion"])
+            yield from (version["VersionId"] for version in page["Versions"] if not version["IsDefaultVersion"])
     except ClientError as error:
         if errors.code(error) != _MISSING:
             raise

@@ -58,7 +58,7 @@ def older_versions(account: Account, name: str) -> bool:
     """Whether the bucket has a version, current or not, of a document of any project's participants."""
     bucket = VersionedBucket(account, name)
     projects = filter(ids.is_project_id, bucket.folders())
-    return any(not one.marker for project in projects for one in bucket.versions(keys.prefix(project)))
+    return any(not version.marker for project in projects for version in bucket.versions(keys.prefix(project)))
 
 
 def _folders(account: Account, name: str) -> Iterator[str]:

@@ -96,13 +96,13 @@ class Stack:
 
     def template(self) -> str:
         """Return the text of the stack's template; "" if it is JSON, so not Hippodrome's."""
-        found = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
-        return found if isinstance(found, str) else ""
+        template_body = self._client.get_template(StackName=self.name, TemplateStage="Original")["TemplateBody"]
+        return template_body if isinstance(template_body, str) else ""
 
     def resources(self, stack_id: str = "") -> list[dict[str, Any]]:
         """Return the stack's resources: LogicalResourceId, PhysicalResourceId, ResourceType, ResourceStatus."""
         pages = self._client.get_paginator("list_stack_resources").paginate(StackName=stack_id or self.name)
-        return [dict(one) for page in pages for one in page["StackResourceSummaries"]]
+        return [dict(resource) for page in pages for resource in page["StackResourceSummaries"]]
 
     def ids_of(self, kind: str) -> list[str]:
         """Return the physical ids of the stack's existing resources of a type; empty if there is no stack."""
@@ -284,7 +284,7 @@ class Stack:
             physical = f", {failure.physical_id}" if failure.physical_id else ""
             details += [f"{failure.logical_id} ({failure.type}{physical}):", f"  {failure.reason}"]
         if len(failures) > 3:
-            details.append(f"and {len(failures) - 3} more: {', '.join(one.logical_id for one in failures[3:])}")
+            details.append(f"and {len(failures) - 3} more: {', '.join(failure.logical_id for failure in failures[3:])}")
         if not failures:
             reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
             details = [str(reason)] if reason else []
@@ -295,9 +295,11 @@ def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
     """Return the physical ids of the resources that have this type and exist."""
     deleted = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
     return [
-        str(one["PhysicalResourceId"])
-        for one in resources
-        if one["ResourceType"] == kind and one.get("PhysicalResourceId") and one.get("ResourceStatus") not in deleted
+        str(resource["PhysicalResourceId"])
+        for resource in resources
+        if resource["ResourceType"] == kind
+        and resource.get("PhysicalResourceId")
+        and resource.get("ResourceStatus") not in deleted
     ]
 
 

@@ -86,15 +86,17 @@ def definition(
 def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
     """Find the family's newest revision if it is active and has this content. Return its ARN, or None."""
     try:
-        found = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])["taskDefinition"]
+        task_definition = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])[
+            "taskDefinition"
+        ]
     except ClientError as error:
         if errors.code(error) == "ClientException":  # there is no such family
             return None
         raise
-    if found.get("status", "ACTIVE") != "ACTIVE":
+    if task_definition.get("status", "ACTIVE") != "ACTIVE":
         return None
-    same = _contains(found, wanted) and _secrets(found) == _secrets(wanted)
-    return str(found["taskDefinitionArn"]) if same else None
+    same = _contains(task_definition, wanted) and _secrets(task_definition) == _secrets(wanted)
+    return str(task_definition["taskDefinitionArn"]) if same else None
 
 
 def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
@@ -115,7 +117,7 @@ def _parameter(installation: Installation, secret: str) -> str:
 
 def _secrets(found: Mapping[str, Any]) -> list[str]:
     """Return the names of the secrets that the containers get. A study without a model must not keep its key."""
-    return [secret["name"] for one in found["containerDefinitions"] for secret in one.get("secrets") or ()]
+    return [secret["name"] for container in found["containerDefinitions"] for secret in container.get("secrets") or ()]
 
 
 def _contains(found: Any, wanted: Any) -> bool:

@@ -290,7 +290,7 @@ def _confirm(account: Account, installation: Installation, doing: RegisterPlan, 
         )
         screen.confirm(question, request.yes)
     if under_way:
-        changed = changed_pages(*({key: page for key, page, _ in each} for each in (had, steps)))
+        changed = changed_pages(*({key: page for key, page, _ in step} for step in (had, steps)))
         which = f": {changed}" if changed else ""
         question = f"The study is open and has participants, and its steps change for them too{which}. Go on?"
         screen.confirm(question, request.yes)

@@ -98,10 +98,10 @@ class GameStep:
         before = self._services.repository.project_of_own_server(visit.project, visit.user_id)
         return replace(visit, project=before) if before else visit
 
-    def _still_there(self, visit: Visit, named: Iterable[Step]) -> list[Step]:
+    def _still_there(self, visit: Visit, steps: Iterable[Step]) -> list[Step]:
         """The pages of an earlier registration that still exist."""
         project, cache = visit.project, self._services.project_cache
-        return [page for page in named if cache.page(project, project.file(visit.user_id, page)) is not None]
+        return [page for page in steps if cache.page(project, project.file(visit.user_id, page)) is not None]
 
     def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
         """Request another server, or store the answer of a game that no server could run, as the form asks.

@@ -136,20 +136,20 @@ class SharedGame:
             state["state"] = UNMATCHED
         return state | {"session": True, "players": standing.players, "members": found.members}
 
-    def _standing(self, project: Project, found: LobbyState | NoServerYet | Membership) -> Standing:
-        if isinstance(found, NoServerYet):
-            return Standing(found, _not_yet_ready(found.record))
-        session = found.session if isinstance(found, Membership) else None
-        return Standing(found, self._services.repository.server_of(project.id, session) if session else None)
+    def _standing(self, project: Project, lobby_state: LobbyState | NoServerYet | Membership) -> Standing:
+        if isinstance(lobby_state, NoServerYet):
+            return Standing(lobby_state, _not_yet_ready(lobby_state.record))
+        session = lobby_state.session if isinstance(lobby_state, Membership) else None
+        return Standing(lobby_state, self._services.repository.server_of(project.id, session) if session else None)
 
     def _earlier_answers(self, project: Project, user_id: str, step: Step) -> Mapping[str, Any]:
         """The participant's answers on the pages before this step. Of a field on two pages, the later answer counts."""
         at = project.index(step.key) or 0
-        pages = [each for each in project.steps[:at] if not each.type.on_server]
-        found: dict[str, Any] = {}
+        pages = [step for step in project.steps[:at] if not step.type.on_server]
+        earlier_answers: dict[str, Any] = {}
         for page in pages:
-            found |= self._services.answers.read(project.id, user_id, page.key)
-        return found
+            earlier_answers |= self._services.answers.read(project.id, user_id, page.key)
+        return earlier_answers
 
 
 def _not_yet_ready(record: Server | None) -> Server | None:

@@ -56,12 +56,12 @@ class Handovers:
             raise RetryLater("another delivery was faster")
         return named
 
-    def assign(self, project: Project, named: Versioned) -> bool:
+    def assign(self, project: Project, versioned: Versioned) -> bool:
         """Hand over the reserved warm server. AWS calls: about eight.
 
         Returns False if the warm server has ended or is another participant's.
         """
-        record = named.server
+        record = versioned.server
         warm_server = self._take_over(record)
         if warm_server is None:
             return False
@@ -70,7 +70,7 @@ class Handovers:
         self._write_handover(project, record)
         now = self._platform.now()
         assigned = self._repository.update(
-            named,
+            versioned,
             lambda r: (
                 server.assigned(r, warm_server, now)
                 if r.name == record.name and r.state is ServerState.STARTING

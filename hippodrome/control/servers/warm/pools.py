@@ -136,8 +136,8 @@ class Pools:
         projects = self._project_cache.projects(fresh=timedelta(0))
         configured = {project.id for project in projects if project.live and project.warm_servers}
         registered = {warm_pool.pool_key(project.id): project.id for project in projects}
-        found = (entry.key for entry in self._platform.documents.list(warm_pool.POOLS))
-        return configured, {registered[key] for key in found if key in registered}
+        keys = (entry.key for entry in self._platform.documents.list(warm_pool.POOLS))
+        return configured, {registered[key] for key in keys if key in registered}
 
     def _repair(self, project_id: str, pool: Pool, repository: Repository) -> None:
         def state_of(warm_id: str) -> ServerState:

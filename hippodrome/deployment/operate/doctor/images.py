@@ -46,13 +46,13 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
         yield bad(check, "has no task definition: no server can start.", AGAIN)
         return
     try:
-        found = context.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
+        task_definition = context.account.client("ecs").describe_task_definition(taskDefinition=project.task_definition)
     except ClientError as error:
         if errors.code(error) != "ClientException":
             raise
         yield bad(check, f"its task definition {project.task_definition.rpartition('/')[2]} is gone.", AGAIN)
         return
-    definition = found["taskDefinition"]
+    definition = task_definition["taskDefinition"]
     wrong = [*_wrong(definition)]
     if wrong:
         yield bad(check, f"its task definition {', '.join(wrong)}.", AGAIN)
@@ -113,7 +113,7 @@ def _wrong(definition: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _container(definition: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    return next((one for one in definition["containerDefinitions"] if one["name"] == CONTAINER), None)
+    return next((container for container in definition["containerDefinitions"] if container["name"] == CONTAINER), None)
 
 
 def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
@@ -139,10 +139,10 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
     if not details:
         yield bad(check, "its image is not in the repository: pushed half-way, or deleted.", AGAIN)
         return
-    found = details[0]
-    age = (context.now - found["imagePushedAt"]).days
-    size = found.get("imageSizeInBytes", 0) / 1e6
-    vulnerabilities = _vulnerabilities(client, name_there, found["imageDigest"])
+    detail = details[0]
+    age = (context.now - detail["imagePushedAt"]).days
+    size = detail.get("imageSizeInBytes", 0) / 1e6
+    vulnerabilities = _vulnerabilities(client, name_there, detail["imageDigest"])
     if vulnerabilities:
         text = ", ".join(f"{count} {severity.lower()}" for severity, count in vulnerabilities.items())
         yield look(check, f"its image has known vulnerabilities: {text}.", f"{AGAIN} `--rebuild` takes newer packages.")
@@ -154,8 +154,10 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
 def _vulnerabilities(client: Any, repository: str, digest: str) -> dict[str, int]:
     """Return the number of critical and high vulnerabilities, by severity; {} if the image was not scanned."""
     try:
-        found = client.describe_image_scan_findings(repositoryName=repository, imageId={"imageDigest": digest})
+        image_scan_findings = client.describe_image_scan_findings(
+            repositoryName=repository, imageId={"imageDigest": digest}
+        )
     except client.exceptions.ScanNotFoundException:
         return {}
-    counts = found.get("imageScanFindings", {}).get("findingSeverityCounts", {})
+    counts = image_scan_findings.get("imageScanFindings", {}).get("findingSeverityCounts", {})
     return {severity: counts[severity] for severity in ("CRITICAL", "HIGH") if counts.get(severity)}

@@ -46,7 +46,7 @@ def _public_access(context: CheckContext, name: str) -> Iterator[Finding]:
             raise
         block = {}
     settings = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
-    off = [one for one in settings if not block.get(one)]
+    off = [setting for setting in settings if not block.get(setting)]
     if off:
         yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
 
@@ -63,7 +63,7 @@ def _versions_and_policy(context: CheckContext, name: str) -> Iterator[Finding]:
         policy = {}
     statements = policy.get("Statement", [])
     statements = [statements] if isinstance(statements, dict) else statements
-    if not any(_denies_without_tls(one) for one in statements):
+    if not any(_denies_without_tls(statement) for statement in statements):
         yield bad("bucket", f"{name} can be read without TLS.", APPLY)
     for one in statements:
         if one.get("Effect") == "Allow" and one.get("Principal") in ("*", {"AWS": "*"}) and not one.get("Condition"):

@@ -57,14 +57,14 @@ def plan(
     return ImagePlan(None if again else images.of(content), order)
 
 
-def build(wanted: ImagePlan, *, by_dockerfile: bool = False) -> Image:
+def build(image_plan: ImagePlan, *, by_dockerfile: bool = False) -> Image:
     """Make the image of the plan unless the repository has it, and return it. Raises `Problem` if that fails.
 
     It is assembled here, or built by the Dockerfile, with the Docker, Podman or Buildah of this machine.
     """
-    if wanted.uri:
-        return Image(wanted.uri, built=False)
-    order = wanted.order
+    if image_plan.uri:
+        return Image(image_plan.uri, built=False)
+    order = image_plan.order
     try:
         if by_dockerfile:
             builders.build(order)

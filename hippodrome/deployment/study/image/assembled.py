@@ -71,8 +71,8 @@ class Base:
         kinds = {"application/vnd.docker.image.rootfs.diff.tar.gzip": f"{OCI}.layer.v1.tar+gzip"}
         kept = ("digest", "size")
         return [
-            {"mediaType": kinds.get(each["mediaType"], each["mediaType"]), **{key: each[key] for key in kept}}
-            for each in self.manifest["layers"]
+            {"mediaType": kinds.get(layer["mediaType"], layer["mediaType"]), **{key: layer[key] for key in kept}}
+            for layer in self.manifest["layers"]
         ]
 
 
@@ -157,7 +157,7 @@ def configure(base: Base, layers: list[Layer]) -> bytes:
             "org.opencontainers.image.base.digest": base.digest,
         },
     }
-    history = [{"created": _MADE, "created_by": f"hippodrome register: {each.name}"} for each in layers]
+    history = [{"created": _MADE, "created_by": f"hippodrome register: {layer.name}"} for layer in layers]
     return canonical(
         {
             "architecture": "amd64",
@@ -194,14 +194,14 @@ def push(target: Repository, tag: str, base: Base, layers: list[Layer]) -> str:
             "schemaVersion": 2,
             "mediaType": MANIFEST,
             "config": {"mediaType": f"{OCI}.config.v1+json", "digest": blob.digest, "size": blob.size},
-            "layers": [*base.layers, *(each.descriptor for each in layers)],
+            "layers": [*base.layers, *(layer.descriptor for layer in layers)],
         },
     )
 
 
 def _push_base(target: Repository, base: Base, file: Path) -> None:
     """Send the layers of the base that the repository lacks, by way of the file."""
-    blobs = [Blob(each["digest"], each["size"]) for each in base.layers]
+    blobs = [Blob(layer["digest"], layer["size"]) for layer in base.layers]
     missing = [blob for blob in blobs if not target.has(blob.digest)]
     place = place_of(base.name)
     source = Repository(place.address, place.repository)

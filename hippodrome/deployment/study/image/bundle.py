@@ -59,9 +59,9 @@ class Bundle:
         """The name of the base image, as docker pull takes it."""
         dockerfile = self.entries["Dockerfile"]
         assert isinstance(dockerfile, bytes)
-        found = _BASE.search(dockerfile.decode())
-        assert found
-        return found[1]
+        match = _BASE.search(dockerfile.decode())
+        assert match
+        return match[1]
 
     @property
     def requirements(self) -> str:

@@ -206,13 +206,13 @@ def _target(root: Path, path: Path, name: str, ignored: Ignore) -> Path:
     return real
 
 
-def _too_much(found: dict[str, Path], size: int) -> Problem:
-    if len(found) > LIMIT_FILES:
+def _too_much(paths: dict[str, Path], size: int) -> Problem:
+    if len(paths) > LIMIT_FILES:
         return Problem(
             f"The project folder has more than {LIMIT_FILES:,} files for the image.",
             "Name folders that the agent does not need in a file .dockerignore beside config.yml.",
         )
-    biggest = sorted(((path.stat().st_size, name) for name, path in found.items()), reverse=True)[:5]
+    biggest = sorted(((path.stat().st_size, name) for name, path in paths.items()), reverse=True)[:5]
     return Problem(
         f"The project's files for the image are more than {LIMIT_BYTES / 1024**3:g} GB.",
         "Name what the agent does not need in a file .dockerignore beside config.yml.",

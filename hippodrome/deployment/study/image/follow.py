@@ -78,18 +78,18 @@ class BuildLog:
 def advice(log: str) -> str:
     """Return advice on a failed build, by the first known message in its log."""
     for pattern, text in _ADVICE:
-        found = re.search(pattern, log)
-        if found:
-            return text.format(**{name: value.strip() for name, value in found.groupdict().items() if value})
+        match = re.search(pattern, log)
+        if match:
+            return text.format(**{name: value.strip() for name, value in match.groupdict().items() if value})
     return "Mend what the log says and run the same command again: what is done stays done."
 
 
 def _missing(log: str) -> tuple[str, str] | None:
     """Find the line of trial/check.py that says what the agent needs and the image lacks, and what to do about it."""
-    found = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
-    if found is None:
+    match = re.search(f"{check.LACKS}(?P<what>.+){check.REMEDY}(?P<remedy>.+)", log)
+    if match is None:
         return None
     remedy = re.sub(
-        rf"{check.PACKAGE}(\S+)", lambda module: agent_imports.requirement_line(module[1]) or module[0], found["remedy"]
+        rf"{check.PACKAGE}(\S+)", lambda module: agent_imports.requirement_line(module[1]) or module[0], match["remedy"]
     )
-    return found["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."
+    return match["what"], f"{remedy[:1].upper()}{remedy[1:]}; then run the same command again."

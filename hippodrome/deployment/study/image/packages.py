@@ -150,18 +150,18 @@ def explained(said: str) -> Problem:
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     details = [line for line in lines if re.match(r"error:|cause:|hint:", line)][:6] or lines[:6]
     text = " ".join(lines)
-    if found := re.search(r"Request failed|error sending request|Failed to fetch|dns error", text):
+    if match := re.search(r"Request failed|error sending request|Failed to fetch|dns error", text):
         return Problem("The packages could not be downloaded.", "Check the network, and try again.", details)
-    if found := re.search(r"Failed to (?:download and )?build `([^`]+)`", text):
+    if match := re.search(r"Failed to (?:download and )?build `([^`]+)`", text):
         return Problem(
-            f"{found[1]} has no wheel for Python {PYTHON} on Linux and would have to be compiled.",
+            f"{match[1]} has no wheel for Python {PYTHON} on Linux and would have to be compiled.",
             f"Choose a version that has one; or let Docker, Podman or Buildah compile it: --docker --base {_COMPILER}.",
             details,
         )
-    if found := re.search(
+    if match := re.search(
         r"(\S+) was not found in the (?:package registry|provided package locations)|there is no version of (\S+)", text
     ):
-        name = found[1] or found[2]
+        name = match[1] or match[2]
         return Problem(
             "A package cannot be found.",
             f"requirements.txt asks for {name}, which does not exist for Python {PYTHON} on Linux. Correct its name or "

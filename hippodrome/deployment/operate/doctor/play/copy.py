@@ -65,7 +65,14 @@ class Copy:
             if found is not None:
                 documents.create(f"{self.id}/{STEPS_FOLDER}/{name}", found.body)
         invoke(self._account, self._installation, registration_of(changed(of, self.id), live=True))
-        self._made = next((one for one in participants.registered_projects(documents, []) if one.id == self.id), None)
+        self._made = next(
+            (
+                registration
+                for registration in participants.registered_projects(documents, [])
+                if registration.id == self.id
+            ),
+            None,
+        )
         if self._made is None:
             raise Problem("The copy was registered, and is not in the list of projects.", "Run it again.")
         return len(pages)
@@ -181,8 +188,10 @@ def unregister(documents: Documents, project_id: str) -> None:
         listed = read_list(found.body) if found else MasterList()
         if found is None or listed.find(project_id) is None:
             return
-        kept = MasterList([project for project in listed.projects if project.id != project_id], listed.unreadable)
+        master_list = MasterList(
+            [project for project in listed.projects if project.id != project_id], listed.unreadable
+        )
         with contextlib.suppress(Conflict):
-            documents.replace(MASTER_LIST, write_list(kept), found.etag)
+            documents.replace(MASTER_LIST, write_list(master_list), found.etag)
             return
     raise Problem("The list of projects is being written all the time.", "Run it again.")

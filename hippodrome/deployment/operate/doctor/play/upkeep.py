@@ -111,10 +111,10 @@ class Timer:
         context = self._scene.context
         scheduler, group = context.account.client("scheduler"), context.installation["ScheduleGroup"]
         try:
-            found = scheduler.get_schedule(GroupName=group, Name=record.name)["ScheduleExpression"]
+            schedule_expression = scheduler.get_schedule(GroupName=group, Name=record.name)["ScheduleExpression"]
         except scheduler.exceptions.ResourceNotFoundException:
             return None
-        return datetime.strptime(found, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
+        return datetime.strptime(schedule_expression, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
 
 
 def sweep(scene: RehearsalContext, closed: Server | None) -> None:
@@ -173,9 +173,11 @@ def alarm(scene: RehearsalContext) -> None:
     context = scene.context
     cloudwatch, topic = context.account.client("cloudwatch"), context.installation["Alarms"]
     quiet = [
-        one
-        for one in snapshot.alarms(context.account, context.installation)
-        if one.get("StateValue") != "ALARM" and topic in one.get("AlarmActions", ()) and one.get("ActionsEnabled", True)
+        alarm
+        for alarm in snapshot.alarms(context.account, context.installation)
+        if alarm.get("StateValue") != "ALARM"
+        and topic in alarm.get("AlarmActions", ())
+        and alarm.get("ActionsEnabled", True)
     ]
     if not quiet:
         raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `hippodrome apply`.")
@@ -196,7 +198,7 @@ def alarm(scene: RehearsalContext) -> None:
         if now and now[0].get("StateValue") == "ALARM":
             cloudwatch.set_alarm_state(AlarmName=name, StateValue=before, StateReason=REASON)
     listed = snapshot.subscriptions(context.account, context.installation)
-    subscribers = sum(one["SubscriptionArn"].startswith("arn:") for one in listed)  # confirmed subscriptions
+    subscribers = sum(listing["SubscriptionArn"].startswith("arn:") for listing in listed)  # confirmed subscriptions
     if subscribers:
         scene.transcript.good(
             "alarm",
@@ -213,8 +215,11 @@ def alarm(scene: RehearsalContext) -> None:
 
 
 def _sent_to_topic(cloudwatch: Any, name: str, since: datetime) -> bool:
-    found = cloudwatch.describe_alarm_history(AlarmName=name, HistoryItemType="Action", StartDate=since)
-    return any("success" in one.get("HistorySummary", "").lower() for one in found["AlarmHistoryItems"])
+    alarm_history = cloudwatch.describe_alarm_history(AlarmName=name, HistoryItemType="Action", StartDate=since)
+    return any(
+        "success" in alarm_history_item.get("HistorySummary", "").lower()
+        for alarm_history_item in alarm_history["AlarmHistoryItems"]
+    )
 
 
 def times(scene: RehearsalContext, records: Iterable[Server]) -> None:

@@ -143,12 +143,12 @@ class Walk:
         reports = [bot.report for bot in self.all]
         for report in reports:
             self._scene.transcript.hide(report.code, report.user_id)
-        finished, sent = sum(one.finished for one in reports), sum(len(one.answers) for one in reports)
+        finished, sent = sum(report.finished for report in reports), sum(len(report.answers) for report in reports)
         if finished == len(reports):
             self._scene.transcript.good("pages", f"{finished} of {finished} bots finished, with {sent} forms answered.")
             return
-        reasons = [error for one in reports for error in one.errors]
-        reasons += [f"step {one.ended} has no button to press" for one in reports if one.ended]
+        reasons = [error for report in reports for error in report.errors]
+        reasons += [f"step {report.ended} has no button to press" for report in reports if report.ended]
         why = "; ".join(dict.fromkeys(reasons)) or "they did not finish"
         self._scene.transcript.bad("pages", f"{finished} of {len(reports)} bots finished: {why}.", LOGS)
 
@@ -268,7 +268,7 @@ class Walk:
             ]
         of_others, of_struck = found
         # The recording of a killed server may lack its end.
-        missing = [*of_others.missing, *(one for one in of_struck.missing if not one.endswith("is cut off"))]
+        missing = [*of_others.missing, *(name for name in of_struck.missing if not name.endswith("is cut off"))]
         counts = made["counts"]
         if counts["problems"]:
             missing.append(f"{counts['problems']} files are not as they should be")
