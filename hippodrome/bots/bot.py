@@ -193,7 +193,9 @@ class Bot:
                 return reply
             complaints.append(f"status {reply.status} {self._current_page()}: {_words(reply.text)}")
             if reply.status < 500 or len(complaints) > MAX_RELOADS:
-                self.report.troubles += [each for each in dict.fromkeys(complaints) if each != complaints[-1]]
+                self.report.troubles += [
+                    complaint for complaint in dict.fromkeys(complaints) if complaint != complaints[-1]
+                ]
                 raise Failed(complaints[-1])
             await asyncio.sleep(RETRY_SECONDS)
 

@@ -66,7 +66,7 @@ class Design:
             rule
             for end in self.ends
             for rule in end.when
-            if any(asked[: len(names)] == names for asked in rules.mentioned(rule))
+            if any(mention[: len(names)] == names for mention in rules.mentioned(rule))
         )
         return list(dict.fromkeys(value for rule in asking for value in rules.constants(rule)))
 
@@ -100,9 +100,9 @@ class Steering:
         if step is None:
             return pairs
         self.answers.pop(key, None)
-        wanted = sorted(self.design.fields(step.key) | set(step.right))
-        named = [*self.design.constants("answers", step.key), *step.right.values()]
-        here = {(step.key, name): values for name in wanted if (values := offered(form, name, named))}
+        fields = sorted(self.design.fields(step.key) | set(step.right))
+        constants = [*self.design.constants("answers", step.key), *step.right.values()]
+        here = {(step.key, name): values for name in fields if (values := offered(form, name, constants))}
         here |= {(step.key, name): [right] for name, right in step.right.items() if (step.key, name) not in here}
         choice = {name: value for (_, name), value in self._search(here, key).items()} if here else {}
         chosen = with_values(form, pairs, choice)
@@ -136,10 +136,10 @@ class Steering:
     def _score(self, choice: Choice, here: Mapping[Variable, Any], key: str) -> int:
         """How well a choice leads to the target: _PERFECT if it does, and no other rule would be true, too."""
         step = self.design.step_of(key) if key else None
-        given = {variable[1]: value for variable, value in choice.items() if variable in here}
-        if step is not None and step.right and not step.tries and wrong_fields(step, given):
+        choices = {variable[1]: value for variable, value in choice.items() if variable in here}
+        if step is not None and step.right and not step.tries and wrong_fields(step, choices):
             return 0  # it is asked until it is right
-        facts = self._facts(choice, key, given)
+        facts = self._facts(choice, key, choices)
         holding = [end for end in self.design.ends if any(rules.holds(rule, facts) for rule in end.when)]
         others = sum(end is not self.target for end in holding)
         reached = self.target is None or self.target in holding
@@ -202,7 +202,7 @@ def _judged(step: Step, answers: Mapping[str, Any]) -> dict[str, Any]:
     return {"passed": not wrong_fields(step, answers)} if step.right else {}
 
 
-def offered(form: Form, name: str, named: Sequence[Any]) -> list[str]:
+def offered(form: Form, name: str, constants: Sequence[Any]) -> list[str]:
     """Return the values that a participant may give to the field `name`; "" stands for no answer.
 
     Of a number or a text, they are those in `named` and close to them, within the limits of the field.
@@ -219,9 +219,9 @@ def offered(form: Form, name: str, named: Sequence[Any]) -> list[str]:
         elif control.kind == "select":
             values += [option.value for option in control.options if not option.disabled and option.value]
         elif control.kind in ("number", "range"):
-            values += _numbers(control, named)
+            values += _numbers(control, constants)
         elif control.kind in ("text", "textarea", "search"):
-            values += [*map(_text, named), "x"]
+            values += [*map(_text, constants), "x"]
     return list(dict.fromkeys(values))
 
 
@@ -229,14 +229,16 @@ def with_values(form: Form, pairs: Pairs, choice: Mapping[str, str]) -> Pairs:
     """Return the pairs of a filled form with these values. Only one button is pressed."""
     buttons = {control.name for control in form.buttons if control.name}
     replaced = set(choice) | (buttons if buttons & set(choice) else set())
-    kept = [(name, value) for name, value in pairs if name not in replaced]
-    return kept + [(name, value) for name, value in choice.items() if value != ""]
+    unchanged = [(name, value) for name, value in pairs if name not in replaced]
+    return unchanged + [(name, value) for name, value in choice.items() if value != ""]
 
 
-def _numbers(control: Control, named: Sequence[Any]) -> Iterator[str]:
+def _numbers(control: Control, constants: Sequence[Any]) -> Iterator[str]:
     low, high, step = (decimal_of(control.attributes.get(name)) for name in ("min", "max", "step"))
     step = step if step is not None and step > 0 else Decimal(1)
-    near = [number for value in named for number in map(decimal_of, map(_text, _around(value))) if number is not None]
+    near = [
+        number for value in constants for number in map(decimal_of, map(_text, _around(value))) if number is not None
+    ]
     for number in (low, high, *near):
         if number is None or (low is not None and number < low) or (high is not None and number > high):
             continue

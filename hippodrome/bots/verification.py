@@ -37,7 +37,7 @@ class StoredRecording:
 
 def read_recording(path: Path) -> StoredRecording:
     """Read a recording to its end. Raises nothing: a recording that cannot be read is not complete."""
-    found = StoredRecording(path.name)
+    recording = StoredRecording(path.name)
     unpack, counts = zlib.decompressobj(31), Counter[str]()
     first, last = None, ("", "")
     try:
@@ -47,14 +47,14 @@ def read_recording(path: Path) -> StoredRecording:
             counts[kind if kind in ("step", "reset") else "other"] += 1
             if kind not in ANYWHERE:
                 last = (last[1], kind)
-        found.step = str(first["step"]) if first else ""
-        found.steps = counts["step"]
-        found.pictures = found.steps + counts["reset"]
+        recording.step = str(first["step"]) if first else ""
+        recording.steps = counts["step"]
+        recording.pictures = recording.steps + counts["reset"]
         end = last[0] if last[1] == "break" else last[1]  # the break after an episode stands in the episode's file
-        found.complete = unpack.eof and first is not None and first["kind"] == "header" and end == "end"
+        recording.complete = unpack.eof and first is not None and first["kind"] == "header" and end == "end"
     except (OSError, zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        found.complete = False
-    return found
+        recording.complete = False
+    return recording
 
 
 def _lines(path: Path, unpack: Any) -> Iterator[bytes]:

@@ -102,9 +102,9 @@ class Request:
         The result goes into headers, so the path, which arrives decoded, is encoded again. It never begins with `//`,
         which would name another host.
         """
-        kept = [(key, value) for key, value in self.query or () if key not in changes]
+        unchanged = [(key, value) for key, value in self.query or () if key not in changes]
         path = quote("/" + self.path.lstrip("/\\"), safe="/:@!$&'()*+,;=~", errors="replace")
-        return f"{path}?{urlencode([*kept, *changes.items()])}"
+        return f"{path}?{urlencode([*unchanged, *changes.items()])}"
 
 
 def _query(event: Mapping[str, Any]) -> tuple[tuple[str, str], ...] | None:

@@ -70,7 +70,7 @@ def _enter(platform: Platform, project: Project) -> Project:
     _set_participant_limit(platform, project)
     SecretCache(platform.documents).get_or_create()  # the secret must exist before anything that needs it is written
     for _ in range(TRIES):
-        found, listed = _master_list(platform)
+        document, listed = _master_list(platform)
         before = listed.find(project.id)
         if before and before.has_sessions and not project.has_sessions:
             raise NotRegistered([ALONE.format(players=before.players)])
@@ -80,8 +80,8 @@ def _enter(platform: Platform, project: Project) -> Project:
         entry = msgspec.structs.replace(project.following(before), salt=salt, version=secrets.token_hex(4))
         body = write_list(listed.with_project(entry))
         try:
-            if found:
-                platform.documents.replace(MASTER_LIST, body, found.etag)
+            if document:
+                platform.documents.replace(MASTER_LIST, body, document.etag)
             else:
                 platform.documents.create(MASTER_LIST, body)
         except Conflict:
@@ -111,11 +111,11 @@ def _master_list(platform: Platform) -> tuple[Document | None, MasterList]:
 
     Raises `NotRegistered` if the document cannot be read, so that it is not overwritten.
     """
-    found = platform.documents.get(MASTER_LIST)
-    if found is None:
+    document = platform.documents.get(MASTER_LIST)
+    if document is None:
         return None, MasterList()
     try:
-        return found, read_list(found.body)
+        return document, read_list(document.body)
     except ValueError as error:
         failure("the list of projects cannot be read", error)
         text = f"{MASTER_LIST} cannot be read; the bucket keeps older versions: put the last good one in its place"

@@ -28,14 +28,14 @@ _WORDS = {
 
 def behaviour_of(text: str) -> dict[str, float]:
     """Return what the variable FAKE_MODEL says. Raises ValueError with what to write."""
-    found = {}
+    behaviour = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition(":")
         if name not in _WORDS or not re.fullmatch(r"[0-9]+(\.[0-9]+)?", value):
             words = ", ".join(f"{name}:N ({meaning})" for name, meaning in _WORDS.items())
             raise ValueError(f"{VARIABLE} has {part!r}; it may have {words}")
-        found[name] = float(value)
-    return found
+        behaviour[name] = float(value)
+    return behaviour
 
 
 class FakeModel:
@@ -140,7 +140,7 @@ class _Handler(BaseHTTPRequestHandler):
 def _last_text(messages: Any) -> str:
     """The text of the last message of a request, or the text that is the request."""
     if isinstance(messages, list):
-        messages = next((one.get("content") for one in reversed(messages) if isinstance(one, dict)), "")
+        messages = next((message.get("content") for message in reversed(messages) if isinstance(message, dict)), "")
     if isinstance(messages, list):  # with pictures, a content has parts
         messages = " ".join(str(part.get("text", "")) for part in messages if isinstance(part, dict))
     return messages if isinstance(messages, str) else ""

@@ -71,8 +71,13 @@ def _own_address() -> str:
 
 def _addresses() -> list[str]:
     """The IPv4 addresses of this machine that others may reach."""
-    found = [one.address for each in psutil.net_if_addrs().values() for one in each if one.family == socket.AF_INET]
-    return [address for address in found if not address.startswith("127.")]
+    addresss = [
+        one.address
+        for net_if_addr in psutil.net_if_addrs().values()
+        for one in net_if_addr
+        if one.family == socket.AF_INET
+    ]
+    return [address for address in addresss if not address.startswith("127.")]
 
 
 class Lab:
@@ -101,8 +106,8 @@ class Lab:
         next_step = of_study["next_step"]
 
         def only_ours(event: dict[str, Any], context: object) -> dict[str, Any]:
-            named = Request.from_event(event).query_value("projectId")
-            if named is not None and named not in self._project_ids():
+            query_value = Request.from_event(event).query_value("projectId")
+            if query_value is not None and query_value not in self._project_ids():
                 return _refused(404, "There is no such study here.")
             return next_step(event, context)
 

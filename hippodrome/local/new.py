@@ -45,21 +45,26 @@ class StudyTemplate:
 
 def templates(root: Path = places.ROOT) -> dict[str, StudyTemplate]:
     """Return the templates by their names: for an example its folder's name, for the study at the top its id."""
-    found: dict[str, StudyTemplate] = {}
+    study_templates: dict[str, StudyTemplate] = {}
     top = _source(root)
     if top is not None:
-        found[_text(top, _ID)] = StudyTemplate(root, _text(top, ("project", "name")), at_top=True)
+        study_templates[_text(top, _ID)] = StudyTemplate(root, _text(top, ("project", "name")), at_top=True)
     for folder in sorted((root / EXAMPLES).glob("*/")):
         source = _source(folder)
         if source is not None:
-            found[folder.name] = StudyTemplate(folder, _text(source, ("project", "name")))
-    return found
+            study_templates[folder.name] = StudyTemplate(folder, _text(source, ("project", "name")))
+    return study_templates
 
 
-def listing(known: Mapping[str, StudyTemplate]) -> str:
+def listing(study_templates: Mapping[str, StudyTemplate]) -> str:
     """Return the templates as text, a line for each."""
-    width = max(map(len, known), default=0)
-    return "\n".join(["There are these templates:", *(f"  {name:{width}}  {known[name].title}" for name in known)])
+    width = max(map(len, study_templates), default=0)
+    return "\n".join(
+        [
+            "There are these templates:",
+            *(f"  {name:{width}}  {study_templates[name].title}" for name in study_templates),
+        ]
+    )
 
 
 def make_study(template: StudyTemplate, folder: Path) -> str:
@@ -121,10 +126,10 @@ def _write_id(folder: Path, project_id: str) -> None:
     file = source.layout.config
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
     number = source.parsed.lines[_ID] - 1
-    found = _ID_LINE.fullmatch(lines[number])
-    if found is None:
+    match = _ID_LINE.fullmatch(lines[number])
+    if match is None:
         raise Problem(f"{file}: the id is not on a line of its own.", f"Write id: {project_id} there yourself.")
-    lines[number] = f"{found['key']}{project_id}{found['comment']}"
+    lines[number] = f"{match['key']}{project_id}{match['comment']}"
     file.write_text("".join(lines), encoding="utf-8")
 
 

@@ -22,17 +22,17 @@ def user_ids(
     made = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):
         return list(itertools.islice(made, players))
-    found: list[str] = []
+    user_ids: list[str] = []
     first: int | None = None
     for user_id in itertools.islice(made, MAX_TRIED):
         group = ids.group(project_id, user_id, groups)
         first = group if first is None else first
-        step = len(found) if matching == "mixed" else 0
+        step = len(user_ids) if matching == "mixed" else 0
         if group == (first + step) % groups:
-            found.append(user_id)
-        if len(found) == players:
+            user_ids.append(user_id)
+        if len(user_ids) == players:
             break
-    return found
+    return user_ids
 
 
 def advice(matching: str | dict[str, Any]) -> str:

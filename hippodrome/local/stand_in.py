@@ -28,7 +28,9 @@ class StandIn:
 
         Raises `Problem` if FAKE_MODEL is wrong.
         """
-        unpaid = not self._env.get(environment.LLM_KEY) and not all(is_loopback(one["url"]) for one in config.models)
+        unpaid = not self._env.get(environment.LLM_KEY) and not all(
+            is_loopback(model["url"]) for model in config.models
+        )
         if self._model is not None or not config.models or not (self._always or unpaid):
             return
         try:

@@ -244,7 +244,9 @@ class Study:
             config.groups,
             lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
         )
-        queries = [self._signed(config, each) if project.signed_links else f"&userId={each}" for each in user_ids]
+        queries = [
+            self._signed(config, user_id) if project.signed_links else f"&userId={user_id}" for user_id in user_ids
+        ]
         text = _TOGETHER.format(
             places="both" if project.players == 2 else f"all {project.players}", patience=f"{project.patience:g}"
         )

@@ -22,5 +22,5 @@ def on_disk(folder: Path, name: str) -> Path:
         return path
     for part in Path(name).parts:
         here = folder.iterdir() if folder.is_dir() else ()
-        folder = next((each for each in here if composed(each.name) == composed(part)), folder / part)
+        folder = next((person for person in here if composed(person.name) == composed(part)), folder / part)
     return folder

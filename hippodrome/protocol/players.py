@@ -51,25 +51,25 @@ def players(value: object) -> dict[str, Any]:
         raise ValueError(f'must be a map: indented lines such as "player_0: human" below it, not {show(value)}')
     if not by_group(value):
         return _players(value, "")
-    found: dict[str, Any] = {}
+    players: dict[str, Any] = {}
     for group, item in value.items():
         number = str(int(group))
-        if number in found:
+        if number in players:
             raise ValueError(f"must name each group once, but names group {number} also as {group}")
-        found[number] = _players(item, f"group {group}: ")
-    return found
+        players[number] = _players(item, f"group {group}: ")
+    return players
 
 
 def _players(value: dict[Any, Any], where: str) -> dict[str, str]:
     if len(value) > MAX_PLAYERS:
         raise ValueError(f"{where}must have at most {MAX_PLAYERS} players, not {len(value)}")
-    found = {}
+    players = {}
     for name, plays in value.items():
         player = _checked(_NAME, str(name), where)
-        found[player] = _plays(plays, f"{where}{values.printable(player)} ")
-    if found and HUMAN not in found.values():
+        players[player] = _plays(plays, f"{where}{values.printable(player)} ")
+    if players and HUMAN not in players.values():
         raise ValueError(f"{where}must have a human: write human for the player that the participant plays")
-    return found
+    return players
 
 
 def policy(value: object) -> str:

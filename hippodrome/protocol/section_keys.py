@@ -227,13 +227,13 @@ def _json(value: Any) -> Any:
 
 def keys(section: type[Section]) -> tuple[Key, ...]:
     """Return the keys of a section, in the order of its fields."""
-    found = []
-    for each in dataclasses.fields(section):
-        if "check" in each.metadata:
-            default = None if each.default is dataclasses.MISSING else each.default
-            named: dict[str, Any] = {"name": _camel(each.name), "attribute": each.name, "default": default}
-            found.append(Key(**named | dict(each.metadata)))
-    return tuple(found)
+    declared_keys = []
+    for declared in dataclasses.fields(section):
+        if "check" in declared.metadata:
+            default = None if declared.default is dataclasses.MISSING else declared.default
+            facts: dict[str, Any] = {"name": _camel(declared.name), "attribute": declared.name, "default": default}
+            declared_keys.append(Key(**facts | dict(declared.metadata)))
+    return tuple(declared_keys)
 
 
 def names(section: type[Section]) -> frozenset[str]:
@@ -243,16 +243,16 @@ def names(section: type[Section]) -> frozenset[str]:
 
 def others_of(section: type[Section]) -> dataclasses.Field[Any] | None:
     """Return the field for the keys that are not declared; None if the section may have no such keys."""
-    return next((each for each in dataclasses.fields(section) if "others" in each.metadata), None)
+    return next((field for field in dataclasses.fields(section) if "others" in field.metadata), None)
 
 
 def sections_in(section: type[Section], path: KeyPath = ()) -> dict[KeyPath, type[Section]]:
     """Return this section and all sections in it, by path."""
-    found = {path: section}
+    sections = {path: section}
     for key in keys(section):
         if key.section:
-            found |= sections_in(key.section, (*path, key.name))
-    return found
+            sections |= sections_in(key.section, (*path, key.name))
+    return sections
 
 
 def _camel(name: str) -> str:

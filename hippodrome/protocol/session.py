@@ -67,7 +67,7 @@ class SessionDocument:
 
     def to_json(self) -> bytes:
         """Return the bytes of the document, JSON."""
-        members = [{"userId": each.user_id, "group": each.group, "seat": each.seat} for each in self.members]
+        members = [{"userId": member.user_id, "group": member.group, "seat": member.seat} for member in self.members]
         document = {"schema": SCHEMA, "id": self.id, "players": self.players, "group": self.group}
         return json.dumps({**document, "formed": self.formed, "members": members}, indent=1).encode()
 
@@ -114,7 +114,7 @@ def parse(body: bytes) -> SessionDocument:
     session = SessionDocument(
         found["id"],
         players,
-        tuple(_member(each) for each in members),
+        tuple(_member(member) for member in members),
         _group(found.get("group")),
         formed if isinstance(formed, str) else "",
     )

@@ -493,7 +493,7 @@ class TrialSection(Section):
     def player_maps(self) -> Iterator[tuple[KeyPath, Mapping[str, str]]]:
         """Yield `players`, or the map in it for each group, after its path below `players`."""
         if player_checks.by_group(self.players):
-            yield from (((group,), each) for group, each in self.players.items())
+            yield from (((group,), player) for group, player in self.players.items())
         else:
             yield (), self.players
 

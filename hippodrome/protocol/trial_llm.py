@@ -45,21 +45,21 @@ def is_loopback(url: str) -> bool:
 
 def _prompt(value: object) -> str:
     """Return a prompt, which may have several lines, or the name of its file. Raises ValueError with what to write."""
-    found = value.text if isinstance(value, values.Plain) else value
-    if not isinstance(found, str) or not found.strip():
+    text = value.text if isinstance(value, values.Plain) else value
+    if not isinstance(text, str) or not text.strip():
         raise ValueError(f"must be a text, or a file of the study such as prompts/warm.txt, not {values.show(value)}")
-    found = found.strip()
-    if _CONTROL.search(found):
+    text = text.strip()
+    if _CONTROL.search(text):
         raise ValueError("must not hold invisible characters; take them out")
-    if len(found) > MAX_PROMPT:
+    if len(text) > MAX_PROMPT:
         raise ValueError(
-            f"must be at most {MAX_PROMPT} characters long, not {len(found)}; write it into a file such as "
+            f"must be at most {MAX_PROMPT} characters long, not {len(text)}; write it into a file such as "
             "prompts/partner.txt, and that file's name here"
         )
-    file = prompt_file(found)
+    file = prompt_file(text)
     if file is not None and (file.startswith("/") or ".." in PurePosixPath(file).parts or "\\" in file):
-        raise ValueError(f"must be a file below the folder of agent.py, such as prompts/warm.txt, not {found}")
-    return found
+        raise ValueError(f"must be a file below the folder of agent.py, such as prompts/warm.txt, not {text}")
+    return text
 
 
 def prompt_file(system: str) -> str | None:

@@ -152,10 +152,10 @@ def whole(low: int, high: int) -> Check:
     """Return a check for a whole number from `low` to `high`, also as text."""
 
     def check(value: object) -> int:
-        found = number_in(value)
-        if found is None or found != int(found) or not low <= found <= high:
+        number = number_in(value)
+        if number is None or number != int(number) or not low <= number <= high:
             raise ValueError(f"must be a whole number from {low} to {high}, not {show(value)}")
-        return int(found)
+        return int(number)
 
     return check
 
@@ -164,10 +164,10 @@ def number(low: float, high: int) -> Check:
     """Return a check for a number from `low` to `high`, also as text. The check returns a whole number as an int."""
 
     def check(value: object) -> float:
-        found = number_in(value)
-        if found is None or not low <= found <= high:
+        number = number_in(value)
+        if number is None or not low <= number <= high:
             raise ValueError(f"must be a number from {low} to {high}, not {show(value)}")
-        return int(found) if found == int(found) else found
+        return int(number) if number == int(number) else number
 
     return check
 

@@ -63,8 +63,8 @@ class Route53Dns:
         changes = [_change("DELETE", record) for record in dict.fromkeys(remove) if record.name not in added]
         changes += [_change("UPSERT", record) for record in added.values()]
         refused: _Refused = []
-        made = [self._change_batch(changes[at : at + BATCH], refused) for at in range(0, len(changes), BATCH)]
-        change = ",".join(change for change in made if change)
+        batches = [self._change_batch(changes[at : at + BATCH], refused) for at in range(0, len(changes), BATCH)]
+        change = ",".join(change for change in batches if change)
         if refused:
             raise RefusedDnsRecords([added[name] for name in refused], change)
         return change
@@ -131,8 +131,8 @@ class Route53Dns:
         """Send each half on its own, down to the single refused change: the error does not say which one it is."""
         if len(changes) > 1:
             half = len(changes) // 2
-            made = [self._change_batch(part, refused) for part in (changes[:half], changes[half:])]
-            return ",".join(change for change in made if change)
+            halves = [self._change_batch(part, refused) for part in (changes[:half], changes[half:])]
+            return ",".join(change for change in halves if change)
         (change,) = changes
         if change["Action"] != "DELETE":
             refused.append(change["ResourceRecordSet"]["Name"])
@@ -181,4 +181,4 @@ def _error_text(error: ClientError) -> str:
 
 def _normalised(name: str) -> str:
     """The name unescaped, in lower case, without the final dot."""
-    return _OCTAL.sub(lambda found: chr(int(found[1], 8)), name).rstrip(".").lower()
+    return _OCTAL.sub(lambda digits: chr(int(digits[1], 8)), name).rstrip(".").lower()

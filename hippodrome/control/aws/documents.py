@@ -69,14 +69,14 @@ class S3Documents:
         """
         condition = {"IfNoneMatch": known.etag} if known else {}
         try:
-            found = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
+            answer = self._client().get_object(Bucket=self.bucket, Key=key, **condition)
         except ClientError as error:
             if known and errors.status(error) == 304:
                 return known
             if errors.code(error) == "NoSuchKey":
                 return None
             raise
-        return Document(found["Body"].read(), found["ETag"])
+        return Document(answer["Body"].read(), answer["ETag"])
 
     def create(self, key: str, body: bytes) -> str:
         return self._put(key, body, {"IfNoneMatch": "*"})

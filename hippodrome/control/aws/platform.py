@@ -75,10 +75,10 @@ class AwsPlatform:
         from hippodrome.control.aws.signer import S3Signer
 
         def credentials() -> Any:
-            found = self._session.get_credentials()
-            if found is None:
+            credentials = self._session.get_credentials()
+            if credentials is None:
                 raise RuntimeError("there are no AWS credentials to sign requests with; the function needs a role")
-            return found.get_frozen_credentials()
+            return credentials.get_frozen_credentials()
 
         return S3Signer(lambda: self._client("s3"), credentials, self._need("signer", "BUCKET"))
 
@@ -146,7 +146,7 @@ class AwsPlatform:
         from contextvars import copy_context
 
         with ThreadPoolExecutor(min(MAX_THREADS, len(acts))) as pool:
-            return [one.result() for one in [pool.submit(copy_context().run, act) for act in acts]]
+            return [future.result() for future in [pool.submit(copy_context().run, act) for act in acts]]
 
     def _need(self, port: str, variable: str) -> str:
         """The value of an environment variable that this port needs. Raises RuntimeError if the variable is missing."""
@@ -165,9 +165,9 @@ class AwsPlatform:
 
     def _client(self, service: str) -> Any:
         """The client of an AWS service. Needs `AWS_REGION`, which Lambda sets (or `AWS_DEFAULT_REGION`)."""
-        found = self._clients.get(service)
-        if found is not None:
-            return found
+        client = self._clients.get(service)
+        if client is not None:
+            return client
         with self._client_lock:  # creating a client is not thread-safe, using one is
             if service not in self._clients:
                 self._clients[service] = self._create_client(service)

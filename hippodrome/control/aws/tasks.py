@@ -118,20 +118,20 @@ class EcsTasks:
         interfaces do not exist, another one without their ids. (A filter would accept missing ids, but with a filter
         EC2 pages through all interfaces of the account.)
         """
-        wanted = sorted(set(interfaces))
-        while wanted:
+        ids = sorted(set(interfaces))
+        while ids:
             try:
-                network_interfaces = self._ec2().describe_network_interfaces(NetworkInterfaceIds=wanted)[
+                network_interfaces = self._ec2().describe_network_interfaces(NetworkInterfaceIds=ids)[
                     "NetworkInterfaces"
                 ]
             except ClientError as error:
                 if errors.code(error) != "InvalidNetworkInterfaceID.NotFound":
                     raise
                 missing = set(_INTERFACE.findall(errors.message(error)))
-                existing = [interface for interface in wanted if interface not in missing]
-                if len(existing) == len(wanted):
+                existing = [interface for interface in ids if interface not in missing]
+                if len(existing) == len(ids):
                     raise  # the message names none of these interfaces, so a repetition would fail too
-                wanted = existing
+                ids = existing
             else:
                 public = (
                     (i["NetworkInterfaceId"], i.get("Association", {}).get("PublicIp")) for i in network_interfaces

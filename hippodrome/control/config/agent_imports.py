@@ -190,15 +190,15 @@ def hidden_files(folder: Path) -> list[Diagnostic]:
 
     Python and Hippodrome have a module of this name, and it comes first. Only the first import of each file is named.
     """
-    code, found = layout.agent_folder(folder).resolve(), dict[str, Diagnostic]()
+    code, hidden = layout.agent_folder(folder).resolve(), dict[str, Diagnostic]()
     for (file, line, module), own_files in _imports_and_files(folder, _all):
         name = module.partition(".")[0]
         whose = _also_has(name) if own_files else ""
         if whose:
             shown = name if (code / name).is_dir() else f"{name}.py"
             message = f"import {name} finds a module of {whose}, and not {shown} beside {AGENT}; rename {shown}"
-            found.setdefault(name, Diagnostic(file, line, "", message))
-    return list(found.values())
+            hidden.setdefault(name, Diagnostic(file, line, "", message))
+    return list(hidden.values())
 
 
 def _also_has(name: str) -> str:
@@ -245,7 +245,7 @@ def _closure(requirements: Sequence[Requirement | None]) -> _Image:
     """
     readable = [requirement for requirement in requirements if requirement is not None]
     image = _Image(set(), set(), unread=len(readable) < len(requirements))
-    seen: set[tuple[str, str]] = set()
+    visited: set[tuple[str, str]] = set()
     waiting = [(requirement, True) for requirement in readable]
     while waiting:
         requirement, first = waiting.pop()
@@ -256,8 +256,8 @@ def _closure(requirements: Sequence[Requirement | None]) -> _Image:
             if first:
                 image.unknown.add(name)
             continue
-        for extra in {"", *requirement.extras} - {extra for known, extra in seen if known == name}:
-            seen.add((name, extra))
+        for extra in {"", *requirement.extras} - {extra for package, extra in visited if package == name}:
+            visited.add((name, extra))
             waiting += [(need, False) for need in needs if not need.marker or need.marker.evaluate({"extra": extra})]
     return image
 
@@ -295,12 +295,12 @@ def _imports(folder: Path, chosen: ImportFilter | None = None) -> Iterator[Impor
 def _imports_and_files(folder: Path, chosen: ImportFilter) -> Iterator[tuple[Import, set[Path]]]:
     """The imports as in `_imports`, each with the project's own files that it names."""
     top, folder = folder.resolve(), layout.agent_folder(folder).resolve()
-    waiting, seen = [folder / AGENT], set()
+    waiting, visited = [folder / AGENT], set()
     while waiting:
         path = waiting.pop(0)
-        if path in seen:
+        if path in visited:
             continue
-        seen.add(path)
+        visited.add(path)
         for line, modules in _read(path, folder, chosen):
             own_files = {file for module in modules for file in _beside(folder, module)}
             waiting += sorted(own_files)
@@ -360,15 +360,15 @@ def _modules(node: ast.Import | ast.ImportFrom, package: tuple[str, ...]) -> lis
 
 def _beside(folder: Path, module: str) -> list[Path]:
     """The project's own files that Python runs when it imports the module: its packages' files, and its own."""
-    found, parts = [], module.split(".")
+    files, parts = [], module.split(".")
     if not all(part.isidentifier() for part in parts):
         return []
     for count in range(1, len(parts) + 1):
         path = folder.joinpath(*parts[:count])
         file = path / "__init__.py" if path.is_dir() else path.with_name(f"{path.name}.py")
         if file.is_file():
-            found.append(file)
-    return found
+            files.append(file)
+    return files
 
 
 def _text(file: Path | None) -> str:

@@ -139,14 +139,14 @@ class Config:
 
 def _registered(step: StepFiles) -> dict[str, Any]:
     """A step as a registration stores it: what its design says, with its page and the number of its versions."""
-    known = msgspec.to_builtins(step.step) if step.step else {}
-    return {**known, "key": step.key, "page": step.page, "variants": step.variants}
+    settings = msgspec.to_builtins(step.step) if step.step else {}
+    return {**settings, "key": step.key, "page": step.page, "variants": step.variants}
 
 
 def _registered_design(design: Design) -> dict[str, Any]:
     """The factors, blocks and ends of a study as a registration stores them; empty for a study without any."""
-    found = {name: msgspec.to_builtins(getattr(design, name)) for name in ("conditions", "blocks", "ends")}
-    return {name: value for name, value in found.items() if value}
+    design_data = {name: msgspec.to_builtins(getattr(design, name)) for name in ("conditions", "blocks", "ends")}
+    return {name: value for name, value in design_data.items() if value}
 
 
 def _sized(setup: AwsSetupKeys) -> dict[str, Any] | None:

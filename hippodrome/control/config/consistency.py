@@ -103,8 +103,8 @@ def _plain_clients(checked: Checked) -> Iterator[Mistake]:
 
 def _starts_nothing(checked: Checked) -> bool:
     """Whether it is certain that no step starts a server."""
-    known = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
-    return known and not checked.game_steps and checked.project.events.start_server_step is None
+    is_complete = bool(checked.step_keys) and checked.valid(STEPS, ("project", "events"))
+    return is_complete and not checked.game_steps and checked.project.events.start_server_step is None
 
 
 _AWS_NEEDS = {  # bucket, region and rootDomain may be missing: then the installation's count
@@ -187,8 +187,8 @@ def _together(checked: Checked) -> Iterator[Mistake]:
         return
     first = next((at for at, step in enumerate(design.steps) if step.type.on_server), len(design.steps))
     for step in design.steps[:first]:
-        asked = {names[0] for names in rules.mentioned(step.when)} if step.when else set()
-        if step.block is not None or "{" in step.page or asked & {"condition", "order"}:
+        steps_asked = {names[0] for names in rules.mentioned(step.when)} if step.when else set()
+        if step.block is not None or "{" in step.page or steps_asked & {"condition", "order"}:
             why = "with players: 2 or more, levels are drawn when participants are matched, at the first game"
             yield Mistake(design.paths[step.key], f"comes too early: {why}; move this step behind it")
     if design.steps and "{" in design.steps[-1].page:
@@ -220,10 +220,10 @@ def _answers_read(checked: Checked) -> Iterator[Mistake]:
         names = step_names(own["answers"]) if "answers" in own else checked.trial.answers
         path = (*design.paths[game.key], "answers") if "answers" in own else ("trial", "answers")
         for place, name in enumerate(names if game.type.on_server else ()):
-            found = next((step for step in design.steps if step.key == name), None)
-            if found is None:
+            source = next((step for step in design.steps if step.key == name), None)
+            if source is None:
                 yield Mistake((*path, place), f"there is no step {name}{did_you_mean(name, keys)}")
-            elif found not in design.steps[:at] and (game.block is None or found.block != game.block):
+            elif source not in design.steps[:at] and (game.block is None or source.block != game.block):
                 give = "" if "answers" in own else f"; give {game.key} its own answers, such as answers: []"
                 message = f"{name} does not come before the game {game.key}, whose agent would read its answers{give}"
                 yield Mistake((*path, place), message)
@@ -241,8 +241,8 @@ def _event_steps(checked: Checked) -> Iterator[Mistake]:
     keys = visited(checked.step_keys, steps)
     names = [step_name(key) for key in keys]
     start, stop = position(events.start_server_step, keys), position(events.stop_server_step, keys)
-    for path, key, found in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
-        if key is not None and found is None:
+    for path, key, event_step in ((_START, events.start_server_step, start), (_STOP, events.stop_server_step, stop)):
+        if key is not None and event_step is None:
             yield Mistake(path, f"there is no {step_name(key)}; the steps are {step_range(keys)}")
     games = [index for index, key in enumerate(keys) if type_of(steps.get(key, "")).on_server]
     if start is not None and games and start > games[0]:

@@ -100,23 +100,28 @@ class RegisteredDesign:
 
 def read_registered(data: Mapping[str, Any]) -> RegisteredDesign:
     """Read the design in a registration from outside. Raises ValueError with what is wrong."""
-    wanted = {name: data[name] for name in ("steps", "conditions", "blocks", "ends") if name in data}
-    found = from_data(wanted, RegisteredDesign)
-    if any(step.block is not None and not 0 <= step.block < len(found.blocks) for step in found.steps):
+    keys = {name: data[name] for name in ("steps", "conditions", "blocks", "ends") if name in data}
+    registered = from_data(keys, RegisteredDesign)
+    if any(step.block is not None and not 0 <= step.block < len(registered.blocks) for step in registered.steps):
         raise ValueError("steps: a step names a block that is not there")
-    rules_ = [*(step.when for step in found.steps if step.when), *(rule for end in found.ends for rule in end.when)]
+    rules_ = [
+        *(step.when for step in registered.steps if step.when),
+        *(rule for end in registered.ends for rule in end.when),
+    ]
     for rule in rules_:
         rules.mentioned(rule)
-    for step in found.steps:
+    for step in registered.steps:
         for section in step.sections:
             _, problems = check_trial(dict(section.trial))
             if wrong := [problem for problem in problems if not problem.compared]:
                 raise ValueError(f"steps.{step.key}: {wrong[0].sentence}")
-    names_ = [factor.name for factor in (*found.conditions, *(f for block in found.blocks for f in block.factors))]
+    names_ = [
+        factor.name for factor in (*registered.conditions, *(f for block in registered.blocks for f in block.factors))
+    ]
     well_named = all(map(_NAME.fullmatch, names_)) and len(set(names_)) == len(names_)
-    if not well_named or len(design.cells(found.conditions)) > MAX_CELLS:
+    if not well_named or len(design.cells(registered.conditions)) > MAX_CELLS:
         raise ValueError(f"conditions: the factors need different names, and at most {MAX_CELLS} cells")
-    return found
+    return registered
 
 
 def read(project: Any, trial: Any) -> Design:
@@ -197,9 +202,9 @@ class _Reader:
 
     def _checks_without_an_end(self) -> None:
         """Remark on a check with limited tries, if no end asks who has passed."""
-        asked = {name for end in self.design.ends for rule in end.when for name in rules.steps_mentioned(rule)}
+        checked = {name for end in self.design.ends for rule in end.when for name in rules.steps_mentioned(rule)}
         for step in self.design.steps:
-            if step.tries and step.key not in asked:
+            if step.tries and step.key not in checked:
                 message = (
                     f"no end asks for answers.{step.key}.passed: who fails goes on like everybody, and the column "
                     f"{step.key}.passed tells"
@@ -221,19 +226,19 @@ class _Reader:
         if isinstance(number, int) and 2 <= number <= 1000:
             return Factor(name, {str(level): level for level in range(1, number + 1)})
         if isinstance(levels, dict):
-            known = {key: _level(value) for key, value in levels.items()}
+            level_values = {key: _level(value) for key, value in levels.items()}
         elif isinstance(levels, list) and not any(
             isinstance(level, dict | list) or is_blank(level) for level in levels
         ):
-            known = {_text(level): _level(level) for level in levels}
-            if len(known) < len(levels):
+            level_values = {_text(level): _level(level) for level in levels}
+            if len(level_values) < len(levels):
                 self._wrong(path, "names a level twice")
         else:
             self._wrong(path, f"must be a list of levels, such as [helpful, lazy], not {show(levels)}")
             return None
-        if len(known) < 2:
+        if len(level_values) < 2:
             self._wrong(path, "has one level; a factor needs two or more, or leave it out")
-        for level in known:
+        for level in level_values:
             if not _LEVEL.fullmatch(level):
                 word = re.sub(r"[^A-Za-z0-9_.]+", "_", level).strip("_") or "word"
                 self._wrong(
@@ -241,7 +246,7 @@ class _Reader:
                     f"a level's name has letters, digits, _ and . only; give {show(level)} a name: "
                     f'{{{word}: "{level}"}}',
                 )
-        return Factor(name, known)
+        return Factor(name, level_values)
 
     # Steps
 
@@ -309,9 +314,9 @@ class _Reader:
         if isinstance(item, list) or is_blank(item):
             self._wrong(path, f"must be the name of a step, not {show(item)}")
             return
-        given, settings = next(iter(item.items())) if isinstance(item, dict) else (_text(item), {})
-        name = str(given).removesuffix(".html")
-        here = (*path, given) if isinstance(item, dict) else path
+        page, settings = next(iter(item.items())) if isinstance(item, dict) else (_text(item), {})
+        name = str(page).removesuffix(".html")
+        here = (*path, page) if isinstance(item, dict) else path
         settings = {} if is_blank(settings) else settings
         if not isinstance(settings, dict):
             self._wrong(here, f"must be a map of settings, such as {name}: {{tries: 2}}, or {name} alone")
@@ -334,10 +339,10 @@ class _Reader:
         self.design.steps.append(self._game(step, own, here) if is_game else self._page(step, own, here))
 
     def _game(self, step: Step, own: dict[str, Any], path: KeyPath) -> Step:
-        known = names(TrialSection)
+        trial_keys = names(TrialSection)
         for key in own:
             if key in PAGE_KEYS:
-                why = next(iter(own.keys() & known), "")
+                why = next(iter(own.keys() & trial_keys), "")
                 self._wrong(
                     (*path, key), f"is a setting of pages, and {step.key} is a game{f' (it has {why})' if why else ''}"
                 )
@@ -346,11 +351,12 @@ class _Reader:
                     (*path, key),
                     "is one for all games of a study: write it under trial, and say under options what differs",
                 )
-            elif key not in known:
+            elif key not in trial_keys:
                 self._wrong(
-                    (*path, key), f"unknown key of a game{did_you_mean(key, known)}; a game takes the keys of trial"
+                    (*path, key),
+                    f"unknown key of a game{did_you_mean(key, trial_keys)}; a game takes the keys of trial",
                 )
-        self.design.own_trial[step.key] = {key: value for key, value in own.items() if key in known}
+        self.design.own_trial[step.key] = {key: value for key, value in own.items() if key in trial_keys}
         return step
 
     def _page(self, step: Step, own: dict[str, Any], path: KeyPath) -> Step:
@@ -386,16 +392,16 @@ class _Reader:
 
     # Rules and ends
 
-    def _rule(self, given: Any, path: KeyPath) -> str:
+    def _rule(self, text: Any, path: KeyPath) -> str:
         """Check that a rule can be read, and return it; "" if there is none."""
-        if is_blank(given):
+        if is_blank(text):
             return ""
-        rule = _text(given)
+        rule = _text(text)
         try:
-            if isinstance(given, dict | list):
+            if isinstance(text, dict | list):
                 raise rules.BadRule('must be one rule, such as answers.consent.agree == "yes"')
-            for asked in rules.mentioned(rule):
-                self._check_names(asked, rule)
+            for mention in rules.mentioned(rule):
+                self._check_names(mention, rule)
         except rules.BadRule as error:
             first = re.match(r"(?:not\s+)?([A-Za-z]\w*)[.\s]", rule)
             if first and first[1] in self._all_names:
@@ -405,41 +411,41 @@ class _Reader:
             return ""
         return rule
 
-    def _check_names(self, asked: tuple[str, ...], rule: str) -> None:
+    def _check_names(self, mention: tuple[str, ...], rule: str) -> None:
         """Raise `BadRule` if a rule asks about a step or a factor that is not there, or comes later."""
         design_ = self.design
         keys = {step.key for step in design_.steps}
-        if asked[0] == "answers" and len(asked) > 1 and (design_.is_named and asked[1] not in keys):
-            if asked[1] in self._all_names:
-                raise rules.BadRule(f"{asked[1]} is asked later; a rule may ask about earlier steps only")
-            raise rules.BadRule(f"there is no step {asked[1]}{did_you_mean(asked[1], keys)}")
-        if asked[0] == "answers" and len(asked) == 3 and not _is_over_runs(asked, rule):
-            self._check_run(asked)
-        if asked[0] in ("condition", "order") and (len(asked) != 2 or asked[1] not in self._factors):
-            name = asked[1] if len(asked) > 1 else ""
+        if mention[0] == "answers" and len(mention) > 1 and (design_.is_named and mention[1] not in keys):
+            if mention[1] in self._all_names:
+                raise rules.BadRule(f"{mention[1]} is asked later; a rule may ask about earlier steps only")
+            raise rules.BadRule(f"there is no step {mention[1]}{did_you_mean(mention[1], keys)}")
+        if mention[0] == "answers" and len(mention) == 3 and not _is_over_runs(mention, rule):
+            self._check_run(mention)
+        if mention[0] in ("condition", "order") and (len(mention) != 2 or mention[1] not in self._factors):
+            name = mention[1] if len(mention) > 1 else ""
             raise rules.BadRule(f"there is no factor {name}{did_you_mean(name, self._factors)}")
 
-    def _check_run(self, asked: tuple[str, ...]) -> None:
+    def _check_run(self, mention: tuple[str, ...]) -> None:
         """Raise `BadRule` if a rule outside of a block asks for a field of its steps, and not for that of one run."""
-        step = next((step for step in self.design.steps if step.key == asked[1]), None)
+        step = next((step for step in self.design.steps if step.key == mention[1]), None)
         if step is None or step.block is None or step.block == self._block_now:
             return
         block = self.design.blocks[step.block]
         level = "-".join(block.runs[0])
         factors = " and ".join(factor.name for factor in block.factors)
         raise rules.BadRule(
-            f"answers.{step.key} has an answer for each {factors}; write answers.{step.key}.{level}.{asked[2]}, or "
-            f"sum(answers.{step.key}.{asked[2]})"
+            f"answers.{step.key} has an answer for each {factors}; write answers.{step.key}.{level}.{mention[2]}, or "
+            f"sum(answers.{step.key}.{mention[2]})"
         )
 
-    def _ends(self, given: Any) -> None:
-        if is_blank(given):
+    def _ends(self, written: Any) -> None:
+        if is_blank(written):
             return
-        if not isinstance(given, dict):
+        if not isinstance(written, dict):
             self._wrong(ENDS, 'must be a map of ends and their rules, such as declined: answers.consent.agree == "no"')
             return
         ends = []
-        for name, value in given.items():
+        for name, value in written.items():
             path = (*ENDS, name)
             if not _NAME.fullmatch(name):
                 self._wrong(path, "an end's name has letters, digits and _")
@@ -472,12 +478,12 @@ class _Reader:
                 self._wrong((*path, "page"), str(error))
         return End(name, tuple(filter(None, rules)), minutes, page, code, link)
 
-    def _number(self, given: Any, path: KeyPath, least: int, most: int, *, whole: bool = False) -> float | None:
-        if is_blank(given):
+    def _number(self, value: Any, path: KeyPath, least: int, most: int, *, whole: bool = False) -> float | None:
+        if is_blank(value):
             return None
         check = values.whole(least, most) if whole else values.number(least, most)
         try:
-            return float(str(check(given)))
+            return float(str(check(value)))
         except ValueError as error:
             self._wrong(path, str(error))
             return None
@@ -494,9 +500,9 @@ def _names_in(item: Any) -> Iterator[str]:
         yield _text(item).removesuffix(".html")
 
 
-def _is_over_runs(asked: tuple[str, ...], rule: str) -> bool:
+def _is_over_runs(mention: tuple[str, ...], rule: str) -> bool:
     """Whether the rule asks for a field of all runs, such as `sum(answers.trust.q1)`."""
-    return re.search(rf"\b({'|'.join(rules.FUNCTIONS)})\(\s*{re.escape('.'.join(asked))}\s*\)", rule) is not None
+    return re.search(rf"\b({'|'.join(rules.FUNCTIONS)})\(\s*{re.escape('.'.join(mention))}\s*\)", rule) is not None
 
 
 def _page_name(value: Any) -> str:
@@ -557,22 +563,22 @@ def _written(design: Design, step: Step) -> dict[str, Any]:
 def _sections(design: Design, step: Step, plain: Mapping[str, Any]) -> Iterator[Section]:
     block = design.blocks[step.block] if step.block is not None else None
     within = block.factors if block else ()
-    known = {factor.name: factor for factor in (*design.conditions, *within)}
+    factors = {factor.name: factor for factor in (*design.conditions, *within)}
     everywhere = {factor.name for other in design.blocks for factor in other.factors}
     written = _written(design, step)
-    if known or everywhere:
+    if factors or everywhere:
         for path, text in _texts(written, ()):
             for name in _FACTOR.findall(text):
-                if name not in known:
+                if name not in factors:
                     design.mistakes.append(_unknown_factor(design, step, path, name))
                     return
-    named = [known[name] for name in known if name in named_factors(written)]
-    for cell in itertools.product(*(factor.levels.items() for factor in named)):
-        levels = {factor.name: name for factor, (name, _) in zip(named, cell, strict=True)}
-        given = filled(written, {factor.name: value for factor, (_, value) in zip(named, cell, strict=True)})
+    factors_used = [factors[name] for name in factors if name in named_factors(written)]
+    for cell in itertools.product(*(factor.levels.items() for factor in factors_used)):
+        levels = {factor.name: name for factor, (name, _) in zip(factors_used, cell, strict=True)}
+        given = filled(written, {factor.name: value for factor, (_, value) in zip(factors_used, cell, strict=True)})
         section, problems = check_trial(given)
         own = design.own_trial.get(step.key, {})
-        mistakes = [problem for problem in problems if problem.path[:1] and (problem.path[0] in own or named)]
+        mistakes = [problem for problem in problems if problem.path[:1] and (problem.path[0] in own or factors_used)]
         if mistakes:
             at = f" (with {', '.join(f'{name}: {level}' for name, level in levels.items())})" if levels else ""
             for path, sentence, _ in mistakes[:1]:

@@ -60,16 +60,16 @@ def check_values(
     `named` are the pages of steps with names, which a registration has checked already.
     """
     project = sections.get("project")
-    found = design.read(project, sections.get("trial"))
+    registered = design.read(project, sections.get("trial"))
     if named is not None:
-        found.is_named, found.steps = True, [Step(key, page) for key, page in named.items()]
-    if found.is_named and isinstance(project, dict):
+        registered.is_named, registered.steps = True, [Step(key, page) for key, page in named.items()]
+    if registered.is_named and isinstance(project, dict):
         sections = {**sections, "project": {key: value for key, value in project.items() if key != "steps"}}
     steps = _at(sections, STEPS)
     keys = [key for key in steps if is_step_key(key)] if isinstance(steps, dict) else []
-    checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, found, invalid=list(invalid))
+    checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, registered, invalid=list(invalid))
     _check_project({key: value for key, value in sections.items() if key != "trial"}, checked)
-    _check_trial(found.first_trial, checked)
+    _check_trial(registered.first_trial, checked)
     _check_design(checked)
     return checked
 
@@ -100,12 +100,12 @@ def _check_project(sections: dict[str, Any], checked: Checked) -> None:
             _note(checked, path, sentence)
 
 
-def _check_trial(given: Any, checked: Checked) -> None:
-    checked.trial, problems = check_trial(given)
+def _check_trial(trial: Any, checked: Checked) -> None:
+    checked.trial, problems = check_trial(trial)
     for path, sentence, compared in problems:
         if not compared:
             _note(checked, ("trial", *path), sentence)
-    for path in _unknown_in_trial(given):
+    for path in _unknown_in_trial(trial):
         _note_unknown(checked, path)
     for path, sentence, compared in problems:
         if compared and checked.valid(*(("trial", key) for key in compared)):
@@ -116,11 +116,11 @@ def _unknown_in_trial(trial: Any) -> Iterator[KeyPath]:
     for path, section in SECTIONS.items():
         if path[:1] != ("trial",):
             continue
-        given = _at({"trial": trial}, path)
-        known = NAMES[path] | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
-        unknown = ((*path, key) for key in (given if isinstance(given, dict) else ()) if key not in known)
+        present = _at({"trial": trial}, path)
+        names = NAMES[path] | ({RATE_CHANGE_MISSPELT} if section is TrialSection else set())
+        unknown = ((*path, key) for key in (present if isinstance(present, dict) else ()) if key not in names)
         # A key of `ui` that is not similar to any known key is a control of the project's own.
-        yield from (one for one in unknown if others_of(section) is None or meant_for(one) is not None)
+        yield from (key for key in unknown if others_of(section) is None or meant_for(key) is not None)
 
 
 def _at(data: Any, path: KeyPath) -> Any:

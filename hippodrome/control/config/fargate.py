@@ -73,5 +73,5 @@ def _size(value: object, unit: str) -> float | None:
     if isinstance(value, str):
         # No `\s*` before the unit: long blanks would take quadratic time.
         value = re.sub(rf"(?i){unit}$", "", value.strip()).rstrip()
-    found = number_in(value)
-    return None if found is None else float(found)
+    number = number_in(value)
+    return None if number is None else float(number)

@@ -193,10 +193,10 @@ def _files_of(folder: StepFolder, page: str, checked: Checked, step: Step | None
         return folder.find(page)
     design = checked.design
     within = design.blocks[step.block].factors if step.block is not None else ()
-    named = [factor for factor in (*design.conditions, *within) if f"{{{factor.name}}}" in page]
-    if not named:
+    factors = [factor for factor in (*design.conditions, *within) if f"{{{factor.name}}}" in page]
+    if not factors:
         raise StepFileError(f"there is no factor of the name in {page}")
-    return 0, tuple(file for levels in cells(named) for file in folder.find(fill(page, levels))[1])
+    return 0, tuple(file for levels in cells(factors) for file in folder.find(fill(page, levels))[1])
 
 
 def _of_end_pages(folder: Path, checked: Checked) -> Iterator[Mistake]:

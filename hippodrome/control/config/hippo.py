@@ -60,15 +60,15 @@ class Adapted:
 
     def at(self, path: KeyPath) -> Any:
         """Return the value at the path; None if there is none."""
-        found: Any = self.values
+        value: Any = self.values
         for key in path:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found
+            value = value.get(key) if isinstance(value, dict) else None
+        return value
 
     def section(self, path: KeyPath) -> dict[str, Any]:
         """Return the section at the path; {}, which is no part of the document, if there is none."""
-        found = self.at(path)
-        return found if isinstance(found, dict) else {}
+        value = self.at(path)
+        return value if isinstance(value, dict) else {}
 
     def remark(self, path: KeyPath, message: str) -> None:
         self.remarks.append(Remark(self.origin(path), message))
@@ -295,10 +295,10 @@ def _actions(adapted: Adapted) -> None:
     names = adapted.section(("trial",)).get("actionSpace")
     if not isinstance(names, list) or not all(isinstance(name, str | Plain) for name in names):
         return
-    known: dict[str, int] = {}
+    numbers: dict[str, int] = {}
     for index, item in enumerate(names):
         name = (item.text if isinstance(item, Plain) else item).strip()
-        first = known.setdefault(name.lower(), index)
+        first = numbers.setdefault(name.lower(), index)
         if first != index and name:
             names[index] = f"{name} {index}"
             message = f"the name is item {first + 1} already, so no key leads to this action; it is called"

@@ -30,7 +30,7 @@ def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
 
     Files that cannot be read and addresses that are no origins are left out: other checks report them.
     """
-    found: dict[str, None] = {}
+    origins: dict[str, None] = {}
     for page in pages:
         reader = _Addresses()
         try:
@@ -38,8 +38,8 @@ def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
             reader.close()
         except OSError:
             continue
-        found |= dict.fromkeys(reader.origins)
-    return tuple(found)[:MAX_HOSTS]
+        origins |= dict.fromkeys(reader.origins)
+    return tuple(origins)[:MAX_HOSTS]
 
 
 class _Addresses(PageParser):

@@ -57,10 +57,10 @@ def differing_places(event: Mapping[str, Any], here: Mapping[str, str]) -> Itera
     value "" in `here` is not compared.
     """
     setup = event.get("awsSetup")
-    given = dict(setup) if isinstance(setup, Mapping) else {}
-    given["bucket"] = given.get("bucket") or event.get("bucket")
+    setup_values = dict(setup) if isinstance(setup, Mapping) else {}
+    setup_values["bucket"] = setup_values.get("bucket") or event.get("bucket")
     for key, place in here.items():
-        named = given.get(key)
+        named = setup_values.get(key)
         if isinstance(named, str) and named and place and named.lower() != place.lower():
             yield f"project.awsSetup.{key} is {named}, but this installation's is {place}"
 
@@ -81,14 +81,14 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     lacks, and the keys that HIPPO does not have. So an old copy of the script cannot remove signed links, or the limits
     of a study's cost.
     """
-    given = {key: value for key, value in event.items() if key != "trial"}
-    adapted = adapt({"project": given, "trial": dict(earlier.get("trial") or {})})
+    project_values = {key: value for key, value in event.items() if key != "trial"}
+    adapted = adapt({"project": project_values, "trial": dict(earlier.get("trial") or {})})
     remarks = [f"{path_text(remark.path)}: {remark.message}" for remark in adapted.remarks]
     project, trial = dict(adapted.values["project"]), dict(adapted.values["trial"])
     defaults = document(ProjectKeys())
-    kept = {key: earlier[key] for key in _UNKNOWN_TO_HIPPO if key not in project and key in earlier}
-    kept = {key: value for key, value in kept.items() if value != defaults[key]}
-    remarks += [f"project.{key}: {printable(json.dumps(value), _MAX_SHOWN)} {_STAYS}" for key, value in kept.items()]
+    unknown = {key: earlier[key] for key in _UNKNOWN_TO_HIPPO if key not in project and key in earlier}
+    unknown = {key: value for key, value in unknown.items() if value != defaults[key]}
+    remarks += [f"project.{key}: {printable(json.dumps(value), _MAX_SHOWN)} {_STAYS}" for key, value in unknown.items()]
     task = {key: earlier[key] for key in ("taskDefinition", "serverPort") if key not in project and key in earlier}
     steps = adapted.section(STEPS)
     if "game" in steps.values() and not trial.get("game"):
@@ -97,4 +97,4 @@ def registration_of(event: Mapping[str, Any], earlier: Mapping[str, Any]) -> tup
     if steps and all(map(is_step_key, steps)):
         with_page = [key for key in ordered(steps) if not is_blank(steps[key])]
         project["steps"] = [{"key": key, "page": steps[key]} for key in with_page]
-    return {**kept, **task, **project, "trial": trial}, remarks
+    return {**unknown, **task, **project, "trial": trial}, remarks

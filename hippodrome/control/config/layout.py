@@ -100,11 +100,11 @@ class Layout:
                 yield Diagnostic(self.label(file), None, "", message, remark=True)
         for app in APPS:
             place = self.folder / app
-            found = sorted(place.glob(f"*/{AGENT}")) if place.is_dir() else []
-            for file in found:
+            candidates = sorted(place.glob(f"*/{AGENT}")) if place.is_dir() else []
+            for file in candidates:
                 message = f"not found by servers there; put it into {app}/ itself, with the modules that it imports"
                 yield Diagnostic(self.label(file), None, "", message)
-            if not found and any((place / name).is_file() for name in _PROGRAMS):
+            if not candidates and any((place / name).is_file() for name in _PROGRAMS):
                 message = f"there is no {AGENT} beside HIPPO Gym's own programs; the game would be played without agent"
                 yield Diagnostic(app, None, "", message)
 
@@ -130,8 +130,8 @@ def pages_folder(folder: Path) -> Path | None:
 
     Raises OSError if the folders cannot be read.
     """
-    found = (place / name for place in _places(folder) for name in PAGES)
-    return next((path for path in found if path.is_dir()), None)
+    candidates = (place / name for place in _places(folder) for name in PAGES)
+    return next((path for path in candidates if path.is_dir()), None)
 
 
 def requirements_file(folder: Path) -> Path | None:
@@ -158,12 +158,12 @@ def _config(folder: Path) -> Path:
     if not is_folder:
         message = "this is a file; name the folder it is in" if there else "there is no such folder"
         raise ConfigErrors([Diagnostic(str(folder), None, "", message)])
-    found = next(filter(None, places), [])
-    if len(found) > 1:
+    config_path = next(filter(None, places), [])
+    if len(config_path) > 1:
         raise ConfigErrors([Diagnostic(CONFIGS[0], None, "", f"there is a {CONFIGS[1]} too; keep only one of them")])
-    if not found:
+    if not config_path:
         raise ConfigErrors([Diagnostic(CONFIGS[0], None, "", f"there is no such file in {folder}{_above(folder)}")])
-    return found[0]
+    return config_path[0]
 
 
 def _above(folder: Path) -> str:

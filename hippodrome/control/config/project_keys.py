@@ -58,56 +58,56 @@ def header(value: object) -> str:
 
 def project_id(value: object) -> str:
     """Check a project's id: 1 to 64 letters, digits, dashes and underscores, with no underscore at the beginning."""
-    found = as_text(value, "letters, digits, dashes and underscores")
-    if found == _CERTIFICATES:
-        raise ValueError(f"must not be {found}: that is the folder of the servers' certificate in the bucket")
-    if ids.is_project_id(found):
-        return found
-    if len(found) > 64:
-        raise ValueError(f"must be at most 64 characters long, not {len(found)}")
-    better = re.sub(r"[^A-Za-z0-9_]+", "-", found).strip("-_")
+    text = as_text(value, "letters, digits, dashes and underscores")
+    if text == _CERTIFICATES:
+        raise ValueError(f"must not be {text}: that is the folder of the servers' certificate in the bucket")
+    if ids.is_project_id(text):
+        return text
+    if len(text) > 64:
+        raise ValueError(f"must be at most 64 characters long, not {len(text)}")
+    better = re.sub(r"[^A-Za-z0-9_]+", "-", text).strip("-_")
     hint = f'; write for example "{better}"' if better else ""
-    if found.startswith("_"):
+    if text.startswith("_"):
         raise ValueError(f"must not begin with an underscore{hint}")
-    raise ValueError(f"may hold only letters, digits, dashes and underscores, not {show(found)}{hint}")
+    raise ValueError(f"may hold only letters, digits, dashes and underscores, not {show(text)}{hint}")
 
 
 def region(value: object) -> str:
     """Check the code of an AWS region."""
-    found = as_text(value, "an AWS region such as ca-central-1")
-    if _REGION.fullmatch(found):
-        return found
-    if _REGION.fullmatch(found[:-1]) and found[-1:].isalpha():
-        raise ValueError(f"{found} is an availability zone; the region is {found[:-1]}")
-    raise ValueError(f"must be an AWS region such as ca-central-1, not {show(found)}")
+    text = as_text(value, "an AWS region such as ca-central-1")
+    if _REGION.fullmatch(text):
+        return text
+    if _REGION.fullmatch(text[:-1]) and text[-1:].isalpha():
+        raise ValueError(f"{text} is an availability zone; the region is {text[:-1]}")
+    raise ValueError(f"must be an AWS region such as ca-central-1, not {show(text)}")
 
 
 def domain(value: object) -> str:
     """Check a DNS name of at least two labels, and return it in small letters."""
-    found = as_text(value, "a domain name such as example.org")
-    name = found.lower().rstrip(".")
-    if _DOMAIN.fullmatch(name) and len(name) <= _DNS_ROOM and name == found.lower():
+    text = as_text(value, "a domain name such as example.org")
+    name = text.lower().rstrip(".")
+    if _DOMAIN.fullmatch(name) and len(name) <= _DNS_ROOM and name == text.lower():
         return name
     bare = re.sub(r"^[a-z]+://", "", name).split("/")[0].split(":")[0].rstrip(".")
-    if bare != found and _DOMAIN.fullmatch(bare):
+    if bare != text and _DOMAIN.fullmatch(bare):
         raise ValueError(f"must be the domain name only, without https:// or a path; write {bare}")
     if len(name) > _DNS_ROOM:
         raise ValueError(f"must be at most {_DNS_ROOM} characters, so that the servers' names fit in front")
-    raise ValueError(f"must be a domain name such as example.org, not {show(found)}")
+    raise ValueError(f"must be a domain name such as example.org, not {show(text)}")
 
 
 def origin(value: object) -> str:
     """Check an https origin: https://name, perhaps with a port, without a path and without a wildcard."""
-    found = as_text(value, "an address such as https://example.org")
-    whole_match = _ORIGIN.fullmatch(found.lower())
+    text = as_text(value, "an address such as https://example.org")
+    whole_match = _ORIGIN.fullmatch(text.lower())
     if whole_match and len(whole_match["host"]) <= 253:
-        return found.lower()
-    if _ORIGIN.fullmatch("https://" + found.lower()):
-        raise ValueError(f"must begin with https://; write https://{found.lower()}")
-    start = _ORIGIN.match(found.lower())
-    if start and found[start.end() : start.end() + 1] in {"/", "?", "#"}:
+        return text.lower()
+    if _ORIGIN.fullmatch("https://" + text.lower()):
+        raise ValueError(f"must begin with https://; write https://{text.lower()}")
+    start = _ORIGIN.match(text.lower())
+    if start and text[start.end() : start.end() + 1] in {"/", "?", "#"}:
         raise ValueError(f"must be the host only, without a path; write {start[0]}")
-    raise ValueError(f"must be an address such as https://example.org, without path and without *, not {show(found)}")
+    raise ValueError(f"must be an address such as https://example.org, without path and without *, not {show(text)}")
 
 
 def page_origin(value: object) -> str:
@@ -115,9 +115,9 @@ def page_origin(value: object) -> str:
 
     It is an https origin, or an http origin of this machine (localhost, a name below it, 127.0.0.1).
     """
-    found = as_text(value, "an address such as https://play.example.org").lower()
-    if _HERE.fullmatch(found):
-        return found.removesuffix(":80")
+    text = as_text(value, "an address such as https://play.example.org").lower()
+    if _HERE.fullmatch(text):
+        return text.removesuffix(":80")
     return origin(value).removesuffix(":443")
 
 
@@ -150,19 +150,19 @@ def step_name(value: object) -> str:
     """Check the step that an event names: a number, finalStep, or the name of a step."""
     if isinstance(value, str) and (value.strip() == FINAL or _STEP_NAME.fullmatch(value.strip())):
         return value.strip()
-    found = number_in(value)
-    if found is None or found != int(found) or not 0 < found <= MAX_STEPS + 1:
+    number = number_in(value)
+    if number is None or number != int(number) or not 0 < number <= MAX_STEPS + 1:
         raise ValueError(f"must be the number of a step or {FINAL}, not {show(value)}")
-    return str(int(found))
+    return str(int(number))
 
 
 def page(value: object) -> str:
     """Check the page of a step, and return its file without `.html`, or the type of a step such as `game`."""
     if values.is_blank(value):
         raise ValueError(f"has no page; write the name of its file, or {step_types.NAMES}")
-    found = as_text(value, f"the name of a file, or {step_types.NAMES}")
-    stem = step_file(found)
-    if stem in step_types.RESERVED and found != stem:
+    text = as_text(value, f"the name of a file, or {step_types.NAMES}")
+    stem = step_file(text)
+    if stem in step_types.RESERVED and text != stem:
         raise ValueError(f"a page cannot be called {stem}.html; write {stem} for the {stem} step, or rename the page")
     return stem
 

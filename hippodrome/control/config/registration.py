@@ -51,10 +51,10 @@ def parse_registration(data: object) -> dict[str, Any]:
     steps, mistakes = _steps_in(data.get("steps"))
     project = {key: value for key, value in data.items() if key not in ("trial", "steps", *_OURS, *_DESIGN)}
     pages = {step.key: step.page for step in steps}
-    named = any(key != FINAL and not key.isdecimal() for key in pages)
-    if not mistakes and not named:
+    has_names = any(key != FINAL and not key.isdecimal() for key in pages)
+    if not mistakes and not has_names:
         project["steps"] = pages
-    checked = check({"project": project, "trial": data.get("trial")}, named=pages if named else None)
+    checked = check({"project": project, "trial": data.get("trial")}, named=pages if has_names else None)
     registered = _design_in(data, mistakes)
     if mistakes:
         checked.mistakes = [mistake for mistake in checked.mistakes if mistake.path[:2] != STEPS] + mistakes
@@ -70,9 +70,9 @@ def parse_registration(data: object) -> dict[str, Any]:
     checked.design.steps = registered.steps
     checked.design.conditions, checked.design.blocks = registered.conditions, registered.blocks
     checked.design.ends = registered.ends
-    known = {step.key: step for step in registered.steps}
+    by_key = {step.key: step for step in registered.steps}
     shown = visited(checked.step_keys, checked.project.steps)
-    own = [StepFiles(s.key, s.page, s.variants, step=known.get(s.key)) for s in steps if s.key in shown]
+    own = [StepFiles(s.key, s.page, s.variants, step=by_key.get(s.key)) for s in steps if s.key in shown]
     config = Config.of(checked, own)
     return config.registration() | {"gamePages": dict.fromkeys(config.trial.pages, 0)} | task
 

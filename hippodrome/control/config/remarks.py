@@ -124,8 +124,10 @@ def keys_without_an_action(config: Config, actions: Sequence[str]) -> Iterator[R
     names = [name.strip().lower() for name in actions]
     for combined, action in config.trial.keys.items():
         if action not in names:
-            known = printable(", ".join(names), 100)
-            yield Remark((*KEYS, combined), f"the key does nothing: no action is called {action}; there are {known}")
+            names_shown = printable(", ".join(names), 100)
+            yield Remark(
+                (*KEYS, combined), f"the key does nothing: no action is called {action}; there are {names_shown}"
+            )
 
 
 def _names_a_certificate(config: Config) -> bool:
@@ -186,5 +188,11 @@ def remarks_on(folder: Path, config: Config) -> list[Diagnostic]:
         remark for remark in arrows_without_an_action(config, config.trial.action_space) if source.names(remark.path)
     ]  # a file without `ui` gets no remark, although all arrows are shown
     own = [*texts.shown_as_they_are(config), *texts.left_in_english(config)]
-    found = [*remarks(config), *own, *arrows, *without_observations(source, config), *keys_of_sessions(source, config)]
-    return [*config.remarks, *(source.diagnostic(path, message, remark=True) for path, message in found)]
+    all_remarks = [
+        *remarks(config),
+        *own,
+        *arrows,
+        *without_observations(source, config),
+        *keys_of_sessions(source, config),
+    ]
+    return [*config.remarks, *(source.diagnostic(path, message, remark=True) for path, message in all_remarks)]

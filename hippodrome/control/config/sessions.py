@@ -64,39 +64,39 @@ def mistakes_of_groups(checked: Checked, groups: int) -> Iterator[Mistake]:
         yield Mistake(MATCHING, f"{project.matching}, and there are no groups; {VERSIONS}, or matching: arrival")
 
 
-def _other_groups(named: Sequence[int], groups: int) -> Iterator[Mistake]:
+def _other_groups(group_numbers: Sequence[int], groups: int) -> Iterator[Mistake]:
     """Yield a mistake if `players` is given group by group, and these are not all groups of the study."""
     if not groups:
         yield Mistake(WHO_PLAYS, f"is given group by group, and there are no groups; {VERSIONS}, or one map for all")
         return
     there = f"there are {groups} groups, 0 to {groups - 1}, since a page has {groups} versions"
-    for group in named:
+    for group in group_numbers:
         if group >= groups:
             message = f"{there}; write a page for this group, such as rules-{group}.html, or leave the group out"
             yield Mistake((*WHO_PLAYS, str(group)), message)
-    missing = next((group for group in range(groups) if group not in named), None)
+    missing = next((group for group in range(groups) if group not in group_numbers), None)
     if missing is not None:
         yield Mistake(WHO_PLAYS, f"does not say who plays in group {missing}; {there}")
 
 
 def _humans(checked: Checked) -> Iterator[Mistake]:
     """In each group, the number of human players must be `project.players`."""
-    wanted, trial = checked.project.players, checked.trial
+    players, trial = checked.project.players, checked.trial
     if not checked.valid(WHO_PLAYS) or not checked.game_steps:
         return
     if not trial.players:
-        example = ", ".join(f"player_{index}: {HUMAN}" for index in range(min(wanted, 2)))
-        more = ", …" if wanted > 2 else ""
-        message = f"missing; project.players is {wanted}, so name the environment's players, {wanted} of them human"
+        example = ", ".join(f"player_{index}: {HUMAN}" for index in range(min(players, 2)))
+        more = ", …" if players > 2 else ""
+        message = f"missing; project.players is {players}, so name the environment's players, {players} of them human"
         yield Mistake(WHO_PLAYS, f"{message}, such as {{{example}{more}}}")
         return
     for path, humans in trial.humans():
-        if len(humans) == wanted:
+        if len(humans) == players:
             continue
         are = f"{len(humans)} players are human" if len(humans) > 1 else "1 player is human"
-        advice = f"write human for {wanted} of them, or players: {len(humans)} under project"
+        advice = f"write human for {players} of them, or players: {len(humans)} under project"
         names = printable(", ".join(humans), 100)
-        yield Mistake((*WHO_PLAYS, *path), f"{are} ({names}), and project.players is {wanted}; {advice}")
+        yield Mistake((*WHO_PLAYS, *path), f"{are} ({names}), and project.players is {players}; {advice}")
 
 
 def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:

@@ -55,9 +55,9 @@ class StepFolder:
         pattern = re.compile(re.escape(page) + r"-(0|[1-9][0-9]{0,5})\.html")
         return {int(match[1]) for name in self.names if (match := pattern.fullmatch(name))}
 
-    def _nearest(self, wanted: str) -> str:
+    def _nearest(self, name: str) -> str:
         """The end of the message about a missing page: the page that was probably meant, as config.yml names it."""
-        return did_you_mean(wanted, self._pages(), SIMILAR_FILES) or ("" if self.names else ", which is empty")
+        return did_you_mean(name, self._pages(), SIMILAR_FILES) or ("" if self.names else ", which is empty")
 
     def _pages(self) -> list[str]:
         """The names of all pages for config.yml: without `.html`, and without the number of a group."""

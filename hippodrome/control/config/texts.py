@@ -26,7 +26,7 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
     for name, text in checked.project.own_texts.items():
         if name == LANGUAGE and not is_language(text):
             yield Mistake((*TEXTS, name), f"must be a language as pages name it, such as de or pt-BR, not {show(text)}")
-        elif wrong := [found for found in _BRACES.findall(text) if found[1:-1] not in places(ENGLISH[name])]:
+        elif wrong := [brace for brace in _BRACES.findall(text) if brace[1:-1] not in places(ENGLISH[name])]:
             yield Mistake((*TEXTS, name), f"nothing stands for {wrong[0]} here; {_known(name)}")
         elif match := re.search("[{}]", _BRACES.sub("", text)):
             yield Mistake((*TEXTS, name), f"participants would read {match[0]}, a brace too many; {_known(name)}")
@@ -34,10 +34,10 @@ def mistakes(checked: Checked) -> Iterator[Mistake]:
 
 def _known(name: str) -> str:
     """A clause that names the placeholders which this text may have."""
-    known = [f"{{{place}}}" for place in places(ENGLISH[name])]
-    if not known:
+    placeholders = [f"{{{place}}}" for place in places(ENGLISH[name])]
+    if not placeholders:
         return "this text has no placeholders"
-    *first, last = known
+    *first, last = placeholders
     return f"there are {', '.join(first)} and {last}" if first else f"there is {last}"
 
 

@@ -57,9 +57,9 @@ def _similar(path: KeyPath, here: float, elsewhere: float) -> KeyPath | None:
     `here` is how similar a key of the same section must be, and `elsewhere` a key of another section.
     """
     for section in (path[:-1], *_ELSEWHERE):
-        found = nearest(str(path[-1]), sorted(NAMES[section]), here if section == path[:-1] else elsewhere)
-        if found:
-            return (*section, found)
+        similar = nearest(str(path[-1]), sorted(NAMES[section]), here if section == path[:-1] else elsewhere)
+        if similar:
+            return (*section, similar)
     return None
 
 
@@ -68,4 +68,4 @@ def _home(key: str, section: KeyPath) -> KeyPath | None:
     if key == FINAL or key.isdecimal():
         return STEPS
     texts = TEXTS if key in ENGLISH and section in _AROUND_TEXTS else None
-    return next((home for home, known in _ELSEWHERE.items() if key in known), texts)
+    return next((home for home, keys in _ELSEWHERE.items() if key in keys), texts)

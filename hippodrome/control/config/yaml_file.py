@@ -123,13 +123,13 @@ def _check_text(root: yaml.Node | None) -> None:
     It is an escape such as "\\ud83d", half of a surrogate pair, which UTF-8 cannot hold; or a character of Word or
     Slack that only looks like one of YAML's (`typography.py`).
     """
-    seen: set[int] = set()  # aliases stand for the same node
+    visited: set[int] = set()  # aliases stand for the same node
     nodes = [root] if root else []
     while nodes:
         node = nodes.pop()
-        if id(node) in seen:
+        if id(node) in visited:
             continue
-        seen.add(id(node))
+        visited.add(id(node))
         if isinstance(node, yaml.ScalarNode) and _SURROGATE.search(node.value):
             message = "an escape of half a character; write the character itself instead, such as 😀"
             raise UnreadableConfig(message, node.start_mark.line + 1)
@@ -179,9 +179,9 @@ def _syntax(error: yaml.MarkedYAMLError, text: str) -> UnreadableConfig:
         return UnreadableConfig("the line is indented with a tab; YAML wants spaces", number + 1)
     if "mapping values are not allowed" in problem:
         for near in (number, number - 1):
-            found = _NO_SPACE.fullmatch(lines[near]) if 0 <= near < len(lines) else None
-            if found:
-                better = printable(f"{found['key']}: {found['value']}")
+            match = _NO_SPACE.fullmatch(lines[near]) if 0 <= near < len(lines) else None
+            if match:
+                better = printable(f"{match['key']}: {match['value']}")
                 return UnreadableConfig(f'the space after the colon is missing; write "{better}"', near + 1)
         matched = _MATCHED_BY.match(source)
         if matched:

@@ -158,8 +158,10 @@ class ServerSlots(Record, frozen=True):
         if project.max_servers is not None:
             rooms.append(project.max_servers - len(self.slots))
         if project.max_server_hours is not None:
-            left = project.max_server_hours * 3600 - self.used - sum(held.reserved for held in self.slots.values())
-            rooms.append(left // seconds)
+            seconds_left = (
+                project.max_server_hours * 3600 - self.used - sum(held.reserved for held in self.slots.values())
+            )
+            rooms.append(seconds_left // seconds)
         return min(rooms, default=None)
 
     def released(self, server: Server, seconds: int, *, keep: bool = False) -> ServerSlots:

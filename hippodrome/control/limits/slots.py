@@ -72,9 +72,9 @@ class Slots:
             return
         keys = [limits.participant_slots_key(project.id, shard) for shard in range(SHARDS)]
         parts = [self._shared.read(key, ParticipantSlots) for key in keys]
-        known = {label for part in parts for label in part.labels}
+        labels = {label for part in parts for label in part.labels}
         new: dict[int, list[str]] = {}
-        for label in {ids.server_label(project.id, user_id) for user_id in user_ids} - known:
+        for label in {ids.server_label(project.id, user_id) for user_id in user_ids} - labels:
             new.setdefault(limits.first_shard(label, limit), []).append(label)
         if not new and limits.is_divided(limit, parts):
             return
@@ -158,14 +158,14 @@ class Slots:
         AWS calls: one read for each of these projects that limits servers. There is no listing, so no other document in
         that folder is read.
         """
-        found = {}
+        server_slots = {}
         for project in projects:
             if project.limits_servers:
                 try:
-                    found[project.id] = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
+                    server_slots[project.id] = self._shared.read(limits.server_slots_key(project.id), ServerSlots)
                 except ValueError as error:
                     failure("a project's slots cannot be read", error, project=project.id)
-        return found
+        return server_slots
 
     def release_forgotten(self, project_id: str, forgotten: Mapping[str, Server | None]) -> None:
         """Release slots that servers still hold although they have ended. AWS calls: two for all of them.

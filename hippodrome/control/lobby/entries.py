@@ -92,8 +92,8 @@ class Entries:
 
     def with_waiting(self, waiting: Waiting) -> Entries:
         """Return the listing with this participant, who waits now, added."""
-        left = {label: each for label, each in self.left.items() if label != waiting.label}
-        return replace(self, waiting={**self.waiting, waiting.label: waiting}, left=left)
+        departures = {label: departure for label, departure in self.left.items() if label != waiting.label}
+        return replace(self, waiting={**self.waiting, waiting.label: waiting}, left=departures)
 
     def with_confirmation(self, proposal_id: str, label: str) -> Entries:
         """Return the listing with this confirmation, which has just been written, added."""
@@ -135,8 +135,8 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
         elif kind == "left" and text.isdecimal():
             departures[label] = Departure(int(text), entry.modified)
         elif joined and age <= REMEMBERED:
-            one = Waiting(label, int(joined), trait, entry.modified)
-            waiting[label] = _earlier(waiting[label], one) if label in waiting else one
+            entry_waiting = Waiting(label, int(joined), trait, entry.modified)
+            waiting[label] = _earlier(waiting[label], entry_waiting) if label in waiting else entry_waiting
     return Entries(
         waiting={label: person for label, person in waiting.items() if label not in departures},
         confirmed={sid: frozenset(labels) for sid, labels in confirmed.items()},
@@ -150,7 +150,7 @@ def read(project_id: str, listed: Iterable[Entry], now: datetime, way: timedelta
 
 def _earlier(waiting: Waiting, other: Waiting) -> Waiting:
     """Join the two entries of a participant who opened two pages at once: the earlier `joined`, the later `seen`."""
-    first = min(waiting, other, key=lambda each: each.joined)
+    first = min(waiting, other, key=lambda person: person.joined)
     return replace(first, seen=max(waiting.seen, other.seen))
 
 

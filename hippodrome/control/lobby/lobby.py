@@ -116,10 +116,10 @@ class Lobby:
         label = ids.server_label(project.id, user_id)
         membership = self._repository.membership(project.id, user_id)
         if membership is None:
-            found = self._run(project, _Asker(label, user_id, group, answers))
-            if not isinstance(found, Membership):
-                return found
-            membership = found
+            standing = self._run(project, _Asker(label, user_id, group, answers))
+            if not isinstance(standing, Membership):
+                return standing
+            membership = standing
         if membership.unmatched:
             self._store.answer_as_unmatched(project, user_id)
         return membership
@@ -131,12 +131,12 @@ class Lobby:
         AWS calls: one listing and some writes.
         """
         label = ids.server_label(project.id, user_id)
-        found = self._store.entries(project, label)
-        one = found.waiting.get(label)
-        if one is not None:
-            self._documents.put(lobby_entries.departure_key(project.id, label, one.joined), b"")
-        if one is not None or label in found.left:
-            self._store.delete(key for key in found.keys[label] if ".left." not in key)
+        entries = self._store.entries(project, label)
+        person = entries.waiting.get(label)
+        if person is not None:
+            self._documents.put(lobby_entries.departure_key(project.id, label, person.joined), b"")
+        if person is not None or label in entries.left:
+            self._store.delete(key for key in entries.keys[label] if ".left." not in key)
 
     def forget(self, project: Project, user_id: str) -> None:
         """Delete the entries of a participant who no longer needs a game. May be repeated.
@@ -169,10 +169,10 @@ class Lobby:
         def settle(document: Decisions) -> Decisions:
             if label in document.labels():
                 return document
-            wanted = servers_ahead.sessions_wanted(document, entries, project, [label])
+            sessions_ahead = servers_ahead.sessions_wanted(document, entries, project, [label])
             return servers_ahead.open_sessions(
                 document,
-                wanted,
+                sessions_ahead,
                 label,
                 now,
                 ids.new_session_id,
@@ -183,9 +183,9 @@ class Lobby:
         after = self._store.change(project, settle)
         if label in after.labels():  # the message came late, and nothing else removes the participant
             self._documents.delete(way)
-        for each in after.open:
-            if each.by == label:
-                self._store.start_server(project, each.id, each.players)
+        for server in after.open:
+            if server.by == label:
+                self._store.start_server(project, server.id, server.players)
 
     def repair(self, project: Project) -> Collection[str]:
         """Finish interrupted runs, and bring the servers that are started ahead to their number; for the sweep.
@@ -201,24 +201,24 @@ class Lobby:
 
     def _run(self, project: Project, me: _Asker) -> LobbyState | NoServerYet | Membership:
         """One run, for a participant without a membership."""
-        known = self._store.read(project)
-        formed = known.formed_of(me.label)
+        decisions = self._store.read(project)
+        formed = decisions.formed_of(me.label)
         if formed and formed.waits_for:
-            return self._wait_for_server(project, me, known, formed)
+            return self._wait_for_server(project, me, decisions, formed)
         entries = self._store.entries(project)
-        proposal = known.proposal_of(me.label)
-        if me.label not in known.labels() or (proposal and me.label not in entries.waiting):
+        proposal = decisions.proposal_of(me.label)
+        if me.label not in decisions.labels() or (proposal and me.label not in entries.waiting):
             entries = self._write_entry(project, me, entries)
         if proposal and me.label not in entries.confirmed.get(proposal.id, ()):
             entries = self._confirm(project, me, proposal, entries)
         chosen: Sequence[Sequence[str]] = ()
         if project.asks_match:
-            chosen = self._matcher.chosen(project, me.label, partial(_candidate, me), known, entries)
-        proposals = self._lookups.proposals_to_form(known, entries, me.label)
-        servers = self._lookups.servers(project, known, me.label, proposals)
-        run = self._lookups.run(project, known, entries, proposals, servers=servers, chosen=chosen)
+            chosen = self._matcher.chosen(project, me.label, partial(_candidate, me), decisions, entries)
+        proposals = self._lookups.proposals_to_form(decisions, entries, me.label)
+        servers = self._lookups.servers(project, decisions, me.label, proposals)
+        run = self._lookups.run(project, decisions, entries, proposals, servers=servers, chosen=chosen)
         own = entries.waiting.get(me.label)
-        before = known  # the version of the document that this run changes
+        before = decisions  # the version of the document that this run changes
 
         def settle(document: Decisions) -> Decisions:
             nonlocal before
@@ -232,16 +232,16 @@ class Lobby:
             waited = lobby_entries.seconds_since(own.joined, run.now)
             return rules.give_up(document, Unmatched(me.label, me.user_id, run.now, code, waited))
 
-        after = known
+        after = decisions
         # Decisions that are carried out leave the document with the next other change. Alone they need no write.
-        if settle(known) != rules.without_done(known, entries.done):
-            after = self._change(project, known, settle)
-            if after is not known:
+        if settle(decisions) != rules.without_done(decisions, entries.done):
+            after = self._change(project, decisions, settle)
+            if after is not decisions:
                 self._store.forget_done(project, after, entries)
-        self._begin_to_wait(project, known, after, entries, servers)
-        made = self._store.carry_out(project, _due(me.label, known, before, after), entries)
-        if me.label in made:
-            return made[me.label]
+        self._begin_to_wait(project, decisions, after, entries, servers)
+        memberships = self._store.carry_out(project, _due(me.label, decisions, before, after), entries)
+        if me.label in memberships:
+            return memberships[me.label]
         self._store.delete(entries.outdated[:DELETED_AT_ONCE])
         if formed := after.formed_of(me.label):
             return _no_server_yet(formed, servers)
@@ -257,7 +257,7 @@ class Lobby:
 
         If such a server has no record, its start message may be lost, and is sent again.
         """
-        fresh = [each for each in after.without_server() if decisions.labels_formed().isdisjoint(each.labels)]
+        fresh = [session for session in after.without_server() if decisions.labels_formed().isdisjoint(session.labels)]
         self._store.delete(key for session in fresh for label in session.labels for key in entries.keys.get(label, ()))
         for each in fresh:
             if servers.records.get(each.id, ...) is None:
@@ -279,9 +279,9 @@ class Lobby:
         if settle(decisions) is decisions:  # the usual case: nothing changes
             return _no_server_yet(formed, servers)
         after = self._change(project, decisions, settle)
-        made = self._store.carry_out(project, _due(me.label, decisions, before, after), Entries())
-        if me.label in made:
-            return made[me.label]
+        memberships = self._store.carry_out(project, _due(me.label, decisions, before, after), Entries())
+        if me.label in memberships:
+            return memberships[me.label]
         return _no_server_yet(after.formed_of(me.label) or formed, servers)
 
     def _change(self, project: Project, decisions: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
@@ -294,20 +294,20 @@ class Lobby:
 
     def _write_entry(self, project: Project, me: _Asker, entries: Entries) -> Entries:
         """Write the participant's entry, at most once in `SEEN_ANEW`; return `entries` with it."""
-        now, waiting, left = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
+        now, waiting, departure = self._platform.now(), entries.waiting.get(me.label), entries.left.get(me.label)
         if waiting is not None and now - waiting.seen < SEEN_ANEW:
             return entries
         if waiting is None:
-            is_back = left is not None and now - left.at < lobby_entries.PRESENT
-            joined = left.joined if left is not None and is_back else lobby_entries.milliseconds(now)
+            is_back = departure is not None and now - departure.at < lobby_entries.PRESENT
+            joined = departure.joined if departure is not None and is_back else lobby_entries.milliseconds(now)
             answers = me.answers() if field_of(project.matching) is not None else {}
             waiting = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
-        one = Waiting(waiting.label, waiting.joined, waiting.trait, now)
-        own_key = lobby_entries.waiting_key(project.id, one)
+        refreshed = Waiting(waiting.label, waiting.joined, waiting.trait, now)
+        own_key = lobby_entries.waiting_key(project.id, refreshed)
         self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))
         others = (key for key in entries.keys.get(me.label, ()) if key != own_key and ".yes." not in key)
         self._store.delete(others)  # entries that say they have left, are under way, or wait on another page
-        return entries.with_waiting(one)
+        return entries.with_waiting(refreshed)
 
     def _confirm(self, project: Project, me: _Asker, proposal: Proposal, entries: Entries) -> Entries:
         """Write the participant's confirmation of the proposal; return the folder's entries, listed again.
@@ -329,13 +329,15 @@ def _candidate(me: _Asker) -> questions.Candidate:
     return questions.candidate(me.label, me.group, dict(me.answers()))
 
 
-def _due(label: str, known: Decisions, before: Decisions, after: Decisions) -> Decisions:
+def _due(label: str, decisions: Decisions, before: Decisions, after: Decisions) -> Decisions:
     """The decisions that this participant's request carries out. It has read `known` and changed `before` to `after`.
 
     They are the decision on its own participant, and the sessions of others to which it has given a server. If another
     request has decided on this participant since `known` was read, that request carries the decision out.
     """
-    own = after.decided_for(label) if known.is_decided(label) or not before.is_decided(label) else Decisions()
-    waited = {each.labels for each in before.without_server()}
-    given = [session for session in after.for_good().formed if session.labels in waited and session not in own.formed]
-    return Decisions(formed=(*own.formed, *given), unmatched=own.unmatched)
+    own = after.decided_for(label) if decisions.is_decided(label) or not before.is_decided(label) else Decisions()
+    waited = {session.labels for session in before.without_server()}
+    newly_formed = [
+        session for session in after.for_good().formed if session.labels in waited and session not in own.formed
+    ]
+    return Decisions(formed=(*own.formed, *newly_formed), unmatched=own.unmatched)

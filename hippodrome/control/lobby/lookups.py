@@ -89,11 +89,11 @@ class Lookups:
         open_for = sessions.open_for(project, self._platform.settings)
         usable = [server.id for server in decisions.open if server.is_usable(own.players, now, open_for)]
         some = usable[:LOOKED_AT] if is_first else []
-        found = self._records(project, [own.id, *some])
-        if own.id in found.over:
+        records = self._records(project, [own.id, *some])
+        if own.id in records.over:
             others = self._records(project, usable[len(some) : LOOKED_AT_IN_NEED])
-            return StartedAhead({**found.records, **others.records})
-        return found
+            return StartedAhead({**records.records, **others.records})
+        return records
 
     def _records(self, project: Project, session_ids: Sequence[str]) -> StartedAhead:
         acts = [partial(self._server, project, session_id) for session_id in session_ids]
@@ -120,10 +120,10 @@ class Lookups:
         """
         waiting = [entries.waiting[label] for proposal in proposals for label in proposal.labels]
         looked = self._platform.run_all([partial(self._member, project, person) for person in waiting])
-        found = {person.label: member for person, member in zip(waiting, looked, strict=True)}
+        by_label = {person.label: member for person, member in zip(waiting, looked, strict=True)}
         members, broken = {}, []
         for each in proposals:
-            known = [found[label] for label in each.labels]
+            known = [by_label[label] for label in each.labels]
             if any(isinstance(one, Exception) for one in known):
                 continue
             able = [one for one in known if isinstance(one, Matched)]
@@ -136,8 +136,8 @@ class Lookups:
     def _member(self, project: Project, waiting: Waiting) -> Matched | Exception | None:
         """The participant who waits, as a member; None if they have left or have a membership; the error of a read."""
         try:
-            found = self._platform.documents.get(lobby_entries.waiting_key(project.id, waiting))
-            written = lobby_entries.read_body(found.body) if found else None
+            document = self._platform.documents.get(lobby_entries.waiting_key(project.id, waiting))
+            written = lobby_entries.read_body(document.body) if document else None
             if written is None or ids.server_label(project.id, written.user_id) != waiting.label:
                 return None
             membership = self._repository.membership(project.id, written.user_id)

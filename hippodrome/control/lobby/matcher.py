@@ -104,5 +104,5 @@ class Matcher:
         """The answer to the question; None if it has none yet, or if too few participants wait for a session."""
         if len(question.waiting) < project.players:
             return None
-        found = self._documents.get(groups_key(project.id, question.id))
-        return questions.read(found.body, question) if found else None
+        document = self._documents.get(groups_key(project.id, question.id))
+        return questions.read(document.body, question) if document else None

@@ -65,9 +65,9 @@ def _of_one_trait(free: Sequence[Waiting], players: int) -> list[Sequence[Waitin
     for person in free:
         by_trait.setdefault(person.trait, []).append(person)
     sessions = [
-        found[start : start + players]
-        for found in by_trait.values()
-        for start in range(0, len(found) - players + 1, players)
+        people[start : start + players]
+        for people in by_trait.values()
+        for start in range(0, len(people) - players + 1, players)
     ]
     return sorted(sessions, key=lambda members: members[0].order)
 
@@ -78,7 +78,7 @@ def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[
     by_trait: dict[str, deque[Waiting]] = {}
     for person in free:
         by_trait.setdefault(person.trait, deque()).append(person)
-    heads = [(found[0].order, trait) for trait, found in by_trait.items()]  # in the order of arrival, so it is a heap
+    heads = [(people[0].order, trait) for trait, people in by_trait.items()]  # in the order of arrival, so it is a heap
     while heads:
         members: list[Waiting] = []
         spent: list[str] = []  # the traits of which this session may have no further member
@@ -104,14 +104,14 @@ def _short_sessions(
 ) -> list[Sequence[Waiting]]:
     """A session for each participant in `over` without one, at most `PROPOSED_AT_ONCE`: with free ones, or alone."""
     labels = {member.label for members in sessions for member in members}
-    found: list[Sequence[Waiting]] = []
+    short: list[Sequence[Waiting]] = []
     for person in over:
-        if person.label in labels or len(found) == PROPOSED_AT_ONCE:
+        if person.label in labels or len(short) == PROPOSED_AT_ONCE:
             continue
         members = around(person, [other for other in free if other.label not in labels], project)
         labels |= {member.label for member in members}
-        found.append(members)
-    return found
+        short.append(members)
+    return short
 
 
 def around(waiting: Waiting, free: Iterable[Waiting], project: Project) -> list[Waiting]:

@@ -70,8 +70,8 @@ class MatchAnswer:
 
 def candidate(label: str, group: int | None, answers: dict[str, Any]) -> Candidate:
     """Return what `match` gets of a participant who comes. Answers that are too large are left out."""
-    found = Candidate(label, group=group, answers=answers)
-    return found if len(to_json(found)) <= MAX_ANSWERS else Candidate(label, group=group)
+    candidate = Candidate(label, group=group, answers=answers)
+    return candidate if len(to_json(candidate)) <= MAX_ANSWERS else Candidate(label, group=group)
 
 
 def with_candidate(question: Question, candidate: Candidate) -> Question:
@@ -125,14 +125,16 @@ def next_question(
     the answer to `question`. The new question leaves them out; a later one has them again if they are still free.
     """
     candidates = {label: candidate for label, candidate in question.candidates().items() if label in waiting}
-    asked = sorted(
+    next_asked = sorted(
         (person for person in free if person.label in candidates and person.label not in matched),
         key=lambda one: one.order,
     )
-    asked = asked[:MAX_WAITING]
-    if not _is_due(question, project, {one.label for one in asked}, answered=answered, now=now):
+    next_asked = next_asked[:MAX_WAITING]
+    if not _is_due(question, project, {person.label for person in next_asked}, answered=answered, now=now):
         return question
-    in_question = tuple(msgspec.structs.replace(candidates[one.label], waited=_waited(one, now)) for one in asked)
+    in_question = tuple(
+        msgspec.structs.replace(candidates[person.label], waited=_waited(person, now)) for person in next_asked
+    )
     labels = {each.id for each in in_question}
     rest = tuple(
         msgspec.structs.replace(candidate, waited=0) for label, candidate in candidates.items() if label not in labels

@@ -42,26 +42,30 @@ class Repair:
 
     def run(self, project: Project) -> Collection[str]:
         """Repair the lobby of this project; see `Lobby.repair`."""
-        known, entries = self._store.read(project), self._store.entries(project)
+        decisions, entries = self._store.read(project), self._store.entries(project)
         self._store.delete(entries.outdated)
         if project.asks_match:
             self._matcher.forget(project)
         # The decisions were lost. The requests that had read them have ended, so they write no session any more.
-        may_finish = known.renewed is not None and self._platform.now() - known.renewed >= WRITTEN_WITHIN
+        may_finish = decisions.renewed is not None and self._platform.now() - decisions.renewed >= WRITTEN_WITHIN
         if may_finish:
             self._store.finish_sessions(project)
-        self._store.carry_out(project, rules.without_done(known, entries.done).for_good(), entries)
-        ahead = [*known.open, *(session.waits_for for session in known.formed if session.waits_for)]
+        self._store.carry_out(project, rules.without_done(decisions, entries.done).for_good(), entries)
+        ahead = [*decisions.open, *(session.waits_for for session in decisions.formed if session.waits_for)]
         servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
         entries = self._store.entries(project)  # again, for the marks of what was just carried out
-        run = self._lookups.run(project, known, entries, rules.confirmed(known, entries), servers=StartedAhead(servers))
+        run = self._lookups.run(
+            project, decisions, entries, rules.confirmed(decisions, entries), servers=StartedAhead(servers)
+        )
         closed = {name: server.closed for name, server in servers.items() if server and server.closed}
         over = [name for name, since in closed.items() if run.now - since > CLOSED_FOR_GOOD]
-        wanted = servers_ahead.sessions_wanted(known, entries, project)
-        ended = servers_ahead.surplus(known, wanted, over, run.now, players=project.players, open_for=run.open_for)
+        sessions_ahead = servers_ahead.sessions_wanted(decisions, entries, project)
+        ended = servers_ahead.surplus(
+            decisions, sessions_ahead, over, run.now, players=project.players, open_for=run.open_for
+        )
 
         def settle(document: Decisions) -> Decisions:
-            if may_finish and document.renewed == known.renewed:
+            if may_finish and document.renewed == decisions.renewed:
                 document = msgspec.structs.replace(document, renewed=None)
             document = servers_ahead.without_open(run.decided(document), ended)
             wanted = servers_ahead.sessions_wanted(document, entries, project)
@@ -85,7 +89,7 @@ class Repair:
             is_lost = each.id in servers and servers[each.id] is None and run.now - each.requested > NO_RECORD_AFTER
             if is_new or is_lost:
                 self._store.start_server(project, each.id, each.players)
-        formed = tuple(session for session in after.for_good().formed if session not in known.formed)
+        formed = tuple(session for session in after.for_good().formed if session not in decisions.formed)
         self._store.carry_out(project, Decisions(formed=formed), entries)
         if ended:
             logger.info(

@@ -42,11 +42,11 @@ def decide(
     makes the id of a proposal, and of its session unless that gets an open session. An open session can be used for
     `open_for` after its server was requested.
     """
-    seen = known if known is not None else document
-    settled = _without_fallen(document, entries, seen, now)
+    earlier = known if known is not None else document
+    settled = _without_fallen(document, entries, earlier, now)
     if document.renewed is not None:
         return settled
-    before = seen.labels()
+    before = earlier.labels()
     among = [person for person in free(settled, entries, now) if person.label not in before]
     sessions = choose(among, project, now, chosen)
     return _with_proposals(settled, sessions, now, new_id, players=project.players, open_for=open_for)
@@ -55,8 +55,8 @@ def decide(
 def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
     """Return the participants who are present and in no session, in the order of arrival."""
     busy = document.labels()
-    found = (person for person in entries.waiting.values() if person.label not in busy and person.is_present(now))
-    return sorted(found, key=lambda one: one.order)
+    present = (person for person in entries.waiting.values() if person.label not in busy and person.is_present(now))
+    return sorted(present, key=lambda one: one.order)
 
 
 def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
@@ -180,11 +180,11 @@ def _seated(members: Sequence[Matched], lot: str, seats: str) -> tuple[Matched, 
     return tuple(drawn)
 
 
-def give_up(document: Decisions, one: Unmatched) -> Decisions:
+def give_up(document: Decisions, unmatched: Unmatched) -> Decisions:
     """Make the participant unmatched, unless they stand in the document already."""
-    if document.renewed is not None or one.label in document.labels():
+    if document.renewed is not None or unmatched.label in document.labels():
         return document
-    return msgspec.structs.replace(document, unmatched=(*document.unmatched, one))
+    return msgspec.structs.replace(document, unmatched=(*document.unmatched, unmatched))
 
 
 def without_done(document: Decisions, done: Collection[str]) -> Decisions:
@@ -220,11 +220,13 @@ def without(document: Decisions, label: str) -> Decisions:
         )
         for session in document.formed
     )
-    kept = without_proposals(document, [proposal.id for proposal in document.proposed if label in proposal.labels])
+    others = without_proposals(document, [proposal.id for proposal in document.proposed if label in proposal.labels])
     return msgspec.structs.replace(
-        kept,
-        open=tuple(found for server in kept.open if (found := unnamed(server))),
-        proposed=tuple(msgspec.structs.replace(proposal, ahead=unnamed(proposal.ahead)) for proposal in kept.proposed),
+        others,
+        open=tuple(found for server in others.open if (found := unnamed(server))),
+        proposed=tuple(
+            msgspec.structs.replace(proposal, ahead=unnamed(proposal.ahead)) for proposal in others.proposed
+        ),
         formed=tuple(session for session in formed if any(member.label for member in session.members)),
-        unmatched=tuple(member for member in kept.unmatched if member.label != label),
+        unmatched=tuple(member for member in others.unmatched if member.label != label),
     )

@@ -70,12 +70,12 @@ def with_ready_servers(
     servers = [session.waits_for for session in sessions if session.waits_for]
     opened = list(document.open)
     usable = {server.id for server in opened if server.is_usable(server.players, now, open_for)}
-    left = len({*usable, *(server.id for server in servers)} & set(ready))  # ready servers that no session has got yet
-    given: dict[tuple[str, ...], str] = {}  # by the labels of a session's members: the id of its server
+    spare = len({*usable, *(server.id for server in servers)} & set(ready))  # ready servers that no session has got yet
+    assigned: dict[tuple[str, ...], str] = {}  # by the labels of a session's members: the id of its server
     for at, session in enumerate(sessions):
         players = servers[at].players
         fits = [n for n, server in enumerate(opened) if server.id in usable and server.players == players]
-        if left and servers[at].id not in ready:
+        if spare and servers[at].id not in ready:
             fresh = (n for n in fits if opened[n].id in ready)
             later = (n for n in range(len(servers) - 1, at, -1) if servers[n].id in ready)
             later = (n for n in later if servers[n].players == players)
@@ -86,10 +86,10 @@ def with_ready_servers(
         if servers[at].id in over and (n := next((n for n in fits if opened[n].id in coming), None)) is not None:
             servers[at], opened[n] = opened[n], servers[at]
         is_ready = servers[at].id in ready
-        left -= is_ready
+        spare -= is_ready
         if is_ready or servers[at].id in over or now - session.at >= SERVER_WITHIN:
-            given[session.labels] = servers[at].id
-    if not given and servers == [session.waits_for for session in sessions]:
+            assigned[session.labels] = servers[at].id
+    if not assigned and servers == [session.waits_for for session in sessions]:
         return document
     having = {session.labels: server for session, server in zip(sessions, servers, strict=True)}
 
@@ -97,7 +97,7 @@ def with_ready_servers(
         server = having.get(formed.labels) if formed.waits_for else None
         if server is None:
             return formed
-        return msgspec.structs.replace(formed, id=server.id, waits_for=None if formed.labels in given else server)
+        return msgspec.structs.replace(formed, id=server.id, waits_for=None if formed.labels in assigned else server)
 
     return msgspec.structs.replace(
         document, open=by_age(opened), formed=tuple(bound(session) for session in document.formed)

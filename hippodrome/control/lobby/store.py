@@ -86,16 +86,16 @@ class LobbyStore:
         answers of unmatched participants are written at their next request (`Lobby.visit`): the sweep's role may write
         no answers.
         """
-        made: dict[str, Membership] = {}
+        memberships: dict[str, Membership] = {}
         for formed in decided.formed:
-            made |= self._write_session(project, formed)
+            memberships |= self._write_session(project, formed)
         for member in decided.unmatched:
             membership = Membership(unmatched=True, completion_code=member.completion_code, waited=member.waited)
-            made[member.label] = self._write_membership(project, member.user_id, membership)
-        self.delete(key for label in made for key in entries.keys.get(label, ()))
+            memberships[member.label] = self._write_membership(project, member.user_id, membership)
+        self.delete(key for label in memberships for key in entries.keys.get(label, ()))
         for name in [*(formed.id for formed in decided.formed), *(member.label for member in decided.unmatched)]:
             self._documents.put(lobby_entries.done_key(project.id, name), b"")
-        return made
+        return memberships
 
     def finish_sessions(self, project: Project) -> None:
         """Write the missing memberships of sessions that were formed lately, and send start messages that may be lost.
@@ -110,12 +110,12 @@ class LobbyStore:
             if entry.key != session_key(project.id, session_id) or entry.modified < since:
                 continue
             try:
-                found = self._repository.session(project.id, session_id)
+                session = self._repository.session(project.id, session_id)
             except BadSession as error:
                 failure("a session's document cannot be read", error, project=project.id)
                 continue
-            if found is not None:
-                self._finish_session(project, found)
+            if session is not None:
+                self._finish_session(project, session)
 
     def _finish_session(self, project: Project, session_document: SessionDocument) -> None:
         missing = [member for member in session_document.members if member.user_id]
@@ -130,8 +130,8 @@ class LobbyStore:
 
     def forget_done(self, project: Project, document: Decisions, entries: Entries) -> None:
         """Delete the marks of decisions that are not in `document`, which must have been read after the listing."""
-        kept = {*(session.id for session in document.formed), *(member.label for member in document.unmatched)}
-        self.delete(lobby_entries.done_key(project.id, name) for name in sorted(entries.done - kept))
+        done = {*(session.id for session in document.formed), *(member.label for member in document.unmatched)}
+        self.delete(lobby_entries.done_key(project.id, name) for name in sorted(entries.done - done))
 
     def answer_as_unmatched(self, project: Project, user_id: str) -> None:
         """Store the answer `unmatched` at each game step, which moves the participant on. An earlier answer stays."""

@@ -118,8 +118,8 @@ class Cells(Record, frozen=True):
 
 def assignment_of(project: Project, user_id: str, draw: Draw) -> Assignment:
     """Return the assignment of a participant, or of a session, who drew this."""
-    named = {cell_name(levels): levels for levels in cells(project.conditions)}
-    condition = named.get(draw.cell, {})
+    by_name = {cell_name(levels): levels for levels in cells(project.conditions)}
+    condition = by_name.get(draw.cell, {})
     orders = {block.name: _order(project, block, user_id, draw) for block in project.blocks}
     path = project.own(Assignment(condition=condition, orders=orders)).steps
     return Assignment(project.version, condition, orders, games_on(path, condition, project.trial))

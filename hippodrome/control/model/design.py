@@ -223,8 +223,8 @@ def fill(text: str, levels: Mapping[str, Any]) -> str:
 
 def pages_of(step: Step, conditions: Sequence[Factor]) -> list[Step]:
     """Return the step with the page of each level of the factors between people that its page names."""
-    named = [factor for factor in conditions if f"{{{factor.name}}}" in step.page]
-    return [_at(step, levels) for levels in cells(named)]
+    factors = [factor for factor in conditions if f"{{{factor.name}}}" in step.page]
+    return [_at(step, levels) for levels in cells(factors)]
 
 
 def same_run(runs: Iterable[Step], step: Step) -> Step | None:

@@ -55,7 +55,7 @@ def _pages(steps: Mapping[str, Any]) -> dict[str, str]:
     """The pages in order, by their keys. Steps without a page are left out, and later steps get lower numbers."""
     numbers = _numbers(steps)
     if numbers != list(range(1, len(numbers) + 1)):
-        missing = next(number for number, given in enumerate(numbers, 1) if number != given)
+        missing = next(number for number, number_given in enumerate(numbers, 1) if number != number_given)
         raise ValueError(f"it has no step {missing}, but later ones; number the steps without a gap")
     with_page = [number for number in numbers if not _is_blank(steps[str(number)])]
     pages = {str(now): _page(steps[str(number)]) for now, number in enumerate(with_page, 1)}
@@ -75,9 +75,9 @@ def _events(entry: Mapping[str, Any], keys: list[str], pages: Mapping[str, str])
     games = [index for index, key in enumerate(keys) if type_of(pages[key]).on_server]
     if not games:
         return {}
-    given = entry.get("events")
+    events = entry.get("events")
     start, stop = (
-        _place(given.get(name) if isinstance(given, dict) else None, entry["steps"], keys)
+        _place(events.get(name) if isinstance(events, dict) else None, entry["steps"], keys)
         for name in ("startServerStep", "stopServerStep")
     )
     start = default_start(games) if start is None or start > games[0] else start
@@ -101,20 +101,20 @@ def _place(event: object, steps: Mapping[str, Any], keys: list[str]) -> int | No
     return len(keys) - 1 if found is None else found
 
 
-def _page(given: object) -> str:
-    name = re.split(r"[/\\]", given)[-1].strip().removesuffix(".html") if isinstance(given, str) else ""
+def _page(page: object) -> str:
+    name = re.split(r"[/\\]", page)[-1].strip().removesuffix(".html") if isinstance(page, str) else ""
     if not _PAGE.fullmatch(name) or ".." in name:
         raise ValueError("the name of a page cannot stand in addresses and folders on AWS")
     return name
 
 
-def _minutes(given: object) -> int:
+def _minutes(minutes: object) -> int:
     """The maxRuntime in minutes, from a number or its digits as text; `USUAL_RUNTIME` if it is missing."""
-    if _is_blank(given):
+    if _is_blank(minutes):
         return USUAL_RUNTIME
-    if isinstance(given, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(given)):
+    if isinstance(minutes, bool) or not re.fullmatch(r"[1-9][0-9]{0,8}", str(minutes)):
         raise ValueError("its maxRuntime is no number of minutes")
-    return min(int(str(given)), MAX_RUNTIME)
+    return min(int(str(minutes)), MAX_RUNTIME)
 
 
 def _is_blank(value: object) -> bool:

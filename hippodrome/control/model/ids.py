@@ -37,9 +37,9 @@ def is_user_id(text: object) -> bool:
     return isinstance(text, str) and NAME.fullmatch(text) is not None
 
 
-def warm_id(project_id: str, asked: datetime, number: int) -> str:
+def warm_id(project_id: str, requested: datetime, number: int) -> str:
     """Return the user id in the record of this warm server. It is no valid participant's id, so no link can name it."""
-    return "~" + hashlib.sha256(f"warm\0{project_id}\0{asked.isoformat()}\0{number}".encode()).hexdigest()[:20]
+    return "~" + hashlib.sha256(f"warm\0{project_id}\0{requested.isoformat()}\0{number}".encode()).hexdigest()[:20]
 
 
 def is_warm_id(text: object) -> bool:
@@ -137,6 +137,6 @@ def completion_code(secret: str, user_id: str, outcome: str = "") -> str:
     return base64.b32encode(digest).decode()[:10]
 
 
-def secrets_equal(given: str, expected: str) -> bool:
+def secrets_equal(secret: str, expected: str) -> bool:
     """Return whether a given secret, which may hold any characters, is the expected one. Takes constant time."""
-    return hmac.compare_digest(given.encode("utf-8", "replace"), expected.encode())
+    return hmac.compare_digest(secret.encode("utf-8", "replace"), expected.encode())

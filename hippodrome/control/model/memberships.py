@@ -29,7 +29,7 @@ class Membership(Record, frozen=True, omit_defaults=False):
 
 def read(body: bytes) -> Membership:
     """Read the membership in a document. Raises ValueError if the document holds none."""
-    found = from_json(body, Membership)
-    if (found.session is None) is not found.unmatched:
+    membership = from_json(body, Membership)
+    if (membership.session is None) is not membership.unmatched:
         raise ValueError("the document must either name a session or say that the participant is unmatched")
-    return found
+    return membership

@@ -162,11 +162,16 @@ def parse_dns_changed(body: Any) -> DnsChanged | None:
 
 def parse_task_changed(body: Any) -> TaskChanged | None:
     """Read an ECS event or a `TaskSeen`; None if the body is neither, or if the task is not a server's."""
-    if seen := _read(body, TaskSeen):
+    if task_seen := _read(body, TaskSeen):
         running = TaskChanged(
-            seen.task, seen.cluster, seen.name, status="RUNNING", interface=seen.interface, looked=seen.looked
+            task_seen.task,
+            task_seen.cluster,
+            task_seen.name,
+            status="RUNNING",
+            interface=task_seen.interface,
+            looked=task_seen.looked,
         )
-        return running if ids.parse_server_name(seen.name) else None
+        return running if ids.parse_server_name(task_seen.name) else None
     try:
         detail = body["detail"]
         if body["source"] != "aws.ecs" or ids.parse_server_name(detail["startedBy"]) is None:
@@ -191,7 +196,7 @@ def parse_task_changed(body: Any) -> TaskChanged | None:
 
 def _container(detail: Mapping[str, Any]) -> Mapping[str, Any]:
     """What the event says of the trial's container; empty if it says nothing of it."""
-    return next((each for each in detail.get("containers", []) if each.get("name") == CONTAINER), {})
+    return next((container for container in detail.get("containers", []) if container.get("name") == CONTAINER), {})
 
 
 def _status(detail: Mapping[str, Any]) -> str:
@@ -241,5 +246,5 @@ def _read(body: Any, kind: type[R]) -> R | None:
 
 
 def _ids_are_valid(message: StartServer | StopServer) -> bool:
-    known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id) or is_session_id(message.user_id)
-    return known and ids.is_project_id(message.project_id)
+    is_known = ids.is_user_id(message.user_id) or ids.is_warm_id(message.user_id) or is_session_id(message.user_id)
+    return is_known and ids.is_project_id(message.project_id)

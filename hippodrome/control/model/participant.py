@@ -183,9 +183,9 @@ def failed_game(project: Project, user_id: str) -> dict[str, Any]:
     return {"episodes": 0, "score": 0, "frames": 0, "seconds": 0, "outcome": FAILED, "completionCode": code}
 
 
-def same_answers(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+def same_answers(answers: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return whether two forms hold the same answers, in whatever order their fields are."""
-    return msgspec.json.encode(one, order="sorted") == msgspec.json.encode(other, order="sorted")
+    return msgspec.json.encode(answers, order="sorted") == msgspec.json.encode(other, order="sorted")
 
 
 def starts_server(project: Project, step: Step) -> bool:

@@ -201,10 +201,12 @@ class Project(Record, frozen=True):
 
         These are taken from `before`, the present registration, which this one replaces.
         """
-        kept = {other_number.players: other_number for other_number in (before.other_numbers if before else ())}
+        by_players = {other_number.players: other_number for other_number in (before.other_numbers if before else ())}
         if before is not None:
-            kept[before.players] = ForPlayers(**{name: getattr(before, name) for name in ForPlayers.__struct_fields__})
-        others = tuple(kept[players] for players in sorted(kept.keys() - {self.players}))
+            by_players[before.players] = ForPlayers(
+                **{name: getattr(before, name) for name in ForPlayers.__struct_fields__}
+            )
+        others = tuple(by_players[players] for players in sorted(by_players.keys() - {self.players}))
         return msgspec.structs.replace(self, other_numbers=others)
 
     def for_session(self, players: int) -> Project | None:
@@ -215,10 +217,12 @@ class Project(Record, frozen=True):
         """
         if players in (0, self.players):
             return self
-        found = next((other_number for other_number in self.other_numbers if other_number.players == players), None)
-        if found is None:
+        registration = next(
+            (other_number for other_number in self.other_numbers if other_number.players == players), None
+        )
+        if registration is None:
             return None
-        return msgspec.structs.replace(self, **msgspec.structs.asdict(found), warm_servers=0)
+        return msgspec.structs.replace(self, **msgspec.structs.asdict(registration), warm_servers=0)
 
     @property
     def asks_match(self) -> bool:
@@ -344,7 +348,7 @@ def read_list(body: bytes) -> MasterList:
     for raw in others:
         try:
             project = _checked(from_data(hippo_entry.fields_of(_as_object(raw)), Project))
-            if any(known.id == project.id for known in projects):
+            if any(earlier.id == project.id for earlier in projects):
                 raise ValueError("another entry has its id")
         except ValueError as error:
             unread.append(_unreadable(raw, error))
@@ -384,8 +388,8 @@ def _as_object(raw: bytes) -> Mapping[str, Any]:
 
 
 def _string(entry: Mapping[str, Any], key: str) -> str:
-    found = entry.get(key)
-    return found if isinstance(found, str) else ""
+    value = entry.get(key)
+    return value if isinstance(value, str) else ""
 
 
 def step_key(project_id: str, file: str, folder: str = STEPS_FOLDER) -> str:

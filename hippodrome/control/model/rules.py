@@ -67,29 +67,29 @@ def mentioned(rule: str) -> set[tuple[str, ...]]:
 
 def constants(rule: str) -> list[Any]:
     """Return the texts and numbers that a rule compares with, in their order. Raises `BadRule`."""
-    found: list[Any] = []
+    constants: list[Any] = []
     nodes: list[ast.AST] = [_tree(rule)]
     while nodes:
         node = nodes.pop(0)
         if isinstance(node, ast.Constant):
-            found.append(node.value)
+            constants.append(node.value)
         elif _names(node) is None:  # the name of a field in brackets is no constant
             nodes += ast.iter_child_nodes(node)
-    return found
+    return constants
 
 
 def compared(rule: str) -> list[tuple[tuple[str, ...], str]]:
     """Return the names that a rule compares with texts, each with a text: by `==`, `!=` and `in`. Raises `BadRule`."""
-    found = []
+    comparisons = []
     for node in ast.walk(_tree(rule)):
         sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
         texts = [text for side in sides if _names(side) is None for text in _texts(side)]
-        found += [(names, text) for side in sides if (names := _names(side)) for text in texts]
-    return found
+        comparisons += [(names, text) for side in sides if (names := _names(side)) for text in texts]
+    return comparisons
 
 
 def _texts(node: ast.expr) -> list[str]:
-    constants = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+    constants = [constant.value for constant in ast.walk(node) if isinstance(constant, ast.Constant)]
     return [value for value in constants if isinstance(value, str)]
 
 
@@ -207,13 +207,13 @@ def _value(node: ast.expr, facts: Mapping[str, Any]) -> Any:
         case ast.Constant(value=value):
             return value
         case ast.BoolOp(op=sign, values=inner):
-            values = (_value(each, facts) for each in inner)
+            values = (_value(part, facts) for part in inner)
             return all(values) if isinstance(sign, ast.And) else any(values)
         case ast.UnaryOp(op=sign, operand=operand):
             value = _value(operand, facts)
             return not value if isinstance(sign, ast.Not) else -(_number(value) or 0)
         case ast.List(elts=inner) | ast.Tuple(elts=inner):
-            return [_value(each, facts) for each in inner]
+            return [_value(part, facts) for part in inner]
         case ast.Compare(ops=[sign], left=left, comparators=[right]):
             return _compare(sign, _value(left, facts), _value(right, facts))
         case ast.BinOp(op=sign, left=left, right=right):
@@ -223,8 +223,8 @@ def _value(node: ast.expr, facts: Mapping[str, Any]) -> Any:
     return _over_runs(node.func.id, _value(node.args[0], facts))
 
 
-def _calculate(sign: ast.operator, left: Any, right: Any) -> Any:
-    numbers = _number(left), _number(right)
+def _calculate(sign: ast.operator, first: Any, right: Any) -> Any:
+    numbers = _number(first), _number(right)
     return "" if numbers[0] is None or numbers[1] is None else _ARITHMETIC[type(sign)](numbers[0], numbers[1])
 
 
@@ -237,13 +237,13 @@ def _look_up(facts: Mapping[str, Any], names: Sequence[str]) -> Any:
     return "" if value is None else value
 
 
-def _compare(sign: ast.cmpop, left: Any, right: Any) -> bool:
+def _compare(sign: ast.cmpop, first: Any, right: Any) -> bool:
     if isinstance(sign, ast.Eq | ast.NotEq):
-        return same(left, right) == isinstance(sign, ast.Eq)
+        return same(first, right) == isinstance(sign, ast.Eq)
     if isinstance(sign, ast.In | ast.NotIn):
         among = right if isinstance(right, list) else [right]
-        return any(same(left, item) for item in among) == isinstance(sign, ast.In)
-    numbers = _number(left), _number(right)
+        return any(same(first, item) for item in among) == isinstance(sign, ast.In)
+    numbers = _number(first), _number(right)
     return numbers[0] is not None and numbers[1] is not None and _ORDERED[type(sign)](numbers[0], numbers[1])
 
 

@@ -206,12 +206,12 @@ def owner(name: str, read: Callable[[str], R | None], server: Callable[[R], Serv
     attempt now: compare its `name`. `read` is called once; twice for an assigned warm server.
     """
     parsed = ids.parse_server_name(name)
-    found = read(parsed[0]) if parsed else None
-    assigned_to = server(found).assigned_to if found is not None else None
+    owner_id = read(parsed[0]) if parsed else None
+    assigned_to = server(owner_id).assigned_to if owner_id is not None else None
     if assigned_to is None:
-        return found
+        return owner_id
     new_owner = read(assigned_to)
-    return new_owner if new_owner is not None and server(new_owner).name == name else found
+    return new_owner if new_owner is not None and server(new_owner).name == name else owner_id
 
 
 def key(label: str) -> str:
@@ -289,12 +289,12 @@ def requestable_attempt(record: Server) -> int | None:
     return record.attempt + 1 if record.attempt < MAX_ATTEMPTS else None
 
 
-def attempt_after_pause(record: Server, came: datetime | None) -> int | None:
+def attempt_after_pause(record: Server, arrived: datetime | None) -> int | None:
     """Return the attempt to start for a participant who `came` to a game after their server had ended; None if none.
 
     The server had waited for nobody, or its time was over: the study has two sittings, or the participant was slow.
     """
-    ended_before = came is not None and record.closed is not None and record.closed < came
+    ended_before = arrived is not None and record.closed is not None and record.closed < arrived
     return requestable_attempt(record) if ended_before and record.reason in (Reason.ENDED, Reason.DEADLINE) else None
 
 

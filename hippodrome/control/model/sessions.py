@@ -21,8 +21,8 @@ def open_for(project: Project, settings: Settings) -> timedelta:
     The installation's maxRuntime bounds the sum of waiting and play. If the project's maxRuntime leaves less than
     `MIN_OPEN` for waiting, the waiting takes time from the play.
     """
-    left = timedelta(minutes=settings.max_runtime - project.max_runtime)
-    return max(MIN_OPEN, min(MAX_OPEN, left))
+    time_left = timedelta(minutes=settings.max_runtime - project.max_runtime)
+    return max(MIN_OPEN, min(MAX_OPEN, time_left))
 
 
 def lifetime(project: Project, settings: Settings) -> timedelta:

@@ -579,9 +579,9 @@ class Texts:
 
     def in_talk(self) -> Texts:
         """Return the texts of a page whose game is `talk`: its words for a round and a conversation."""
-        said = {name: self._own.get(own) or self._own.get(name) or ENGLISH[own] for name, own in IN_TALK.items()}
+        words = {name: self._own.get(own) or self._own.get(name) or ENGLISH[own] for name, own in IN_TALK.items()}
         texts = Texts({})
-        texts._own = self._own | said | dict.fromkeys(NOT_IN_TALK, "")
+        texts._own = self._own | words | dict.fromkeys(NOT_IN_TALK, "")
         texts._hash = hash(frozenset(texts._own.items()))
         return texts
 

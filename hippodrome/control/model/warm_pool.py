@@ -75,8 +75,8 @@ class Pool(Record, frozen=True):
 
     def with_ready(self, warm_ids: Collection[str]) -> Pool:
         """Return the pool with these warm servers marked ready; ids that are not in the pool are ignored."""
-        known = self.warm_servers.keys() & warm_ids
-        ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in known}
+        pool_ids = self.warm_servers.keys() & warm_ids
+        ready = {warm_id: msgspec.structs.replace(self.warm_servers[warm_id], ready=True) for warm_id in pool_ids}
         return self._with({**self.warm_servers, **ready})
 
     def with_returned(self, warm_id: str, warm_server: WarmServer) -> Pool:
@@ -99,8 +99,8 @@ class Pool(Record, frozen=True):
             return self._with({})
         fit = self.of_registration(project)
         best = sorted(fit, key=lambda warm_id: (fit[warm_id].ready, fit[warm_id].requested, warm_id), reverse=True)
-        kept = {warm_id: fit[warm_id] for warm_id in best[:number]}
-        return self._with(kept).with_new(project, number - len(kept), now)
+        remaining = {warm_id: fit[warm_id] for warm_id in best[:number]}
+        return self._with(remaining).with_new(project, number - len(remaining), now)
 
     def with_new(self, project: Project, count: int, now: datetime) -> Pool:
         """Return the pool with `count` new warm servers, which are to be started."""

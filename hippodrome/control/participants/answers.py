@@ -47,8 +47,8 @@ class Answers:
 
     def read(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
         """Return the participant's answers at a step; empty if there are none, or if the document holds no answers."""
-        found = self._platform.documents.get(answer_key(project_id, user_id, step))
-        answers = answers_in(found.body) if found else {}
+        document = self._platform.documents.get(answer_key(project_id, user_id, step))
+        answers = answers_in(document.body) if document else {}
         if answers is None:
             logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
         return answers or {}
@@ -61,4 +61,4 @@ class Answers:
         """
         recent = progress.recently_answered(project, self._platform.now())
         earlier = (self.read(project.id, user_id, key) for key in recent)
-        return any(participant.same_answers(answers, one) for one in earlier)
+        return any(participant.same_answers(answers, answer) for answer in earlier)

@@ -84,23 +84,23 @@ class Assigning:
         documents, key = self._platform.documents, cells_key(project.id)
         outcomes: Outcomes | None = None  # looked up once: others write the document while this one looks
         for attempt in range(TRIES):
-            found = documents.get(key)
-            cells = from_json(found.body, Cells) if found else Cells()
+            document = documents.get(key)
+            cells = from_json(document.body, Cells) if document else Cells()
             if outcomes is None:
                 outcomes = self._outcomes(project, cells, now)
             cells, draw = _settled(project, cells, outcomes, now).draw(project, owner, now, _RANDOM, cell)
             try:
-                self._write(key, found, cells)
+                self._write(key, document, cells)
                 return draw
             except Conflict:
                 time.sleep(PAUSE * _RANDOM.random() * min(2**attempt, 32))
         raise RetryLater("too many participants are assigned at this moment")
 
-    def _write(self, key: str, found: Document | None, cells: Cells) -> None:
-        if found is None:
+    def _write(self, key: str, document: Document | None, cells: Cells) -> None:
+        if document is None:
             self._platform.documents.create(key, to_json(cells))
         else:
-            self._platform.documents.replace(key, to_json(cells), found.etag)
+            self._platform.documents.replace(key, to_json(cells), document.etag)
 
     def _outcomes(self, project: Project, cells: Cells, now: datetime) -> Outcomes:
         """What became of those who have done nothing for long: whether they have finished, or left."""

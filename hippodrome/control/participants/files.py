@@ -67,12 +67,12 @@ class Files:
         return Response(200, document.body, _headers(name))
 
 
-def _part(body: bytes, asked: str, headers: dict[str, str]) -> Response:
+def _part(body: bytes, requested_range: str, headers: dict[str, str]) -> Response:
     """Respond with the part of a file that `Range` asks for: Safari plays a film or a sound only if it gets parts.
 
     A value of another form than one range is ignored (RFC 9110, section 14.2).
     """
-    match = _RANGE.fullmatch(asked.strip())
+    match = _RANGE.fullmatch(requested_range.strip())
     if match is None or not any(match.groups()):
         return Response(200, body, headers)
     first, last = (None if text is None else int(text) for text in match.groups())

@@ -120,11 +120,13 @@ def _deeper(data: Any, most: int) -> bool:
     """Whether JSON data has more than `most` levels of lists and objects."""
     level = [data]
     for _ in range(most):
-        groups = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
-        level = [each for group in groups for each in group]
+        groups = [
+            value.values() if isinstance(value, dict) else value for value in level if isinstance(value, dict | list)
+        ]
+        level = [value for group in groups for value in group]
         if not level:
             return False
-    return any(isinstance(each, dict | list) for each in level)
+    return any(isinstance(value, dict | list) for value in level)
 
 
 def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -137,6 +139,6 @@ def _gather(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _text(value: Any) -> str | None:
     """A hidden field as text; None if it is no text. A client may send it twice, with the same value."""
-    if isinstance(value, list) and value and all(each == value[0] for each in value):
+    if isinstance(value, list) and value and all(value_part == value[0] for value_part in value):
         value = value[0]
     return value if isinstance(value, str) else None

@@ -283,9 +283,9 @@ def _content(text: str, name: str, at: int) -> tuple[str, str]:
 
 def _attributes(text: str) -> dict[str, str]:
     """The values of attributes by their names in lower case. Of two with one name, the first counts, as in browsers."""
-    found: dict[str, str] = {}
-    for each in _ATTRIBUTE.finditer(text):
-        value = each["value"] or ""
+    attributes: dict[str, str] = {}
+    for attribute in _ATTRIBUTE.finditer(text):
+        value = attribute["value"] or ""
         value = value[1:-1] if value[:1] in ('"', "'") else value
-        found.setdefault(each["name"].lower(), html.unescape(value))
-    return found
+        attributes.setdefault(attribute["name"].lower(), html.unescape(value))
+    return attributes

@@ -158,9 +158,9 @@ def headers(project: Project | None, nonce: str, connect: str = "") -> dict[str,
     }
 
 
-def allowed_sources(given: list[str]) -> list[str]:
+def allowed_sources(hosts: list[str]) -> list[str]:
     """Return the valid sources among the given ones. So no value can add a directive to the policy."""
-    return [source for source in given if _SOURCE.fullmatch(source)]
+    return [source for source in hosts if _SOURCE.fullmatch(source)]
 
 
 # Templates

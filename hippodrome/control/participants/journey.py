@@ -230,14 +230,16 @@ class Journey:
             if unassigned and standing.is_matched:
                 return self._shared_game.state(project, user_id, step, standing) | {"state": ENDED}  # load it again
         else:
-            found = self._shared_game.decided(project, user_id)
-            if found is None or not request.has_query("ticket"):  # the page of a game for one participant sends none
-                alone = self._shared_game.state_alone(project, user_id, step, is_member=found is not None)
+            standing_found = self._shared_game.decided(project, user_id)
+            if standing_found is None or not request.has_query(
+                "ticket"
+            ):  # the page of a game for one participant sends none
+                alone = self._shared_game.state_alone(project, user_id, step, is_member=standing_found is not None)
                 if alone is not None:
                     return alone
-            if found is None:
+            if standing_found is None:
                 raise PageError.of(Texts(project.texts), 403, "outdated")
-            standing = found
+            standing = standing_found
         return self._shared_game.state(project, user_id, step, standing, asked=_asked(request))
 
 
@@ -252,14 +254,14 @@ def _user_id(request: Request, texts: Texts) -> str | None:
 
     Raises `PageError` if the id is not valid, or if a POST has none.
     """
-    given = next((name for name in IDS if request.has_query(name)), None)
-    if given is None:
+    field = next((name for name in IDS if request.has_query(name)), None)
+    if field is None:
         if request.method == "POST":
             raise PageError.of(texts, 400, "whoAreYou")
         return None
-    user_id = request.query_value(given)
+    user_id = request.query_value(field)
     if user_id is None or not ids.is_user_id(user_id):
-        text = f"{texts.say('brokenId', field=given)} {texts['brokenLinkText']}"
+        text = f"{texts.say('brokenId', field=field)} {texts['brokenLinkText']}"
         raise PageError(400, texts["brokenLink"], text, lang=texts.language)
     return user_id
 

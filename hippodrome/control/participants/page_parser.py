@@ -24,7 +24,7 @@ class PageParser(HTMLParser):
 
 def attributes_of(attrs: Iterable[tuple[str, str | None]]) -> dict[str, str]:
     """Return a tag's attributes by name. If it has two of one name, the first counts, as in browsers."""
-    found: dict[str, str] = {}
+    attributes: dict[str, str] = {}
     for name, value in attrs:
-        found.setdefault(name, value or "")
-    return found
+        attributes.setdefault(name, value or "")
+    return attributes

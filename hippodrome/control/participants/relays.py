@@ -82,8 +82,12 @@ class Relays:
 
     def _project_of_ticket(self, user_id: str, form: PostedForm) -> Project:
         """The project whose ticket this is, for HIPPO's stop request, which names no project. Raises `Refusal`."""
-        for found in self._project_cache.projects():
-            project = self._secrets.with_secret(found) if found.live and found.step(form.step) and form.ticket else None
+        for candidate in self._project_cache.projects():
+            project = (
+                self._secrets.with_secret(candidate)
+                if candidate.live and candidate.step(form.step) and form.ticket
+                else None
+            )
             if project and project.step_of_ticket(user_id, form.step, form.ticket):
                 return project
         raise Refusal(403, f"{NO_PROOF} A token needs the projectId as well.")

@@ -109,13 +109,13 @@ def shuffler(seed: str) -> Callable[[Iterable[Any]], list[Any]]:
 
 def _counted_range() -> Callable[..., range]:
     """Return the function `range` of one page. A page that loops for hours would hold up everything else."""
-    left = ROUNDS
+    rounds_left = ROUNDS
 
     def counted(*bounds: int) -> range:
-        nonlocal left
+        nonlocal rounds_left
         numbers = range(*bounds)
-        left -= len(numbers)
-        if left < 0:
+        rounds_left -= len(numbers)
+        if rounds_left < 0:
             raise OverflowError(f"the page's loops over range() have more than {ROUNDS} rounds")
         return numbers
 
@@ -170,9 +170,9 @@ def environment() -> ImmutableSandboxedEnvironment:
         if not isinstance(value, ChainableUndefined):
             raise TypeError(f"{type(value).__name__} is not JSON serializable")
 
-    made = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True, finalize=_shown)
-    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": empty}
-    return made
+    sandbox = Environment(autoescape=True, undefined=ChainableUndefined, keep_trailing_newline=True, finalize=_shown)
+    sandbox.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": empty}
+    return sandbox
 
 
 def _shown(value: Any) -> Any:

@@ -22,21 +22,21 @@ def join(main: Path, also: tuple[str, ...] = ()) -> str:
     `also` are modules in the same folder that `main` does not import. They and their imports come before it. Raises
     ValueError for an import or export of another form, and if a module imports itself.
     """
-    found: dict[Path, str] = {}
+    modules: dict[Path, str] = {}
     for module in (*map(main.with_name, also), main):
-        if module not in found:
-            _add(module, found)
-    return "".join(found.values())
+        if module not in modules:
+            _add(module, modules)
+    return "".join(modules.values())
 
 
-def _add(module: Path, found: dict[Path, str], above: tuple[Path, ...] = ()) -> None:
+def _add(module: Path, modules: dict[Path, str], above: tuple[Path, ...] = ()) -> None:
     if module in above:
         raise ValueError(f"{module.name} imports itself, by way of {above[-1].name}")
     source = module.read_text(encoding="utf-8")
     for name in _IMPORT.findall(source):
-        if module.with_name(name) not in found:
-            _add(module.with_name(name), found, (*above, module))
+        if module.with_name(name) not in modules:
+            _add(module.with_name(name), modules, (*above, module))
     script = _EXPORT.sub("", _IMPORT.sub("", source))
     if match := _LEFT.search(script):
         raise ValueError(f"{module.name} cannot be joined: {match[0]}")
-    found[module] = script
+    modules[module] = script

@@ -36,13 +36,13 @@ def in_template(template: str, texts: Texts) -> str:
 
     `{step}` in a text becomes `$step`.
     """
-    known = texts.all()
-    return NAMED.sub(lambda found: _in_html(known[found[1]], places(ENGLISH[found[1]])), template)
+    texts_by_name = texts.all()
+    return NAMED.sub(lambda match: _in_html(texts_by_name[match[1]], places(ENGLISH[match[1]])), template)
 
 
-def _in_html(text: str, named: tuple[str, ...]) -> str:
+def _in_html(text: str, placeholders: tuple[str, ...]) -> str:
     safe = html.escape(text, quote=False).replace('"', "&quot;").replace("$", "$$")
-    return PLACE.sub(lambda place: f"${place[0]}" if place[1] in named else place[0], safe)
+    return PLACE.sub(lambda place: f"${place[0]}" if place[1] in placeholders else place[0], safe)
 
 
 def _filled(code: str, texts: dict[str, str]) -> str:
@@ -51,9 +51,9 @@ def _filled(code: str, texts: dict[str, str]) -> str:
         done += code[at : match.start()]
         name, at = match[1], match.end()
         values: dict[str, str] = {}
-        if named := places(ENGLISH[name]):
-            given, at = _arguments(code, at)
-            values = dict(zip(named, (_filled(each, texts) for each in given), strict=True))
+        if placeholders := places(ENGLISH[name]):
+            arguments, at = _arguments(code, at)
+            values = dict(zip(placeholders, (_filled(argument, texts) for argument in arguments), strict=True))
         if done.endswith("${") and code.startswith("}", at):  # `${TEXT.name}`: the text becomes part of the template
             done, at = done[:-2] + _in_template(texts[name], values), at + 1
         else:
@@ -78,14 +78,14 @@ _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|`[^`$]*`|[(\[{]|[)\]}]|,|[^"`(\[{)\]},
 
 def _arguments(code: str, at: int) -> tuple[list[str], int]:
     """The arguments between the brackets that open at `at`, and the index after the closing bracket."""
-    given, depth = [""], 0
+    arguments, depth = [""], 0
     while token := _TOKEN.match(code, at):
         at = token.end()
         depth += (token[0] in "([{") - (token[0] in ")]}")
         if depth == 0:
-            return given, at
+            return arguments, at
         if depth == 1 and token[0] == ",":
-            given.append("")
+            arguments.append("")
         elif depth > 1 or token[0] != "(":
-            given[-1] += token[0] if given[-1] else token[0].lstrip()
+            arguments[-1] += token[0] if arguments[-1] else token[0].lstrip()
     raise ValueError(f"brackets without an end: {code[at : at + 40]}")

@@ -94,24 +94,26 @@ class Certifying:
         order; one message once the certificate is issued.
         """
         try:
-            wanted = read_request(
+            certificate_request = read_request(
                 request, CertificateRequest, MAX_BODY, "server and credential, or with order and csr too"
             )
-            record = record_of(wanted.server, wanted.credential, self._repository, self._secrets)
+            record = record_of(
+                certificate_request.server, certificate_request.credential, self._repository, self._secrets
+            )
             if record.assigned_to and (owner := self._repository.server(record.assigned_to)):
                 record = owner.server
-            if record.dns or not record.owns(wanted.server) or record.state not in _WAITING:
+            if record.dns or not record.owns(certificate_request.server) or record.state not in _WAITING:
                 raise Refusal(409, "This server needs no certificate now.")
             if record.host and record.host != request.source:
                 raise Refusal(409, "The request does not come from the address of the server's task.")
-            if wanted.order:
-                answer = self._advance(record, wanted, request.source)
+            if certificate_request.order:
+                answer = self._advance(record, certificate_request, request.source)
             else:
-                answer = self._place(wanted.server, request.source)
+                answer = self._place(certificate_request.server, request.source)
         except Refusal as refusal:
             return answer_of(refusal.status, {"message": refusal.text})
         except OrderFailed as failed:
-            about = {"server": wanted.server, "why": failed.reason.value, "text": str(failed)}
+            about = {"server": certificate_request.server, "why": failed.reason.value, "text": str(failed)}
             logger.warning("a certificate was not issued", extra=about)
             return self._failed(failed)
         return answer_of(200, answer)
@@ -128,21 +130,21 @@ class Certifying:
         return {"address": address, "order": order.url, "token": order.token, "proof": order.proof}
 
     def _advance(self, record: Server, certificate_request: CertificateRequest, address: str) -> dict[str, str | bool]:
-        seen = record.host == address
+        task_seen = record.host == address
         try:
             chain = self._client().advance(
                 certificate_request.order,
                 address,
                 certificate_request.csr,
                 answer=certificate_request.answer,
-                may_issue=seen,
+                may_issue=task_seen,
             )
         except PermissionError:
             raise Refusal(403, "That order is for another address.") from None
         except ValueError:
             raise Refusal(400, "That is no order's address.") from None
         if not chain:
-            return {} if seen else {"unseen": True}
+            return {} if task_seen else {"unseen": True}
         if record.state is ServerState.NAMING:
             issued = DnsChanged("", [ServerAttempt(record.label, record.attempt)])
             self._platform.bus.send_delayed(to_message(issued), 0)

@@ -37,9 +37,9 @@ MAX_CACHED = 1000  # records kept between the states `naming` and `ready`
 
 def delete_dns_records(platform: Platform, records: Iterable[DnsRecord | None]) -> None:
     """Delete these DNS records, with exactly these values, by one change. If all are None, nothing is called."""
-    found = [record for record in records if record is not None]
-    if found:
-        platform.dns.change(remove=found)
+    existing = [record for record in records if record is not None]
+    if existing:
+        platform.dns.change(remove=existing)
 
 
 class DnsRecords:

@@ -81,10 +81,10 @@ def why_slot_left_over(name: str, owner: Server | None, now: datetime) -> Leftov
     return LeftoverReason.CLOSED if owner.closed is not None and now > owner.closed + LOST_AFTER else None
 
 
-def leftovers(found: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
+def leftovers(resources: Resources, owners: Mapping[str, Server], scope: Scope) -> Resources:
     """Return the resources that are left over. `owners` maps a resource's name to the record that owns it."""
 
     def keep(name: str, *, ours: bool = False) -> bool:
         return why_left_over(name, owners.get(name), scope, ours=ours) is not None
 
-    return found.only(keep, lambda name: keep(name, ours=True))
+    return resources.only(keep, lambda name: keep(name, ours=True))

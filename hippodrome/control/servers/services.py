@@ -34,5 +34,5 @@ class ServerServices:
 
     def failures(self) -> list[Cause]:
         """Return the causes of the failed servers that were closed since the last call, one per server."""
-        found, self._failures = self._failures, []
-        return found
+        failures, self._failures = self._failures, []
+        return failures

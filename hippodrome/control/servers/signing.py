@@ -303,13 +303,13 @@ class Signing:
 
     def _sign(self, access: ServerAccess, document_requests: Sequence[DocumentRequest]) -> list[Presigned]:
         """Sign all requests. Raises `Refusal` and signs none if one of them is not allowed."""
-        if not all(access.allows(wanted) for wanted in document_requests):
+        if not all(access.allows(document_request) for document_request in document_requests):
             logger.warning("a server asked for a document that is not its own", extra={"server": access.name})
             raise Refusal(403, "That is none of this server's documents.")
         announced = [
-            wanted.size or 0
-            for wanted in document_requests
-            if wanted.method is Method.PUT and access.is_recording(wanted.key)
+            document_request.size or 0
+            for document_request in document_requests
+            if document_request.method is Method.PUT and access.is_recording(document_request.key)
         ]
         if announced:
             stored = [entry.size for entry in self._platform.documents.list(access.folder)]
@@ -320,10 +320,10 @@ class Signing:
                 )
         signer = self._platform.signer
         return [
-            signer.presign_get(wanted.key, VALID_SECONDS)
-            if wanted.method is Method.GET
-            else signer.presign_put(wanted.key, wanted.size or 0, VALID_SECONDS)
-            for wanted in document_requests
+            signer.presign_get(document_request.key, VALID_SECONDS)
+            if document_request.method is Method.GET
+            else signer.presign_put(document_request.key, document_request.size or 0, VALID_SECONDS)
+            for document_request in document_requests
         ]
 
 

@@ -91,12 +91,12 @@ class ProjectCache:
         kept = self._cached.get(key)
         if kept and kept.version == version and now < kept.read + fresh:
             return kept.document
-        found = self._platform.documents.get(key, kept.document if kept else None)
-        if found is None:
+        document = self._platform.documents.get(key, kept.document if kept else None)
+        if document is None:
             self._cached.pop(key, None)  # a missing document is not cached
             return None
         size = sum(len(each.document.body) for each in list(self._cached.values()))  # other threads change the cache
-        if len(self._cached) >= MAX_DOCUMENTS or size + len(found.body) > MAX_BYTES:
+        if len(self._cached) >= MAX_DOCUMENTS or size + len(document.body) > MAX_BYTES:
             self._cached.clear()
-        self._cached[key] = _Cached(found, now, version)
-        return found
+        self._cached[key] = _Cached(document, now, version)
+        return document

@@ -84,21 +84,21 @@ def open_account(profile: str | None = None, region: str | None = None) -> Accou
     try:
         core = botocore.session.Session(profile=profile)
         # botocore itself reads only AWS_DEFAULT_REGION; Lambda, the CLI and other SDKs read AWS_REGION first.
-        found = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
+        region_name = region or os.environ.get("AWS_REGION") or core.get_config_variable("region")
         credentials = core.get_credentials()
     except botocore.exceptions.MissingDependencyException:  # awscrt, the only package that botocore can miss here
         raise _of_aws_login(profile or os.environ.get("AWS_PROFILE") or "default") from None
     except botocore.exceptions.ProfileNotFound as error:  # --profile or AWS_PROFILE names a profile that does not exist
-        known = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
+        profiles = ", ".join(sorted(botocore.session.Session().available_profiles)) or "none"
         raise Problem(
             f"There is no AWS profile named {error.kwargs['profile']}.",
-            f"Name another with --profile or AWS_PROFILE; profiles on this machine: {known}.",
+            f"Name another with --profile or AWS_PROFILE; profiles on this machine: {profiles}.",
         ) from None
-    wrong = [] if found else [_NO_REGION]
+    wrong = [] if region_name else [_NO_REGION]
     wrong += [_NO_CREDENTIALS] if credentials is None else []
-    if wrong or not found:
+    if wrong or not region_name:
         raise Problem(" ".join(text for text, _ in wrong), " ".join(advice for _, advice in wrong))
-    return Account(core, found)
+    return Account(core, region_name)
 
 
 def _of_aws_login(profile: str) -> Problem:
@@ -135,10 +135,10 @@ class Installation:
     parameters: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, account: Account, found: Mapping[str, Any]) -> Installation:
+    def of(cls, account: Account, stack: Mapping[str, Any]) -> Installation:
         """Return the installation of a stack from DescribeStacks, in whatever state the stack is."""
-        outputs = {one["OutputKey"]: one["OutputValue"] for one in found.get("Outputs", ())}
-        return cls(found["StackName"], account.region, found["StackStatus"], outputs, parameters_of(found))
+        outputs = {output["OutputKey"]: output["OutputValue"] for output in stack.get("Outputs", ())}
+        return cls(stack["StackName"], account.region, stack["StackStatus"], outputs, parameters_of(stack))
 
     def __getitem__(self, output: str) -> str:
         """Return an output of the stack; "" for one of a domain that it lacks. Raises `Problem` for any other."""
@@ -195,19 +195,20 @@ def describe_stack(account: Account, stack: str) -> Mapping[str, Any] | None:
     Raises `Problem` if the stack is no installation of Hippodrome: no command may touch a stack of others.
     """
     try:
-        found: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
+        described: Mapping[str, Any] = account.client("cloudformation").describe_stacks(StackName=stack)["Stacks"][0]
     except botocore.exceptions.ClientError as error:
         if is_no_stack(error):
             return None
         raise
-    if found["StackStatus"] == "DELETE_COMPLETE":
+    if described["StackStatus"] == "DELETE_COMPLETE":
         return None
-    if not is_ours(found):
+    if not is_ours(described):
         raise Problem(
-            f"The stack {found['StackName']} in {account.region} is no installation of Hippodrome: it stays as it is.",
+            f"The stack {described['StackName']} in {account.region} is no installation of Hippodrome: "
+            "it stays as it is.",
             "Name another with --stack.",
         )
-    return found
+    return described
 
 
 def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
@@ -215,18 +216,21 @@ def is_no_stack(error: botocore.exceptions.ClientError) -> bool:
     return errors.code(error) == "ValidationError" and "does not exist" in errors.message(error)
 
 
-def is_ours(found: Mapping[str, Any]) -> bool:
+def is_ours(stack: Mapping[str, Any]) -> bool:
     """Whether a described stack is an installation of Hippodrome, or still empty.
 
     The tag that `apply` gives it tells, or its parameters if it was made by hand from our template.
     """
-    tagged = any(tag["Key"] == TAG for tag in found.get("Tags", ()))
-    return tagged or found["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(found)) >= _OUR_PARAMETERS
+    tagged = any(tag["Key"] == TAG for tag in stack.get("Tags", ()))
+    return tagged or stack["StackStatus"] == "REVIEW_IN_PROGRESS" or set(parameters_of(stack)) >= _OUR_PARAMETERS
 
 
-def parameters_of(found: Mapping[str, Any] | None) -> dict[str, str]:
+def parameters_of(stack: Mapping[str, Any] | None) -> dict[str, str]:
     """Return the parameters of a described stack."""
-    return {one["ParameterKey"]: one.get("ParameterValue", "") for one in (found or {}).get("Parameters", ())}
+    return {
+        parameter["ParameterKey"]: parameter.get("ParameterValue", "")
+        for parameter in (stack or {}).get("Parameters", ())
+    }
 
 
 def site_host(parameters: Mapping[str, str]) -> str:
@@ -258,10 +262,10 @@ def elsewhere(account: Account, stack: str) -> str:
         buckets = [str(bucket["Name"]) for bucket in account.fail_fast_client("s3").list_buckets()["Buckets"]]
     except (botocore.exceptions.ClientError, botocore.exceptions.BotoCoreError):
         return ""
-    found = {region for bucket in buckets if (region := resource_names.code_bucket_region(stack, bucket))}
-    regions = sorted(found - {account.region})
-    named = " or ".join(f"AWS_REGION={region}" for region in regions)
-    return f"Something of that name is in another region: say {named}." if named else ""
+    regions_found = {region for bucket in buckets if (region := resource_names.code_bucket_region(stack, bucket))}
+    regions = sorted(regions_found - {account.region})
+    choices = " or ".join(f"AWS_REGION={region}" for region in regions)
+    return f"Something of that name is in another region: say {choices}." if choices else ""
 
 
 def find_installation(account: Account, stack: str = STACK) -> Installation:

@@ -45,7 +45,7 @@ def _zones_of(account: Account, subnets: Sequence[str]) -> list[str]:
         if errors.code(error) in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
             return []
         raise
-    zones = {one["SubnetId"]: str(one["AvailabilityZone"]) for one in found}
+    zones = {subnet["SubnetId"]: str(subnet["AvailabilityZone"]) for subnet in found}
     return [zones[name] for name in subnets if name in zones]
 
 

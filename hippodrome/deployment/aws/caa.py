@@ -40,7 +40,7 @@ class Caa:
         return [] if allowed else counting
 
 
-def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
+def find(name: str, exists: Callable[[str], bool] = lambda name: True) -> Caa:
     """Ask DNS for the records that apply to a name: its own, or the records of the nearest domain above (section 3).
 
     `known` says whether a name exists. DNS is not asked for a name that does not
@@ -53,7 +53,7 @@ def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
     labels = name.split(".")
     for start in range(len(labels)):
         above = ".".join(labels[start:])
-        if not known(above):
+        if not exists(above):
             continue
         try:
             answer = resolver.resolve(f"{above}.", "CAA")
@@ -61,7 +61,7 @@ def find(name: str, known: Callable[[str], bool] = lambda name: True) -> Caa:
             continue
         except (dns.exception.DNSException, OSError, ValueError):
             return Caa(certain=False)
-        return Caa(above, tuple((_plain(one.tag).lower(), _plain(one.value)) for one in answer))
+        return Caa(above, tuple((_plain(entry.tag).lower(), _plain(entry.value)) for entry in answer))
     return Caa()
 
 

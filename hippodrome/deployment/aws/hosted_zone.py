@@ -35,10 +35,10 @@ class Zone:
 
 def clean_domain(domain: str) -> str:
     """Write the domain in lower case and without a final dot. Raises `Problem` if it is no domain."""
-    found = domain.strip().rstrip(".").lower()
-    if not _DOMAIN.fullmatch(found):
+    name = domain.strip().rstrip(".").lower()
+    if not _DOMAIN.fullmatch(name):
         raise Problem(f"{domain!r} is not a domain.", "Give one such as example.org.")
-    return found
+    return name
 
 
 def find_zone(account: Account, domain: str) -> Zone:
@@ -49,12 +49,12 @@ def find_zone(account: Account, domain: str) -> Zone:
     public: dict[str, list[str]] = {}
     private: set[str] = set()
     for page in account.client("route53").get_paginator("list_hosted_zones").paginate():
-        for one in page["HostedZones"]:
-            name = one["Name"].rstrip(".").lower()
-            if one.get("Config", {}).get("PrivateZone"):
+        for zone in page["HostedZones"]:
+            name = zone["Name"].rstrip(".").lower()
+            if zone.get("Config", {}).get("PrivateZone"):
                 private.add(name)
             else:
-                public.setdefault(name, []).append(one["Id"].rsplit("/", 1)[-1])
+                public.setdefault(name, []).append(zone["Id"].rsplit("/", 1)[-1])
     parts = domain.split(".")
     for start in range(len(parts) - 1):
         name = ".".join(parts[start:])
@@ -80,19 +80,19 @@ def read_zone(account: Account, zone_id: str) -> Zone:
         raise Problem(f"{zone_id!r} is not the id of a hosted zone.", "They look like Z0123456789ABCDEFGHIJ.")
     client = account.client("route53")
     try:
-        found = client.get_hosted_zone(Id=zone_id)
+        zone = client.get_hosted_zone(Id=zone_id)
     except (client.exceptions.NoSuchHostedZone, client.exceptions.InvalidInput):
         raise Problem(
             f"This account has no hosted zone {zone_id}.", "`aws route53 list-hosted-zones` lists its zones."
         ) from None
-    if found["HostedZone"].get("Config", {}).get("PrivateZone"):
+    if zone["HostedZone"].get("Config", {}).get("PrivateZone"):
         raise Problem(
             f"The hosted zone {zone_id} is private: participants could not find anything in it.",
             "Give the id of the domain's public zone.",
         )
-    servers = found.get("DelegationSet", {}).get("NameServers", [])
+    servers = zone.get("DelegationSet", {}).get("NameServers", [])
     return Zone(
-        zone_id, found["HostedZone"]["Name"].rstrip("."), tuple(sorted(server.rstrip(".") for server in servers))
+        zone_id, zone["HostedZone"]["Name"].rstrip("."), tuple(sorted(server.rstrip(".") for server in servers))
     )
 
 
@@ -148,7 +148,7 @@ def _has_records(account: Account, zone: Zone, name: str) -> bool:
         HostedZoneId=zone.id, StartRecordName=f"{name}.", MaxItems="1"
     )
     names = [record["Name"].replace(r"\052", "*").rstrip(".").lower() for record in records["ResourceRecordSets"]]
-    return any(one == name or one.endswith(f".{name}") for one in names)
+    return any(record_name == name or record_name.endswith(f".{name}") for record_name in names)
 
 
 @dataclass(frozen=True)
@@ -165,38 +165,38 @@ def delegation(zone: Zone) -> Delegation:
     import dns.exception
     import dns.resolver
 
-    asked = resolver()
+    dns_resolver = resolver()
     try:
-        answer = asked.resolve(zone.domain, "NS")
+        answer = dns_resolver.resolve(zone.domain, "NS")
     except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
         return Delegation((), f"The Internet knows no name servers for {zone.domain}.")
     except dns.resolver.NoNameservers:
-        certain = _answers(asked, zone.domain.partition(".")[2])
+        certain = _answers(dns_resolver, zone.domain.partition(".")[2])
         return Delegation((), f"The name servers that {zone.domain} is delegated to do not answer for it.", certain)
     except (dns.exception.DNSException, OSError, ValueError) as error:
         return Delegation((), f"Whether {zone.domain} is delegated could not be asked: {type(error).__name__}.", False)
-    found = tuple(sorted(str(one.target).rstrip(".").lower() for one in answer))
-    if zone.name_servers and not set(found) & {name_server.lower() for name_server in zone.name_servers}:
-        return Delegation(found, f"{zone.domain} is delegated to other name servers: {', '.join(found)}.")
-    return Delegation(found)
+    servers = tuple(sorted(str(target.target).rstrip(".").lower() for target in answer))
+    if zone.name_servers and not set(servers) & {name_server.lower() for name_server in zone.name_servers}:
+        return Delegation(servers, f"{zone.domain} is delegated to other name servers: {', '.join(servers)}.")
+    return Delegation(servers)
 
 
 def resolver() -> dns.resolver.Resolver:
     """Make a resolver with this machine's configuration, which gives up after `DNS_TIMEOUT`."""
     import dns.resolver
 
-    made = dns.resolver.Resolver(configure=True)
-    made.lifetime = DNS_TIMEOUT
-    return made
+    dns_resolver = dns.resolver.Resolver(configure=True)
+    dns_resolver.lifetime = DNS_TIMEOUT
+    return dns_resolver
 
 
-def _answers(asked: dns.resolver.Resolver, domain: str) -> bool:
+def _answers(dns_resolver: dns.resolver.Resolver, domain: str) -> bool:
     """Whether the resolver answers for `domain`. If it does not, its failure for a domain below proves nothing."""
     import dns.exception
     import dns.resolver
 
     try:
-        asked.resolve(f"{domain}.", "NS")
+        dns_resolver.resolve(f"{domain}.", "NS")
     except (dns.resolver.NXDOMAIN, dns.resolver.NoAnswer):
         return True
     except (dns.exception.DNSException, OSError, ValueError):

@@ -52,15 +52,15 @@ def applied(account: Account, quota: Quota) -> float | None:
     return None
 
 
-def request(account: Account, quota: Quota, wanted: float) -> str:
+def request(account: Account, quota: Quota, number: float) -> str:
     """Return where to ask for a higher value, in the console or by a command. AWS grants it after hours or days."""
     return (
-        f"{wanted:g} in the console, Service Quotas, {_PLACES[quota]}; or by: "
+        f"{number:g} in the console, Service Quotas, {_PLACES[quota]}; or by: "
         f"aws service-quotas request-service-quota-increase --service-code {quota.service} "
-        f"--quota-code {quota.code} --desired-value {wanted:g} --region {account.region}"
+        f"--quota-code {quota.code} --desired-value {number:g} --region {account.region}"
     )
 
 
-def ask_for(account: Account, quota: Quota, wanted: float) -> str:
+def ask_for(account: Account, quota: Quota, number: float) -> str:
     """Return the advice for a quota that is too small: to ask AWS for more, by the command that `request` returns."""
-    return f"Ask for more: {request(account, quota, wanted)}"
+    return f"Ask for more: {request(account, quota, number)}"

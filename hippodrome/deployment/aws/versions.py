@@ -82,10 +82,10 @@ class VersionedBucket:
         Return whether it was stored.
         """
         try:
-            found = self._s3.get_object(Key=key, **self._bucket)
-            if found["Body"].read() != before:
+            answer = self._s3.get_object(Key=key, **self._bucket)
+            if answer["Body"].read() != before:
                 return False
-            self._s3.put_object(Key=key, Body=after, IfMatch=found["ETag"], **self._bucket)
+            self._s3.put_object(Key=key, Body=after, IfMatch=answer["ETag"], **self._bucket)
         except ClientError as error:
             if errors.code(error) in {"PreconditionFailed", "ConditionalRequestConflict", "NoSuchKey", "404"}:
                 return False

@@ -111,7 +111,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
     return Function(name, tuple(members[key] for key in sorted(members)), tuple(sorted(distributions)), python)
 
 
-def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
+def _pruned(wheel: Wheel, packages: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
     """Return the wheel's Python files that the imports `wanted` reach without the modules `ends` and their imports."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
@@ -119,7 +119,7 @@ def _pruned(wheel: Wheel, wanted: Iterable[str], ends: tuple[str, ...]) -> dict[
         path = None if f"{module}.".startswith(tuple(f"{end}." for end in ends)) else paths.get(module)
         return SourceModule(wheel.members[path].read().decode(), path.endswith("__init__.py")) if path else None
 
-    starts = [name for name in wanted if name.partition(".")[0] in wheel.modules]
+    starts = [name for name in packages if name.partition(".")[0] in wheel.modules]
     reached = _closure(starts, source, tuple(wheel.modules))
     return {paths[module]: wheel.members[paths[module]] for module in reached.inside if module in paths}
 
@@ -160,9 +160,9 @@ class _Tree:
         if path:
             yield self._member(path)
         for folder in DATA.get(module, ()):
-            for one in sorted((self._base("hippodrome") / folder).rglob("*")):
-                if one.is_file() and not any(part.startswith((".", "__")) for part in one.parts[-2:]):
-                    yield self._member(one)
+            for file in sorted((self._base("hippodrome") / folder).rglob("*")):
+                if file.is_file() and not any(part.startswith((".", "__")) for part in file.parts[-2:]):
+                    yield self._member(file)
 
     def _member(self, path: Path) -> ZipMember:
         body = self._body(path)
@@ -178,7 +178,9 @@ class _Tree:
         if module.partition(".")[0] not in OURS:
             return None
         path = self._base(module.partition(".")[0]).joinpath(*module.split("."))
-        return next((one for one in (path / "__init__.py", path.with_suffix(".py")) if one.is_file()), None)
+        return next(
+            (candidate for candidate in (path / "__init__.py", path.with_suffix(".py")) if candidate.is_file()), None
+        )
 
     def _body(self, path: Path) -> bytes:
         if path not in self._read:
@@ -226,14 +228,14 @@ def imported(source: SourceModule, module: str) -> set[str]:
 
     `from a import b` gives `a` and `a.b`: b may be a module.
     """
-    found: set[str] = set()
+    modules: set[str] = set()
     for node in _statements(_parse(source.text, module)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = _base(node, module, source.package)
-            found |= {base} | {f"{base}.{alias.name}" for alias in node.names if alias.name != "*"}
-    return found
+            modules |= {base} | {f"{base}.{alias.name}" for alias in node.names if alias.name != "*"}
+    return modules
 
 
 def _base(node: ast.ImportFrom, module: str, package: bool) -> str:

@@ -36,8 +36,8 @@ def compiler(version: str) -> str | None:
 
 def _is_cpython(place: str, version: str) -> bool:
     """Whether the program is CPython of that version, and not the placeholder of a version manager."""
-    asked = [place, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
-    answer = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - found above
+    command = [place, "-c", "import sys; print('%d.%d %s' % (*sys.version_info[:2], sys.implementation.name))"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - found above
     return answer.stdout.strip() == f"{version} cpython"
 
 
@@ -52,8 +52,8 @@ def compiled(sources: Mapping[str, bytes], python: str, where: str = WHERE) -> d
     are left out: some packages hold modules in the syntax of other versions, which they do not import.
     """
     if new := {name: body for name, body in sources.items() if (python, where, name, body) not in _made}:
-        found = _compile(new, python, where)
-        _made.update({(python, where, name, body): found.get(name, {}) for name, body in new.items()})
+        bytecode = _compile(new, python, where)
+        _made.update({(python, where, name, body): bytecode.get(name, {}) for name, body in new.items()})
     return {path: code for name, body in sources.items() for path, code in _made[python, where, name, body].items()}
 
 
@@ -66,8 +66,8 @@ def _compile(sources: Mapping[str, bytes], python: str, where: str) -> dict[str,
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(body)
         compile_folder(root, where, python)
-        made = {path.relative_to(root): path.read_bytes() for path in root.rglob("*.pyc")}
-    return {_source(path): {path.as_posix(): code} for path, code in made.items()}
+        compiled_files = {path.relative_to(root): path.read_bytes() for path in root.rglob("*.pyc")}
+    return {_source(path): {path.as_posix(): code} for path, code in compiled_files.items()}
 
 
 def compile_folder(folder: Path, where: str, python: str) -> None:

@@ -92,10 +92,10 @@ class Target:
         """The values of environment markers (PEP 508) on this target."""
         from packaging.markers import default_environment
 
-        found = {key: str(value) for key, value in default_environment().items()} | {"extra": ""}
+        markers = {key: str(value) for key, value in default_environment().items()} | {"extra": ""}
         if self.local:
-            return found
-        return found | {
+            return markers
+        return markers | {
             "implementation_name": "cpython",
             "implementation_version": f"{self.python}.0",
             "os_name": "posix",
@@ -147,12 +147,12 @@ class Wheel:
     @cached_property
     def members(self) -> Mapping[str, ZipMember]:
         """The files that go into a zip, by their names there."""
-        found = {}
+        wheel_members = {}
         for name, digest in self._record.items():
             place = _place(name)
             if place and digest and not _LEAVE_OUT.search(place):
-                found[place] = ZipMember(place, digest, lambda name=name: self._zip.read(name))  # type: ignore[misc]
-        return found
+                wheel_members[place] = ZipMember(place, digest, lambda name=name: self._zip.read(name))  # type: ignore[misc]
+        return wheel_members
 
     @cached_property
     def modules(self) -> set[str]:
@@ -166,7 +166,9 @@ class Wheel:
 
         requirements = self._requirements
         return {
-            canonicalize_name(one.name) for one in requirements if not one.marker or one.marker.evaluate(target.markers)
+            canonicalize_name(requirement.name)
+            for requirement in requirements
+            if not requirement.marker or requirement.marker.evaluate(target.markers)
         }
 
     @cached_property
@@ -196,10 +198,10 @@ class Wheel:
     @cached_property
     def _info(self) -> str:
         folders = {name.split("/")[0] for name in self._zip.namelist()}
-        found = [folder for folder in folders if folder.endswith(".dist-info")]
-        if len(found) != 1:
+        info_folders = [folder for folder in folders if folder.endswith(".dist-info")]
+        if len(info_folders) != 1:
             raise ValueError("it must have exactly one .dist-info folder")
-        return found[0]
+        return info_folders[0]
 
     def _text(self, name: str) -> str:
         return self._zip.read(f"{self._info}/{name}").decode()
@@ -228,12 +230,12 @@ def read_pins(path: Path = PINS) -> dict[str, Pin]:
     """Return the pins of a requirements file, by normalized name; lines that are not `name==version` are left out."""
     from packaging.utils import canonicalize_name
 
-    found: dict[str, Pin] = {}
+    pins: dict[str, Pin] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         if match := re.match(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?==([^\s;#]+)(?:.*--hash=sha256:([0-9a-f]{64}))?", line):
             name = canonicalize_name(match[1])
-            found[name] = Pin(name, match[2], match[3] or "")
-    return found
+            pins[name] = Pin(name, match[2], match[3] or "")
+    return pins
 
 
 class WheelCache:
@@ -257,12 +259,12 @@ class WheelCache:
 
     def closure(self, names: Iterable[str]) -> set[str]:
         """Return these distributions and all that they need, except those that Lambda's runtime has."""
-        found: set[str] = set()
-        wanted = set(names) - IN_RUNTIME
-        while new := wanted - found:
-            found |= new
-            wanted |= {need for wheel in self.wheels(new).values() for need in wheel.needs(self.target)} - IN_RUNTIME
-        return found
+        collected: set[str] = set()
+        waiting = set(names) - IN_RUNTIME
+        while new := waiting - collected:
+            collected |= new
+            waiting |= {need for wheel in self.wheels(new).values() for need in wheel.needs(self.target)} - IN_RUNTIME
+        return collected
 
     @cached_property
     def owners(self) -> dict[str, str]:
@@ -280,10 +282,10 @@ class WheelCache:
 
     def _find(self, pin: Pin) -> bool:
         if pin.name not in self._wheels:
-            found = sorted((self._folder / self._key(pin)).glob("*.whl"))
-            if not found:
+            wheels = sorted((self._folder / self._key(pin)).glob("*.whl"))
+            if not wheels:
                 return False
-            self._wheels[pin.name] = Wheel(found[0])
+            self._wheels[pin.name] = Wheel(wheels[0])
         return True
 
     def _key(self, pin: Pin) -> str:

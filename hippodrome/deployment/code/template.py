@@ -66,7 +66,7 @@ class Template:
     @property
     def functions(self) -> set[str]:
         """The functions whose zips the template names."""
-        return {found[3] for found in _KEY.finditer(self.text)}
+        return {match[3] for match in _KEY.finditer(self.text)}
 
     @cached_property
     def body(self) -> Mapping[str, Any]:
@@ -75,12 +75,12 @@ class Template:
         Raises `Problem` if the text is not YAML, or has no Resources.
         """
         try:
-            found = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
+            body = yaml.load(self.text, _Loader)  # noqa: S506 - a SafeLoader with CloudFormation's tags  # nosec B506
         except yaml.YAMLError as error:
             raise Problem(f"The template is not YAML: {error}.", _CORRECT) from None
-        if not isinstance(found, dict) or "Resources" not in found:
+        if not isinstance(body, dict) or "Resources" not in body:
             raise Problem("The template has no Resources.", _CORRECT)
-        return found
+        return body
 
     @property
     def defaults(self) -> dict[str, str | None]:
@@ -97,7 +97,7 @@ class Template:
         """
         for name, spec in self.body.get("Parameters", {}).items():
             value = parameters.get(name, "")
-            allowed = [str(one) for one in spec.get("AllowedValues", ())]
+            allowed = [str(allowed_value) for allowed_value in spec.get("AllowedValues", ())]
             if allowed and value not in allowed:
                 yield name, f"must be one of {', '.join(allowed)}"
             elif "AllowedPattern" in spec and not re.fullmatch(spec["AllowedPattern"], value):
@@ -117,12 +117,12 @@ class Template:
 
     def function_names(self) -> dict[str, str]:
         """Return, by logical id, the function's file name in `lambdas/`, which its handler names."""
-        found = {}
+        names = {}
         for name, resource in self.body["Resources"].items():
             handler = resource.get("Properties", {}).get("Handler")
             if isinstance(handler, str) and handler.startswith("lambdas."):
-                found[name] = handler.split(".")[1]
-        return found
+                names[name] = handler.split(".")[1]
+        return names
 
 
 def _evaluate(expression: Any, conditions: Mapping[str, Any], parameters: Mapping[str, str]) -> Any:
@@ -136,7 +136,7 @@ def _evaluate(expression: Any, conditions: Mapping[str, Any], parameters: Mappin
         return _evaluate(conditions.get(value), conditions, parameters)
     if name not in _FUNCTIONS:
         return expression
-    return _FUNCTIONS[name](*(_evaluate(one, conditions, parameters) for one in value))
+    return _FUNCTIONS[name](*(_evaluate(argument, conditions, parameters) for argument in value))
 
 
 _FUNCTIONS: dict[str, Callable[..., bool]] = {

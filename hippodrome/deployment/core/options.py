@@ -12,19 +12,19 @@ from hippodrome.console.problem import Problem
 from hippodrome.deployment.aws.resource_names import RESERVED_STACK_NAME, STACK_NAME
 
 
-def stack_name(given: str) -> str:
+def stack_name(name: str) -> str:
     """Check and return the name of an installation. Raises `Problem` if no stack can have this name."""
-    if not STACK_NAME.fullmatch(given):
+    if not STACK_NAME.fullmatch(name):
         raise Problem(
-            f"{given!r} cannot be the name of an installation.",
+            f"{name!r} cannot be the name of an installation.",
             "It has letters, digits and dashes, 30 at most, and begins with a letter (--stack).",
         )
-    if RESERVED_STACK_NAME.fullmatch(given):
+    if RESERVED_STACK_NAME.fullmatch(name):
         raise Problem(
-            f"An installation cannot be called {given}: AWS reserves that name.",
+            f"An installation cannot be called {name}: AWS reserves that name.",
             "Choose another name (--stack).",
         )
-    return given
+    return name
 
 
 def same_place(region: str, profile: str | None) -> str:

@@ -38,11 +38,11 @@ def registered_projects(documents: Documents, unread: list[UnreadableEntry] | No
 
     Entries that cannot be read are added to `unread`; without `unread`, a warning is printed for each of them.
     """
-    found = documents.get(MASTER_LIST)
-    if found is None:
+    document = documents.get(MASTER_LIST)
+    if document is None:
         return []
     try:
-        listed = read_list(found.body)
+        listed = read_list(document.body)
         if unread is None:
             for entry in listed.unreadable:
                 screen.warning(f"{unreadable(entry)} {MEND}")
@@ -62,16 +62,16 @@ def unreadable(entry: UnreadableEntry) -> str:
     return f"The entry of {whose} in {MASTER_LIST} cannot be read ({entry.why}): it counts as closed."
 
 
-def choose(projects: Iterable[Project], wanted: str | None) -> list[Project]:
+def choose(projects: Iterable[Project], project_id: str | None) -> list[Project]:
     """Return the project with the id `wanted`; None: all. Raises `Problem` if no project has this id."""
     projects = list(projects)
-    if wanted is None:
+    if project_id is None:
         return projects
-    chosen = [project for project in projects if project.id == wanted]
+    chosen = [project for project in projects if project.id == project_id]
     if not chosen:
-        known = ", ".join(project.id for project in projects) or "none"
-        advice = f"Registered here: {known}. `hippodrome register STUDY` adds one."
-        raise Problem(f"No project named {wanted} is registered.", advice)
+        known_ids = ", ".join(project.id for project in projects) or "none"
+        advice = f"Registered here: {known_ids}. `hippodrome register STUDY` adds one."
+        raise Problem(f"No project named {project_id} is registered.", advice)
     return chosen
 
 

@@ -66,14 +66,14 @@ def read(folder: Path, installation: Installation | None = None) -> ProjectFolde
 
 def id_in(folder: Path) -> str | None:
     """Return the project's id, even if config.yml has mistakes elsewhere; None if it cannot be read."""
-    found = _value_of(folder, "id")
-    return None if found is None else str(getattr(found, "text", found))
+    project_id = _value_of(folder, "id")
+    return None if project_id is None else str(getattr(project_id, "text", project_id))
 
 
 def uses_aws(folder: Path) -> bool:
     """Whether config.yml says `useAWS: true`."""
-    found = _value_of(folder, "useAWS")
-    return getattr(found, "value", found) is True
+    use_aws = _value_of(folder, "useAWS")
+    return getattr(use_aws, "value", use_aws) is True
 
 
 def may_use_aws(folder: Path) -> bool:
@@ -91,12 +91,12 @@ def _value_of(folder: Path, key: str) -> Any:
 
 def registration_of(project: Project, live: bool) -> dict[str, Any]:
     """Return the registration with which `update_project_master_list` sets `live` of a registered project."""
-    known = msgspec.to_builtins(project)
+    fields = msgspec.to_builtins(project)
     ours = {"salt", "version"}
-    kept = {key: value for key, value in known.items() if value is not None and key not in ours}
+    fields_kept = {key: value for key, value in fields.items() if value is not None and key not in ours}
     if project.aws_setup is not None:  # a record leaves out values that are the default
-        kept["awsSetup"] = {**known["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
-    return {**kept, "live": live}
+        fields_kept["awsSetup"] = {**fields["awsSetup"], "cpu": project.size.cpu, "memory": project.size.memory}
+    return {**fields_kept, "live": live}
 
 
 def _aws_setup_of(installation: Installation) -> dict[str, str]:
@@ -110,8 +110,8 @@ def _aws_setup_of(installation: Installation) -> dict[str, str]:
 
 def _no_id(folder: Path) -> Iterator[tuple[KeyPath, str]]:
     """Yield a mistake if the id is empty. On one machine an empty id stands for the folder's name."""
-    given: Any = read_source(folder).parsed.values.get("project")
-    if isinstance(given, dict) and given.get("id") in (None, ""):
+    section: Any = read_source(folder).parsed.values.get("project")
+    if isinstance(section, dict) and section.get("id") in (None, ""):
         yield (
             ("project", "id"),
             "is empty; on AWS give the study an id of its own, since another folder may have the same name",
@@ -186,12 +186,12 @@ def _agent(folder: Path, config: Config) -> Iterator[str]:
 
     `hippodrome check` runs it, too.
     """
-    found = layout.find(folder)
-    if found.agent is None or not config.game_steps:
+    agent = layout.find(folder)
+    if agent.agent is None or not config.game_steps:
         return
-    label = found.label(found.agent)
+    label = agent.label(agent.agent)
     try:
-        ast.parse(found.agent.read_bytes())
+        ast.parse(agent.agent.read_bytes())
     except SyntaxError as error:
         yield str(Diagnostic(label, error.lineno, "", f"Python cannot read this: {error.msg}"))
     except (ValueError, OSError) as error:

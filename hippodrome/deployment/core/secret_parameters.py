@@ -32,8 +32,8 @@ def needed(project: Project) -> list[str]:
 def check_name(name: str) -> str:
     """Return the name. Raises `Problem` if servers know no secret of this name."""
     if name not in NAMES:
-        known = ", ".join(NAMES)
-        raise Problem(f"Unknown secret {name!r}; expected {known}.", exit_code=Exit.MISUSE)
+        names = ", ".join(NAMES)
+        raise Problem(f"Unknown secret {name!r}; expected {names}.", exit_code=Exit.MISUSE)
     return name
 
 
@@ -75,10 +75,10 @@ def stored(account: Account, stack: str) -> dict[str, datetime]:
     prefix = resource_names.secret(stack, "")
     filters = [{"Key": "Path", "Option": "OneLevel", "Values": [prefix.rstrip("/")]}]
     pages = account.client("ssm").get_paginator("describe_parameters").paginate(ParameterFilters=filters)
-    found = {
+    parameters = {
         str(parameter["Name"]): parameter["LastModifiedDate"] for page in pages for parameter in page["Parameters"]
     }
-    return {name.removeprefix(prefix): when for name, when in sorted(found.items())}
+    return {name.removeprefix(prefix): when for name, when in sorted(parameters.items())}
 
 
 def missing(account: Account, stack: str, project: Project) -> list[str]:

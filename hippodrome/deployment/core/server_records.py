@@ -42,20 +42,20 @@ class Records:
         """
         listed = {entry.key: entry for entry in self._documents.list(RECORDS) if _is_record(entry.key)}
         self._kept = {key: kept for key, kept in self._kept.items() if key in listed}  # others have been deleted
-        wanted = [entry for entry in listed.values() if moment is None or entry.modified >= moment]
-        stale = [entry for entry in wanted if self._is_stale(entry)]
+        recent = [entry for entry in listed.values() if moment is None or entry.modified >= moment]
+        stale = [entry for entry in recent if self._is_stale(entry)]
         stale_keys = [entry.key for entry in stale]
         with ThreadPoolExecutor(READERS) as pool:
             for done, (entry, record) in enumerate(zip(stale, pool.map(self._load, stale_keys), strict=True), 1):
                 self._kept[entry.key] = (entry.modified, record)
                 if advance:
                     advance(done, len(stale))
-        found = [self._kept[entry.key][1] for entry in wanted]
+        records = [self._kept[entry.key][1] for entry in recent]
         now = datetime.now(UTC)
-        for entry in wanted:
+        for entry in recent:
             if now - entry.modified < SETTLED and self._kept[entry.key][1] is not None:
                 del self._kept[entry.key]
-        return [record for record in found if record is not None]
+        return [record for record in records if record is not None]
 
     def open(self, max_runtime: int, now: datetime) -> list[Server]:
         """Read the records of servers that are not closed. `max_runtime` is the installation's, in minutes.
@@ -69,8 +69,8 @@ class Records:
         """Read the present records of these labels. Return them by label, without the records that cannot be read."""
         keys = sorted({server.key(label) for label in labels})
         with ThreadPoolExecutor(READERS) as pool:
-            found = pool.map(self._load, keys)
-            return {record.label: record for record in found if record is not None}
+            loaded = pool.map(self._load, keys)
+            return {record.label: record for record in loaded if record is not None}
 
     def owners(self, names: Iterable[str]) -> dict[str, Server]:
         """Find the records that own these resource names, by the rule of `Repository.owner`. Other names are left out.
@@ -80,8 +80,8 @@ class Records:
         names = [*names]
         records = self.read(parsed[0] for name in names if (parsed := ids.parse_server_name(name)))
         records |= self.read({record.assigned_to for record in records.values() if record.assigned_to})
-        found = {name: server.owner(name, records.get, lambda record: record) for name in names}
-        return {name: record for name, record in found.items() if record is not None}
+        owner_ids = {name: server.owner(name, records.get, lambda record: record) for name in names}
+        return {name: record for name, record in owner_ids.items() if record is not None}
 
     def _is_stale(self, entry: Entry) -> bool:
         kept = self._kept.get(entry.key)
@@ -109,7 +109,7 @@ def attempts_of(record: Server) -> list[PastAttempt]:
 
 def warm_servers_of(record: Server | None) -> list[str]:
     """Return the names of the warm servers that a record's owner was given, in all attempts."""
-    return [one.warm_server_name for one in attempts_of(record) if one.warm_server_name] if record else []
+    return [attempt.warm_server_name for attempt in attempts_of(record) if attempt.warm_server_name] if record else []
 
 
 def keys_of_warm_servers(project_id: str, names: Collection[str]) -> list[str]:

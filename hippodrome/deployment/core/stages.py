@@ -54,9 +54,9 @@ class Executor:
 
         With `note` they are independent: `note` gets the exception of a step that fails, and the next step follows.
         """
-        for one in steps:
+        for step in steps:
             try:
-                one.operation(*one.arguments)
+                step.operation(*step.arguments)
             except Exception as error:
                 if note is None:
                     raise
@@ -78,34 +78,34 @@ class Executor:
         the next round begins with what the last look found. If something was found and its plan is empty, this only
         waits until a look finds nothing.
         """
-        timer, executed, found = self._timer(), 0, look()
-        while found:
-            if steps := plan(found):
+        timer, executed, state = self._timer(), 0, look()
+        while state:
+            if steps := plan(state):
                 self.execute(steps, note)
                 executed += 1
-                found = look()
-            if not found or executed == rounds or timer.over(seconds):
+                state = look()
+            if not state or executed == rounds or timer.over(seconds):
                 break
             if pause != 0 or not steps:
                 timer.sleep(PAUSE if pause is None else pause)
-                found = look()
-        return found
+                state = look()
+        return state
 
     def wait(self, look: Callable[[], F], seconds: float, *, pause: float | None = None, title: str = "") -> F:
         """Look until nothing is found, or `seconds` are over; return what the last look found.
 
         With `title` a progress bar is shown from the first look that finds something.
         """
-        timer, found = self._timer(), look()
-        if not found:
-            return found
+        timer, state = self._timer(), look()
+        if not state:
+            return state
         with contextlib.ExitStack() as stack:
             if title:
                 stack.enter_context(screen.ProgressBars()).add_task(title, total=None)
-            while found and not timer.over(seconds):
+            while state and not timer.over(seconds):
                 timer.sleep(PAUSE if pause is None else pause)
-                found = look()
-        return found
+                state = look()
+        return state
 
     def retry(self, act: Callable[[], R], recover: Callable[[Exception], bool], tries: int) -> R:
         """Call `act` until it succeeds, `tries` times at most, and return its result.

@@ -49,44 +49,44 @@ def selected(given: str | None) -> StudySelection:
     return study
 
 
-def one_or_all(given: str | None, every: bool) -> str | None:
+def one_or_all(study: str | None, every: bool) -> str | None:
     """Return the id of the study that STUDY names (see `selected`); None for `--all`.
 
     Raises `Problem` as `selected`, and if both or neither are given: a command must not take all studies by itself.
     """
-    if every and given is not None:
-        raise Problem(f"STUDY ({given}) and --all exclude each other.", "Give one of the two.", exit_code=Exit.MISUSE)
+    if every and study is not None:
+        raise Problem(f"STUDY ({study}) and --all exclude each other.", "Give one of the two.", exit_code=Exit.MISUSE)
     if every:
         return None
-    if given is None and _found(None) is None:
+    if study is None and _found(None) is None:
         raise Problem(
             "No study is named, and none is in this folder.",
             "Name one, by its folder or its id; or add --all for all studies of the installation.",
             exit_code=Exit.MISUSE,
         )
-    return selected(given).id
+    return selected(study).id
 
 
-def _found(given: str | None) -> StudySelection | None:
+def _found(study: str | None) -> StudySelection | None:
     from hippodrome.deployment.core.project_folder import id_in  # noqa: PLC0415 - the checks of config.yml, only where a folder is read
 
     here = id_in(Path())
-    if given is None:
+    if study is None:
         return None if here is None else StudySelection(here, Path())
-    folder = Path(given)
-    if "/" in given or os.sep in given or given in {".", ".."}:  # ids have neither slashes nor dots
-        found = id_in(folder)
-        if found is None:
-            raise Problem(f"{given} has no config.yml with a project id.", "Name the study's folder, or its id.")
-        return StudySelection(found, folder)
+    folder = Path(study)
+    if "/" in study or os.sep in study or study in {".", ".."}:  # ids have neither slashes nor dots
+        study_id = id_in(folder)
+        if study_id is None:
+            raise Problem(f"{study} has no config.yml with a project id.", "Name the study's folder, or its id.")
+        return StudySelection(study_id, folder)
     below = id_in(folder) if folder.is_dir() else None
-    if below not in (None, given):
+    if below not in (None, study):
         raise Problem(
-            f"{given} may be the folder {given}/ here, whose study is {below}, or the id of another study.",
-            f"Write {given}/ for the folder; for the id, run this in another folder.",
+            f"{study} may be the folder {study}/ here, whose study is {below}, or the id of another study.",
+            f"Write {study}/ for the folder; for the id, run this in another folder.",
             exit_code=Exit.MISUSE,
         )
-    return StudySelection(given, folder if below else Path() if given == here else None)
+    return StudySelection(study, folder if below else Path() if study == here else None)
 
 
 def place_of_data(study: StudySelection, command: str) -> Path | None:

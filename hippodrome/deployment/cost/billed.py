@@ -43,16 +43,16 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
     A tag counts from the day on which it was made a cost allocation tag (Billing, "Cost allocation tags"). Raises
     `Problem` if Cost Explorer has no data, and ClientError if it refuses.
     """
-    found = Billed(start, end)
+    bill = Billed(start, end)
     client = account.client("ce", HOME)
     try:
-        found.tagged = _ask(client, found, {"Tags": {"Key": TAG, "Values": [stack], "MatchOptions": ["EQUALS"]}})
-        if ECS not in found.tagged:
+        bill.tagged = _ask(client, bill, {"Tags": {"Key": TAG, "Values": [stack], "MatchOptions": ["EQUALS"]}})
+        if ECS not in bill.tagged:
             here = [
                 {"Dimensions": {"Key": "SERVICE", "Values": [ECS]}},
                 {"Dimensions": {"Key": "REGION", "Values": [account.region]}},
             ]
-            found.fargate = _ask(client, found, {"And": here}).get(ECS, 0.0)
+            bill.fargate = _ask(client, bill, {"And": here}).get(ECS, 0.0)
     except ClientError as error:
         code = errors.code(error)
         if code == "DataUnavailableException" or "not enabled" in errors.message(error):
@@ -61,7 +61,7 @@ def billed(account: Account, stack: str, start: date, end: date) -> Billed:
                 "Switch it on in the Billing console; it takes a day to fill.",
             ) from None
         raise
-    return found
+    return bill
 
 
 def billed_or_why(account: Account, stack: str, start: date, end: date) -> tuple[Billed | None, str]:

@@ -220,7 +220,7 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
         every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
     sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
     owned = {project.id: [r for r in every if r.project_id == project.id] for project in projects}
-    by_project = {name: spent(found, prices, at, sizes) for name, found in owned.items() if project or found}
+    by_project = {name: spent(records, prices, at, sizes) for name, records in owned.items() if project or records}
     waited = {name: spent([r for r in owned[name] if r.is_warm_server], prices, at, sizes) for name in by_project}
     now_warm = [
         warm(project.id, project.warm_servers, project.size.cpu, project.size.memory, prices)
@@ -270,12 +270,12 @@ def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, 
     return Exit.DONE
 
 
-def _row(name: str, one: Spent) -> tuple[object, ...]:
-    return (name, one.attempts, f"{one.hours:,.1f}", *map(_money, one.usd))
+def _row(name: str, amounts: Spent) -> tuple[object, ...]:
+    return (name, amounts.attempts, f"{amounts.hours:,.1f}", *map(_money, amounts.usd))
 
 
 def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
-    never, guessed = sum(one.never_ran for one in found), sum(one.guessed for one in found)
+    never, guessed = sum(amounts.never_ran for amounts in found), sum(one.guessed for one in found)
     notes = []
     if never:
         notes.append(f"{never:,} more were asked for and never ran: not counted.")
@@ -300,7 +300,7 @@ def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime
 
 
 def _show_bill(bill: Billed, project: str | None) -> None:
-    rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda one: -one[1])]
+    rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda row: -row[1])]
     screen.result("")
     title = f"Billed by AWS, {bill.start} to {bill.end}, with the stack's tag"
     if rows:
@@ -335,13 +335,13 @@ def _warm(warm_cost: WarmCost) -> dict[str, Any]:
     }
 
 
-def _spent(one: Spent) -> dict[str, Any]:
+def _spent(amounts: Spent) -> dict[str, Any]:
     return {
-        "usd": one.usd.as_json(),
-        "hours": round(one.hours, 3),
-        "servers": one.attempts,
-        "neverRan": one.never_ran,
-        "sizeGuessed": one.guessed,
+        "usd": amounts.usd.as_json(),
+        "hours": round(amounts.hours, 3),
+        "servers": amounts.attempts,
+        "neverRan": amounts.never_ran,
+        "sizeGuessed": amounts.guessed,
     }
 
 

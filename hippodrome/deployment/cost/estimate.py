@@ -185,13 +185,13 @@ def _data(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     per_gb = study.participants / 1e6
     frames = study.server_minutes * PLAYED * (60 * study.frame_rate)
     out = (frames * FRAME_KB + PAGE_LOADS * (study.steps * PAGE_KB)) * per_gb
-    each = PICTURE_KB if study.observations else RECORDED_KB
-    stored = (frames * each + Range.exactly(ANSWERS_KB)) * per_gb
+    kilobytes = PICTURE_KB if study.observations else RECORDED_KB
+    stored = (frames * kilobytes + Range.exactly(ANSWERS_KB)) * per_gb
     logged = LOG_KB * per_gb
-    kept = f"Data kept in S3, {MONTHS_KEPT.likely} months"
+    label = f"Data kept in S3, {MONTHS_KEPT.likely} months"
     return [
         CostLine("Data to participants", f"{out.likely:,.2f} GB", out * prices.out_gb.usd),
-        CostLine(kept, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
+        CostLine(label, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
         CostLine("Logs", f"{logged.likely:,.3f} GB", logged * (prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
     ]
 
@@ -267,38 +267,38 @@ def _fixed(what: str, number: int, price: float, free: float) -> CostLine:
 def assumptions(study: StudyToEstimate) -> list[str]:
     """Write the assumptions of the estimate, in sentences."""
     low, likely, high = study.server_minutes
-    known = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
-    found = [f"{count(study.participants, 'participant')}, and each does all {study.steps} steps."]
+    minutes = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
+    sentences = [f"{count(study.participants, 'participant')}, and each does all {study.steps} steps."]
     if study.games:
         whom = f" {study.players}" if study.has_sessions else ""
-        found.append(
-            f"A server for each{whom}: {known}, {high:g} at most (maxRuntime). "
+        sentences.append(
+            f"A server for each{whom}: {minutes}, {high:g} at most (maxRuntime). "
             + ("" if study.minutes is not None else "Give the mean time with --minutes: it decides most of the cost.")
         )
         if study.has_sessions:
             likely_wait = min(2 * LOBBY_POLLS.likely, study.patience)
-            found.append(
+            sentences.append(
                 f"Each waits {likely_wait:g} seconds in the lobby, {study.patience:g} at most. Servers that are "
                 f"started ahead and not used are not counted: one for {study.players} people who begin and do not "
                 f"come to the game, which runs for {UNUSED_AHEAD:g} minutes at most."
             )
         if study.at_link and study.has_sessions:
-            found.append(
+            sentences.append(
                 f"Every {study.players} opened links start a server. Those of {study.players} people who look and "
                 f"leave are not counted here: each runs for up to {UNUSED_AHEAD:g} minutes."
             )
         elif study.at_link:
-            found.append(
+            sentences.append(
                 "Every opened link starts a server. Those of people who look and leave are not counted here: "
                 f"each runs for about {UNUSED:g} minutes."
             )
-        found.append(
+        sentences.append(
             f"Pictures of {FRAME_KB.likely:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB.high:g} "
             "kB, the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
         )
     if study.games and study.spot:
-        found.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")
-    return [line.strip() for line in found]
+        sentences.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")
+    return [line.strip() for line in sentences]
 
 
 def total(lines: list[CostLine]) -> Usd:

@@ -125,7 +125,7 @@ def current(client: Any, region: str, today: str) -> Prices:
     `client` is the boto3 client `pricing` (the Price List API, which is in us-east-1 and free). Raises LookupError if
     the answer has no such prices.
     """
-    found: dict[str, float] = {}
+    prices_by_name: dict[str, float] = {}
     pages = client.get_paginator("get_products").paginate(
         ServiceCode="AmazonECS", Filters=[{"Type": "TERM_MATCH", "Field": "regionCode", "Value": region}]
     )
@@ -137,9 +137,9 @@ def current(client: Any, region: str, today: str) -> Prices:
             prefix, _, kind = usage.rpartition("Fargate-")
             price = _on_demand(product)
             if price and (not prefix or (prefix.endswith("-") and prefix.count("-") == 1)):
-                found[kind] = price
+                prices_by_name[kind] = price
     try:
-        vcpu, gb = found["vCPU-Hours:perCPU"], found["GB-Hours"]
+        vcpu, gb = prices_by_name["vCPU-Hours:perCPU"], prices_by_name["GB-Hours"]
     except KeyError:
         raise LookupError(f"AWS's price list has no Fargate prices for {region}") from None
     table = Prices()

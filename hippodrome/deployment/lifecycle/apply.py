@@ -160,8 +160,8 @@ def _unchanged(account: Account, stack: str, began: float) -> ApplyOutcome:
 
 def _delete_failed(prepared: Prepared) -> None:
     """Delete a stack whose creation failed, so that it can be made anew, and its buckets if they are empty."""
-    stack, found = prepared.stack, prepared.found
-    assert found
+    stack, existing = prepared.stack, prepared.found
+    assert existing
     screen.info(f"The stack {stack.name} is in {prepared.status}: its making failed, and nothing of it works.")
     screen.info("It is deleted and made anew.")
     buckets = [

@@ -103,26 +103,26 @@ def command(
     hosted zone in Route 53) gives both names, and is better for large studies. For researchers, who may not change the
     installation, it only registers the study.
     """
-    found, problem = _study(folder)
-    known = [preflight.of_problem("study", problem)] if problem else []
-    account = _account(profile, region, known)
+    study, problem = _study(folder)
+    earlier_findings = [preflight.of_problem("study", problem)] if problem else []
+    account = _account(profile, region, earlier_findings)
     if problem and (dry_run or describe_stack(account, stack)):
         raise problem  # with an installation, the account needs no further check
     if dry_run:
-        code = plans.run(account, stack, settings, False, found)
-        if found:
-            screen.info(f"Then {found.id} would be registered: `hippodrome register {folder} --dry-run` says how.")
+        code = plans.run(account, stack, settings, False, study)
+        if study:
+            screen.info(f"Then {study.id} would be registered: `hippodrome register {folder} --dry-run` says how.")
         return code
     if may_apply(account, stack):
-        request = applying.ApplyRequest(found, known, yes=yes, anyway=anyway)
+        request = applying.ApplyRequest(study, earlier_findings, yes=yes, anyway=anyway)
         outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
             applying.report(outcome, settings, False)
         if not no_certificate and (settings.domain or outcome.outputs.get("RootDomain")):
-            _certify(account, stack, found)
+            _certify(account, stack, study)
     else:
         screen.info(f"The installation {stack} stays as it is: these credentials are a researcher's.")
-    if found is None:
+    if study is None:
         return Exit.DONE
     return register.command(folder, base=base, yes=yes, stack=stack, region=region, profile=profile)
 
@@ -138,14 +138,14 @@ def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, Problem |
         return None, problem
 
 
-def _account(profile: str | None, region: str | None, known: list[Finding]) -> Account:
+def _account(profile: str | None, region: str | None, findings: list[Finding]) -> Account:
     """Open the account and try its credentials. If they fail, show the findings in `known` first, then raise."""
     try:
         account = open_account(profile, region)
         user = account.identity["Arn"].rpartition(":")[2]
     except Exception as error:
         if problem := explain.problem_from(error):
-            show(known, screen.err)
+            show(findings, screen.err)
             raise problem from None
         raise
     screen.info(f"In account {account.id}, region {account.region}, as {user}.")
@@ -164,5 +164,5 @@ def _certify(account: Account, stack: str, found: project_folder.ProjectFolder |
             ) from None
         screen.warning(f"There is no certificate for servers, which this study does not need. {problem}")
     else:
-        left = f", {report.days_left} days left" if report.days_left is not None else ""
-        screen.success(f"The certificate for servers below {report.domain} is in place{left}.")
+        days = f", {report.days_left} days left" if report.days_left is not None else ""
+        screen.success(f"The certificate for servers below {report.domain} is in place{days}.")

@@ -35,14 +35,14 @@ def command(
     account.id  # noqa: B018 - raises at once if AWS does not accept the credentials
     removal = Removal(account, stack)
     screen.info(f"Looking for the resources of {stack} in {account.region} …", "dim")
-    found = removal.look()
-    if dry_run or not found:
-        return _tell(account, stack, found, data, as_json)
-    _show(found, data)
-    if found.stack or found.things or data:
-        _ask(stack, data and bool(found.data), yes)
-        removal.run(found, data)
-    remains = look_again(removal, found.resources)
+    installation = removal.look()
+    if dry_run or not installation:
+        return _tell(account, stack, installation, data, as_json)
+    _show(installation, data)
+    if installation.stack or installation.things or data:
+        _ask(stack, data and bool(installation.data), yes)
+        removal.run(installation, data)
+    remains = look_again(removal, installation.resources)
     if as_json:
         screen.result_json(remains.as_json())
     else:
@@ -63,20 +63,20 @@ def _tell(account: Account, stack: str, installation: FoundInstallation, data: b
     return Exit.CHANGES if to_do else Exit.DONE
 
 
-def _show(found: FoundInstallation, data: bool) -> None:
-    if found.stack:
-        screen.info(f"  - the stack, {found.stack['StackStatus']}, with all that it made", "red")
-    for kind in dict.fromkeys(thing.kind for thing in found.things):
-        names = [thing.name for thing in found.things if thing.kind == kind]
+def _show(installation: FoundInstallation, data: bool) -> None:
+    if installation.stack:
+        screen.info(f"  - the stack, {installation.stack['StackStatus']}, with all that it made", "red")
+    for kind in dict.fromkeys(thing.kind for thing in installation.things):
+        names = [thing.name for thing in installation.things if thing.kind == kind]
         screen.info(f"  - {kind}: {names[0] if len(names) == 1 else len(names)}", "red")
-    for attached in found.attached:
+    for attached in installation.attached:
         screen.info(f"  - the policy {attached.name}, which is taken from {attached.whom}", "red")
-    for bucket in found.data:
+    for bucket in installation.data:
         if data:
             screen.info(f"  - the participants' data: the bucket {bucket}, every version", "bold red")
         else:
             screen.info(f"  = the participants' data stay: the bucket {bucket}")
-    if data and found.data:
+    if data and installation.data:
         screen.info(
             "  The servers' certificate goes with the data. Let's Encrypt issues five for a domain in a week; without "
             "--data the next installation takes it over."

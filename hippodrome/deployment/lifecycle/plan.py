@@ -132,13 +132,13 @@ class Plan:
 def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> list[Change]:
     """Read the changes in `answer`, the list `Changes` of DescribeChangeSet."""
     files = template.function_names()
-    found = []
+    changes = []
     for one in answer:
         change = one.get("ResourceChange")
         if not change:
             continue
         logical = change["LogicalResourceId"]
-        found.append(
+        changes.append(
             Change(
                 action=_action(change),
                 name=files.get(logical, logical),
@@ -149,7 +149,7 @@ def of_change_set(answer: Iterable[Mapping[str, Any]], template: Template) -> li
                 kept="Retain" in str(change.get("PolicyAction", "")),
             )
         )
-    return found
+    return changes
 
 
 def of_creation(template: Template, parameters: Mapping[str, str]) -> list[Change]:
@@ -220,7 +220,7 @@ def _each(changes: Sequence[Change], action: str) -> Iterator[tuple[str, str]]:
         "import": "is taken in",
     }
     for change in changes:
-        text = words.get(action, "") + ", ".join(one for one in change.properties if one)
+        text = words.get(action, "") + ", ".join(property_name for property_name in change.properties if property_name)
         yield f"  {_SIGNS[action]} {change.name} ({_called(change.type)}) {text}".rstrip(), _STYLES[action]
 
 
@@ -264,11 +264,11 @@ def plan(account: Account, stack: str, settings: StackSettings, *, study: Projec
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
     if not prepared.bucket.exists():
         raise Problem(f"The code bucket {prepared.bucket.name} is gone.", "`hippodrome apply` makes it anew.")
-    with change_set(prepared, keep=False) as made:
-        changes = of_change_set(made.changes, prepared.template)
+    with change_set(prepared, keep=False) as change_set_made:
+        changes = of_change_set(change_set_made.changes, prepared.template)
     if not changes:
         return Plan(stack, account.region, "nothing", seconds=time.monotonic() - began)
-    findings = [look("CloudFormation", warning) for warning in made.warnings]
+    findings = [look("CloudFormation", warning) for warning in change_set_made.warnings]
     findings += preflight.look_at(prepared, study)
     changed, seconds = prepared.changed_parameters(), time.monotonic() - began
     return Plan(stack, account.region, "update", changes, changed, seconds, findings, new_site(prepared))
@@ -284,13 +284,13 @@ def run(
     account: Account, stack: str, settings: StackSettings, as_json: bool, study: ProjectFolder | None = None
 ) -> int:
     """Make the plan, print it with its findings, and return the command's exit code."""
-    found = plan(account, stack, settings, study=study)
+    changes = plan(account, stack, settings, study=study)
     if as_json:
-        screen.result_json(found.as_json())
+        screen.result_json(changes.as_json())
     else:
-        show(found, answer=True)
-        show_findings(found.findings, screen.err)
-    return Exit.DONE if found.kind == "nothing" else Exit.CHANGES
+        show(changes, answer=True)
+        show_findings(changes.findings, screen.err)
+    return Exit.DONE if changes.kind == "nothing" else Exit.CHANGES
 
 
 @taking_settings

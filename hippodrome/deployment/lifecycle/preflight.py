@@ -64,7 +64,7 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
     `study` is the study that will be registered in this installation.
     """
     before, after = prepared.before, prepared.parameters
-    found: list[Finding] = []
+    findings: list[Finding] = []
     checks: dict[str, Callable[[Prepared], Iterable[Finding]]] = {}
     if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
         checks |= _OF_ADDRESSES if after["RootDomain"] else {"servers": _servers_that_run}
@@ -78,19 +78,19 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
         checks["Internet"] = _internet
     if prepared.existing is None:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
-        found = examine(AccountCheck(prepared.account, study), _OF_ACCOUNT)
-    found += examine(prepared, checks)
-    return _bad_last(one for one in found if one.mark is not Mark.GOOD)
+        findings = examine(AccountCheck(prepared.account, study), _OF_ACCOUNT)
+    findings += examine(prepared, checks)
+    return _bad_last(finding for finding in findings if finding.mark is not Mark.GOOD)
 
 
-def _bad_last(found: Iterable[Finding]) -> list[Finding]:
+def _bad_last(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings with the bad ones at the end, so that long remarks do not scroll them off the screen."""
-    return sorted(found, key=lambda one: one.mark is Mark.BAD)
+    return sorted(findings, key=lambda finding: finding.mark is Mark.BAD)
 
 
 def _stop(findings: Sequence[Finding], anyway: bool = False) -> None:
     show(_bad_last(findings), screen.err)
-    bads = sum(one.mark is Mark.BAD for one in findings)
+    bads = sum(finding.mark is Mark.BAD for finding in findings)
     if bads and not anyway:
         raise Problem(
             f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
@@ -171,17 +171,17 @@ def _delegation(prepared: Prepared) -> Iterator[Finding]:
     (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
     """
     zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
-    found = delegation(zone)
+    answer = delegation(zone)
     servers = ", ".join(zone.name_servers)
-    if found.problem and found.certain:
+    if answer.problem and answer.certain:
         yield bad(
             "domain",
-            f"{found.problem} No certificate can be issued for it, and its names cannot be resolved.",
+            f"{answer.problem} No certificate can be issued for it, and its names cannot be resolved.",
             f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
             "DNS knows them after minutes or hours; then run the same command again.",
         )
-    elif found.problem:
-        yield look("domain", found.problem, f"Its name servers have to be {servers}.")
+    elif answer.problem:
+        yield look("domain", answer.problem, f"Its name servers have to be {servers}.")
 
 
 def _proof(prepared: Prepared) -> Iterator[Finding]:
@@ -202,22 +202,23 @@ def _authorities(prepared: Prepared) -> Iterator[Finding]:
     """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
     after = prepared.parameters
     root, site, servers = after["RootDomain"], site_host(after), names_of(servers_domain(after))
-    known = partial(exists, prepared.account, read_zone(prepared.account, after["HostedZoneId"]))
+    exists_in_zone = partial(exists, prepared.account, read_zone(prepared.account, after["HostedZoneId"]))
     wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
     for issuer, name, authorities in wanted:
-        found, wildcard = caa.find(name.removeprefix("*."), known), name.startswith("*.")
-        if not found.certain:
+        caa_records, wildcard = caa.find(name.removeprefix("*."), exists_in_zone), name.startswith("*.")
+        if not caa_records.certain:
             yield look(
                 "CAA",
                 f"DNS could not be asked which authorities may issue certificates for {name}.",
                 "If the domain has no CAA records, nothing needs to be done. Otherwise try again on another network.",
             )
-        elif forbidding := found.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):
-            place = root if root.endswith(f".{found.where}") else found.where
+        elif forbidding := caa_records.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):
+            place = root if root.endswith(f".{caa_records.where}") else caa_records.where
             records = ", ".join(f'0 {tag} "{value}"' for tag, value in forbidding)
             yield bad(
                 "CAA",
-                f"The CAA records of {found.where} ({records}) keep {issuer} from issuing a certificate for {name}.",
+                f"The CAA records of {caa_records.where} ({records}) keep {issuer} "
+                f"from issuing a certificate for {name}.",
                 f'Add two CAA records to {place}: 0 issue "{caa.AMAZON[0]}" and 0 issuewild "{caa.LETS_ENCRYPT[0]}".',
             )
 
@@ -291,11 +292,11 @@ def _subnets(prepared: Prepared) -> Iterator[Finding]:
             raise
         yield bad("network", errors.message(error), "Check --subnets and --region.")
         return
-    for one in found:
-        if one["VpcId"] != vpc:
+    for subnet in found:
+        if subnet["VpcId"] != vpc:
             yield bad(
                 "network",
-                f"The subnet {one['SubnetId']} is in {one['VpcId']}, not in {vpc}.",
+                f"The subnet {subnet['SubnetId']} is in {subnet['VpcId']}, not in {vpc}.",
                 "Name a VPC and its own subnets: --vpc and --subnets.",
             )
     if len({one.get("AvailabilityZone") for one in found}) < 2:
@@ -314,11 +315,11 @@ def _endpoint(prepared: Prepared, vpc: str) -> Iterator[Finding]:
     """
     filters = [{"Name": "vpc-id", "Values": [vpc]}]
     pages = prepared.account.client("ec2").get_paginator("describe_vpc_endpoints").paginate(Filters=filters)
-    for one in (endpoint for page in pages for endpoint in page["VpcEndpoints"]):
-        if one["ServiceName"].endswith(".execute-api") and one.get("PrivateDnsEnabled"):
+    for private in (endpoint for page in pages for endpoint in page["VpcEndpoints"]):
+        if private["ServiceName"].endswith(".execute-api") and private.get("PrivateDnsEnabled"):
             yield bad(
                 "network",
-                f"The endpoint {one['VpcEndpointId']} of {vpc} has private DNS, so servers could not reach the "
+                f"The endpoint {private['VpcEndpointId']} of {vpc} has private DNS, so servers could not reach the "
                 "functions, to store data and to get certificates.",
                 "Switch its private DNS off, or name another VPC: --vpc and --subnets.",
             )

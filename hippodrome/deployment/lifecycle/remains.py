@@ -34,10 +34,10 @@ def look_again(removal: Removal, remembered: Sequence[inventory.Resource]) -> Re
 
     def look() -> Remains:
         after = removal.look()
-        found = inventory.still_there(removal.account, remembered)
-        found += [*after.things, *inventory.tagged(removal.account, removal.name)]
-        left = [thing for thing in dict.fromkeys(found) if thing.name not in after.data]
-        return Remains(removal, remembered, after, left)
+        things = inventory.still_there(removal.account, remembered)
+        things += [*after.things, *inventory.tagged(removal.account, removal.name)]
+        remaining = [thing for thing in dict.fromkeys(things) if thing.name not in after.data]
+        return Remains(removal, remembered, after, remaining)
 
     title = f"AWS still lists what is deleted: up to {duration(LISTED)}"
     return removal.executor.wait(look, LISTED, pause=PAUSE, title=title)
@@ -73,22 +73,22 @@ class Remains:
     def server_names(self) -> Sequence[str]:
         """DNS names of servers, of this or another installation of the same domain; empty while the stack exists."""
         where = [] if self.after.stack else self.after.addresses
-        return [name for one in where for name in inventory.server_names(self._account, one)]
+        return [name for place in where for name in inventory.server_names(self._account, place)]
 
     @cached_property
     def records(self) -> Sequence[tuple[Validation, str, str]]:
         """The validation records that stay, each with the reason and the command that deletes it."""
-        found = [(one, f"it renews {users} as well") for one, users in self.removal.kept]
-        known = {one for one, _ in found}
+        kept_records = [(record, f"it renews {users} as well") for record, users in self.removal.kept]
+        kept_before = {record for record, _ in kept_records}
         for addresses in self.after.addresses if not self.after.stack else ():
             for one in acm_records.of_domain(self._account, addresses.zone, addresses.site):
-                if one not in known:
+                if one not in kept_before:
                     users = acm_records.users(self._account, one)
                     why = f"it renews {', '.join(users)}" if users else "it may prove the name for another AWS account"
-                    found.append((one, why))
+                    kept_records.append((one, why))
         return [
             (one, why, acm_records.removal(one.zone, record))
-            for one, why in found
+            for one, why in kept_records
             if (record := acm_records.present(self._account, one))
         ]
 
@@ -106,7 +106,7 @@ class Remains:
             ],
             "kept": list(self.after.data),
             "storedBytes": self.stored,
-            "records": [{"name": one.name, "why": why, "remove": remove} for one, why, remove in self.records],
+            "records": [{"name": record.name, "why": why, "remove": remove} for record, why, remove in self.records],
             "roles": self.service_roles,
             "serverNames": self.server_names,
             "errors": self.removal.errors,
@@ -117,15 +117,15 @@ class Remains:
         rows = [*self._rows()]
         if rows:
             screen.table(["what", "left", "a month", ""], rows)
-        kinds = {LISTINGS[one.type].kind for one in self.remembered if one.type in LISTINGS}
-        removed_kinds = kinds - {one.kind for one in self.left}
+        kinds = {LISTINGS[thing.type].kind for thing in self.remembered if thing.type in LISTINGS}
+        removed_kinds = kinds - {thing.kind for thing in self.left}
         if removed_kinds:
             number = count(len(removed_kinds), "other kind" if rows else "kind")
             screen.result(f"{number} of things looked at: nothing left.")
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:
-        for kind in sorted({one.kind for one in self.left}):
-            names = [one.name for one in self.left if one.kind == kind]
+        for kind in sorted({thing.kind for thing in self.left}):
+            names = [thing.name for thing in self.left if thing.kind == kind]
             yield kind, str(len(names)), inventory.cost_of(kind), ", ".join(names[:3])
         for bucket, stored in self.stored.items():
             month = f"${stored / 1e9 * Prices().s3_gb_month.usd:,.2f} ({size(stored)})"
@@ -182,13 +182,13 @@ def _tell_kept(account: Account, bucket: str, place: str) -> None:
     """Print how to fetch the data in a kept bucket."""
     projects = retained_bucket.projects(account, bucket)
     if not projects:
-        found = (
+        sentences = (
             "The participants' data in it have been deleted; S3 keeps their older versions for about "
             f"{OLD_VERSIONS} days."
             if retained_bucket.older_versions(account, bucket)
             else "There are no participants' data in it."
         )
-        screen.info(f"The bucket {bucket} stays. {found}")
+        screen.info(f"The bucket {bucket} stays. {sentences}")
         return
     screen.info(f"The participants' data stay in the bucket {bucket}. To fetch them:")
     for project in projects:

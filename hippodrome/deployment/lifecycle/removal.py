@@ -71,14 +71,14 @@ class Removal:
         things = [
             ListedResource("ECS task definition", arn) for arn in inventory.task_definitions(self.account, self.name)
         ]
-        made = self._stack.resources() if described else []
-        own = {one.get("PhysicalResourceId") for one in made}
+        stack_resources = self._stack.resources() if described else []
+        own = {resource.get("PhysicalResourceId") for resource in stack_resources}
         groups = inventory.log_groups(self.account, self.name)
         things += [ListedResource("log group", group) for group in groups if group not in own]
         things += [ListedResource("secret", name) for name in self._secret_names()]
         if self._code.exists():
             things.append(ListedResource("S3 bucket", self._code.name))
-        attached = [policies.attached(self.account, arn) for arn in ids_of(made, "AWS::IAM::ManagedPolicy")]
+        attached = [policies.attached(self.account, arn) for arn in ids_of(stack_resources, "AWS::IAM::ManagedPolicy")]
         stacks = inventory.stacks(self.account, self.name)
         resources = inventory.resources(self.account, stacks)
         return FoundInstallation(
@@ -124,7 +124,7 @@ class Removal:
         if not installation.stack or not installation.addresses:
             return
         arns, zone = self._stack.ids_of("AWS::CertificateManager::Certificate"), _zone(installation)
-        self._records = [one for arn in arns for one in acm_records.of_certificate(self.account, arn, zone)]
+        self._records = [record for arn in arns for record in acm_records.of_certificate(self.account, arn, zone)]
         acm_records.remember(self._code, self._records)
 
     def _delete_stack(self, installation: FoundInstallation) -> None:
@@ -142,10 +142,10 @@ class Removal:
             stopper = Stopper(self.account.platform(installation), None, self.executor)
             with screen.ProgressBars() as bar:
                 task = bar.add_task("Stopping servers", total=None)
-                left = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
+                remaining = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))
             if stopper.stopped:
                 screen.success(f"{count(len(stopper.stopped), 'server')} stopped.")
-            if left.to_do:
+            if remaining.to_do:
                 self.errors.extend(stopper.errors)
         tasks = EcsTasks(lambda: ecs, lambda: self.account.client("ec2"), installation.__getitem__)
 
@@ -162,13 +162,13 @@ class Removal:
 
     def _validation_records(self) -> None:
         """Delete the records that prove the site's name to ACM, unless another certificate needs them."""
-        for one in dict.fromkeys([*self._records, *acm_records.remembered(self._code)]):
-            if acm_records.present(self.account, one) is None:
+        for record in dict.fromkeys([*self._records, *acm_records.remembered(self._code)]):
+            if acm_records.present(self.account, record) is None:
                 continue
-            if users := acm_records.users(self.account, one):
-                self.kept.append((one, ", ".join(users)))
-            elif acm_records.remove(self.account, one):
-                screen.success(f"The DNS record {one.name} is deleted, which proved the site's name to AWS.")
+            if users := acm_records.users(self.account, record):
+                self.kept.append((record, ", ".join(users)))
+            elif acm_records.remove(self.account, record):
+                screen.success(f"The DNS record {record.name} is deleted, which proved the site's name to AWS.")
 
     def _acme_records(self, addresses: Addresses) -> None:
         """Delete the challenge records that interrupted orders of certificates left."""

@@ -284,22 +284,22 @@ class Eraser:
         """Wait until ECS lists the task. If it has not after `SETTLED`, there is none."""
         self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
 
-    def _leave_session(self, found: FoundSession, advance: Callable[[int], None]) -> None:
+    def _leave_session(self, session: FoundSession, advance: Callable[[int], None]) -> None:
         """Take the participant out of a session. If its server runs again, finish in the next round, which stops it."""
         note = self._noting(advance)
-        key = server.key(ids.server_label(self.project, found.id))
-        if not found.others:
+        key = server.key(ids.server_label(self.project, session.id))
+        if not session.others:
             record = self._record(key)
             if record is None or record.is_closed:
                 for keys_of_warm_server in (*keys_of_warm_servers(self.project, warm_servers_of(record)), key):
                     self._bucket.delete(self._bucket.versions_of(keys_of_warm_server), note)
-                self._sessions.delete_session(found, note)
+                self._sessions.delete_session(session, note)
             return
-        self._sessions.take_out(found, note)
+        self._sessions.take_out(session, note)
         self.receipt.rewritten = self._sessions.rewritten
         record = self._record(key)
         if record is None or record.is_closed:
-            self._sessions.take_name(found, note)
+            self._sessions.take_name(session, note)
 
     def _leave_lobby(self, advance: Callable[[int], None]) -> None:
         self._lobby.erase(self._noting(advance))

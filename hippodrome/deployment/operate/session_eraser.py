@@ -64,13 +64,13 @@ class SessionEraser:
         self.unreadable = []
         every = [(session, version) for session, versions in documents.items() for version in versions]
         bodies = read_all(self._storage, [version for _, version in every])
-        found: dict[str, FoundSession] = {}
+        by_id: dict[str, FoundSession] = {}
         for (session, version), body in zip(every, bodies, strict=True):
-            self._look(session, version.key, body, found)
+            self._look(session, version.key, body, by_id)
         theirs = self._membership() if existing else None
-        if theirs is not None and theirs.id in existing and theirs.id not in found and theirs.id not in documents:
-            found[theirs.id] = theirs
-        return sorted(found.values(), key=lambda each: each.id)
+        if theirs is not None and theirs.id in existing and theirs.id not in by_id and theirs.id not in documents:
+            by_id[theirs.id] = theirs
+        return sorted(by_id.values(), key=lambda each: each.id)
 
     def _look(self, session: str, key: str, body: bytes, found: dict[str, FoundSession]) -> None:
         try:
@@ -90,8 +90,10 @@ class SessionEraser:
         try:
             for version in self._storage.versions_of(membership_key(self._project, self._user)):
                 if not version.marker:
-                    found = memberships.read(self._storage.read(version))
-                    return FoundSession(found.session, found.seat, others=True) if found.session else None
+                    membership = memberships.read(self._storage.read(version))
+                    return (
+                        FoundSession(membership.session, membership.seat, others=True) if membership.session else None
+                    )
         except ValueError:
             return None
         return None
@@ -103,26 +105,26 @@ class SessionEraser:
         for session in self.sessions():
             self.leave(session, note)
 
-    def leave(self, found: FoundSession, note: Note) -> None:
+    def leave(self, session: FoundSession, note: Note) -> None:
         """Take the participant out of one session, whose server must not run."""
-        if found.others:
-            self.take_out(found, note)
-            self.take_name(found, note)
+        if session.others:
+            self.take_out(session, note)
+            self.take_name(session, note)
         else:
-            self.delete_session(found, note)
+            self.delete_session(session, note)
 
-    def take_out(self, found: FoundSession, note: Note) -> None:
+    def take_out(self, session: FoundSession, note: Note) -> None:
         """Write the session's recordings without the participant, and delete their earlier versions."""
-        folder = session_folder(self._project, found.id)
+        folder = session_folder(self._project, session.id)
         for key in dict.fromkeys(version.key for version in self._storage.versions(folder)):
             if key.endswith(_RECORDING) or _PIECE.search(key):
-                self._rewrite(key, found.seat)
+                self._rewrite(key, session.seat)
                 self._storage.delete(older(self._storage, key), note)
         self._storage.delete([*self._storage.uploads(folder)], note)
 
-    def take_name(self, found: FoundSession, note: Note) -> None:
+    def take_name(self, session: FoundSession, note: Note) -> None:
         """Write the session's document without the participant's id. This is the last step."""
-        key = session_key(self._project, found.id)
+        key = session_key(self._project, session.id)
         last = newest(self._storage, key)
         if last is None:
             return
@@ -139,9 +141,9 @@ class SessionEraser:
         members = (replace(member, user_id="") if member.user_id == self._user else member for member in parsed.members)
         return replace(parsed, members=tuple(members)).to_json()
 
-    def delete_session(self, found: FoundSession, note: Note) -> None:
+    def delete_session(self, session: FoundSession, note: Note) -> None:
         """Delete all documents of a session without other members; the session's own document comes last."""
-        folder, last = session_folder(self._project, found.id), session_key(self._project, found.id)
+        folder, last = session_folder(self._project, session.id), session_key(self._project, session.id)
         self._storage.delete([*self._storage.uploads(folder)], note)
         self._storage.delete([version for version in self._storage.versions(folder) if version.key != last], note)
         self._storage.delete([*self._storage.versions_of(last)], note)

@@ -113,21 +113,21 @@ class Snapshot:
     @property
     def failures(self) -> list[ServerFailure]:
         """Return why servers failed in the last 24 hours: preventable causes first, then by number of servers."""
-        found: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
+        by_cause: dict[tuple[str, Cause], list[tuple[datetime, str]]] = {}
         for record in self.recent:
-            for one in attempts_of(record):
-                cause = parse_cause(one.cause)
-                if cause and one.closed and one.closed >= self.at - DAY:
-                    name = one.warm_server_name or ids.server_name(record.label, one.attempt)
-                    found.setdefault((record.project_id, cause), []).append((one.closed, name))
-        server_failures = [ServerFailure(*key, len(ends), *max(ends)) for key, ends in found.items()]
+            for attempt in attempts_of(record):
+                cause = parse_cause(attempt.cause)
+                if cause and attempt.closed and attempt.closed >= self.at - DAY:
+                    name = attempt.warm_server_name or ids.server_name(record.label, attempt.attempt)
+                    by_cause.setdefault((record.project_id, cause), []).append((attempt.closed, name))
+        server_failures = [ServerFailure(*key, len(ends), *max(ends)) for key, ends in by_cause.items()]
         return sorted(server_failures, key=lambda f: (not f.matters, -f.servers, f.project, f.cause))
 
     def warm(self, project_id: str) -> WarmServers:
         """Count the warm servers of a project."""
         mine = [r for r in self.servers if r.is_warm_server and r.project_id == project_id]
-        taken = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
-        return WarmServers(sum(r.state is ServerState.READY for r in mine), len(mine), len(taken))
+        assigned = [r for r in self._closed_today() if r.reason is Reason.ASSIGNED and r.project_id == project_id]
+        return WarmServers(sum(r.state is ServerState.READY for r in mine), len(mine), len(assigned))
 
     def _closed_today(self) -> list[Server]:
         day = midnight(self.at)
@@ -159,8 +159,8 @@ class InstallationMonitor:
         with ThreadPoolExecutor(4) as pool:
             running = [pool.submit(self._try, look, part, read) for part, read in parts.items()]
             self._try(look, "projects", partial(self._projects, progress=progress))
-            for one in running:
-                one.result()
+            for server in running:
+                server.result()
         sizes = {project.id: (project.size.cpu, project.size.memory) for project, _ in look.projects}
         look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
         return look
@@ -195,23 +195,23 @@ class InstallationMonitor:
         # Servers that may be open, or have failed or cost something today: their records were written within the last
         # day, or within the longest life of a server.
         since = min(look.at - DAY, look.at - timedelta(minutes=self._platform.settings.max_runtime) - SLACK)
-        found = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
+        records = [r for r in self._records.since(since) if self._project_id in (None, r.project_id)]
         if self._records.unreadable:
             look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
-        look.servers = sorted((r for r in found if not r.is_closed), key=lambda r: r.requested)
-        look.recent = found
+        look.servers = sorted((r for r in records if not r.is_closed), key=lambda r: r.requested)
+        look.recent = records
         look.members = dict(self._members([server for server in look.servers if server.is_of_session]))
 
     def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
         """Yield the names of sessions' servers, each with the number of members. Reads each formed session once."""
         for server in servers:
-            known = self._formed.get(server.user_id)
-            if known is None:
+            formed = self._formed.get(server.user_id)
+            if formed is None:
                 session = readable_session(self._repository, server.project_id, server.user_id)
-                known = len(session.members) if session else None
-            if known is not None:
-                self._formed[server.user_id] = known
-                yield server.name, known
+                formed = len(session.members) if session else None
+            if formed is not None:
+                self._formed[server.user_id] = formed
+                yield server.name, formed
 
     def _tasks(self, look: Snapshot) -> None:
         look.tasks = self._platform.tasks.count()
@@ -235,10 +235,10 @@ def midnight(now: datetime) -> datetime:
 def queues(account: Account, stack: str) -> list[StackQueue]:
     """Read the stack's queues. A queue that another one names in its RedrivePolicy is a dead-letter queue."""
     client = account.client("sqs")
-    found: dict[str, Mapping[str, str]] = {}
+    by_queue: dict[str, Mapping[str, str]] = {}
     for url in Stack(account, stack).ids_of("AWS::SQS::Queue"):
-        found[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
-    policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in found.values())
+        by_queue[url] = client.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"]
+    policies = " ".join(attributes.get("RedrivePolicy", "") for attributes in by_queue.values())
     return [
         StackQueue(
             name=url.rpartition("/")[2],
@@ -247,7 +247,7 @@ def queues(account: Account, stack: str) -> list[StackQueue]:
             delayed=int(attributes.get("ApproximateNumberOfMessagesDelayed", 0)),
             dead=f'"{attributes["QueueArn"]}"' in policies,
         )
-        for url, attributes in found.items()
+        for url, attributes in by_queue.items()
     ]
 
 
@@ -259,11 +259,11 @@ def certificate(installation: Installation, documents: Documents, now: datetime)
     from cryptography import x509  # noqa: PLC0415 - takes its time to import
 
     key = installation.certificate.fullchain
-    found = documents.get(key)
-    if found is None:
+    document = documents.get(key)
+    if document is None:
         return None
     try:
-        leaf = x509.load_pem_x509_certificates(found.body)[0]
+        leaf = x509.load_pem_x509_certificates(document.body)[0]
         names = leaf.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         dns = tuple(names.get_values_for_type(x509.DNSName))
     except (ValueError, IndexError):

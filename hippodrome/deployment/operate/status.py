@@ -270,13 +270,15 @@ def _servers(look: Snapshot) -> list[RenderableType]:
     if look.servers:
         table = _table("server", "project", "state", "age", "left", "")
         for server in look.servers[:MAX_SERVERS]:
-            left = (server.deadline - look.at).total_seconds()
+            seconds_left = (server.deadline - look.at).total_seconds()
             table.add_row(
                 Text(server.name),
                 Text(server.project_id),
                 Text(str(server.state)),
                 Text(duration((look.at - server.requested).total_seconds())),
-                Text(duration(left) if left >= 0 else "overdue", style="" if left >= 0 else "red"),
+                Text(
+                    duration(seconds_left) if seconds_left >= 0 else "overdue", style="" if seconds_left >= 0 else "red"
+                ),
                 Text(_kind(server, look.members.get(server.name)), style="dim"),
             )
         parts.append(table)

@@ -86,7 +86,7 @@ class Stopper:
     def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> FoundServers:
         """Stop servers until a look finds nothing, or `wait` seconds are over. Return what the last look found."""
         return self._executor.converge(
-            self.look, lambda found: self.plan(found, advance), note=self._note, seconds=wait
+            self.look, lambda servers: self.plan(servers, advance), note=self._note, seconds=wait
         )
 
     def look(self) -> FoundServers:
@@ -98,12 +98,12 @@ class Stopper:
         found = resources.list_resources(platform)
         draining = list(platform.tasks.draining(found.cluster))
         owners = self._records.owners([*found.names(), *(task.name for task in draining)])
-        known = {record.label: record for record in owners.values()}
+        by_label = {record.label: record for record in owners.values()}
         for record in self._records.open(platform.settings.max_runtime, platform.now()):
-            known.setdefault(record.label, record)
+            by_label.setdefault(record.label, record)
         return FoundServers(
             sorted(
-                (record for record in known.values() if not record.is_closed and self._scope.covers(record)),
+                (record for record in by_label.values() if not record.is_closed and self._scope.covers(record)),
                 key=lambda record: record.requested,
             ),
             leftovers(found, owners, self._scope),
@@ -183,12 +183,14 @@ def command(
         screen.confirm(f"Stop {servers} {owner}? Participants who play there lose the game that is on.", yes)
     with screen.ProgressBars() as progress:
         bar = progress.add_task("Stopping servers", total=len(found.servers))
-        left = stopper.run(wait, lambda number: progress.advance(bar, number))
+        remaining = stopper.run(wait, lambda number: progress.advance(bar, number))
     if as_json:
-        screen.result_json({"stopped": len(stopper.stopped), "left": left.counts(), "errors": list(stopper.errors)})
-    if left.to_do:
+        screen.result_json(
+            {"stopped": len(stopper.stopped), "left": remaining.counts(), "errors": list(stopper.errors)}
+        )
+    if remaining.to_do:
         raise Problem(
-            f"Not everything is gone: {_in_words(left.counts())}.",
+            f"Not everything is gone: {_in_words(remaining.counts())}.",
             "Run it again: it goes on from there. Every server's own timer stops it too.",
             list(stopper.errors),
         )
@@ -197,8 +199,10 @@ def command(
         screen.warning(f"{unread} of servers cannot be read; `hippodrome doctor --all` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.success(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
-    if left.draining:
-        screen.warning(f"{count(len(left.draining), 'task')} still saving: they end within two minutes of the stop.")
+    if remaining.draining:
+        screen.warning(
+            f"{count(len(remaining.draining), 'task')} still saving: they end within two minutes of the stop."
+        )
     if live and found.servers:
         screen.warning(f"{_again(live)}; `register --no-live` closes it.")
     return Exit.DONE
@@ -211,13 +215,13 @@ def _again(live: Sequence[Project]) -> str:
     return text + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
 
 
-def _show(found: FoundServers, as_json: bool) -> None:
+def _show(servers: FoundServers, as_json: bool) -> None:
     if as_json:
-        screen.result_json({"found": found.counts(), "servers": [_line(record) for record in found.servers]})
+        screen.result_json({"found": servers.counts(), "servers": [_line(record) for record in servers.servers]})
         return
-    projects = Counter((record.project_id, _state(record)) for record in found.servers)
+    projects = Counter((record.project_id, _state(record)) for record in servers.servers)
     rows = [(project, state, count) for (project, state), count in sorted(projects.items())]
-    rows += [("left over", what, count) for what, count in found.counts().items() if count and what != "servers"]
+    rows += [("left over", what, count) for what, count in servers.counts().items() if count and what != "servers"]
     if rows:
         screen.table(["project", "state", "servers"], rows, right=["servers"])
     else:

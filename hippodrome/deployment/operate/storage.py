@@ -50,7 +50,7 @@ def read_all(storage: Storage, versions: Sequence[Version]) -> list[bytes]:
 
 def newest(storage: Storage, key: str) -> Version | None:
     """Return the newest version of a document; None if the document does not exist or was deleted."""
-    return next((each for each in storage.versions_of(key) if each.latest and not each.marker), None)
+    return next((version for version in storage.versions_of(key) if version.latest and not version.marker), None)
 
 
 def older(storage: Storage, key: str) -> list[Version]:

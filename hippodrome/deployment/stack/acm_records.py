@@ -55,16 +55,16 @@ def in_use_by(account: Account, arn: str) -> list[str]:
 
 def remember(bucket: CodeBucket, validations: Iterable[Validation]) -> None:
     """Write into the code bucket which records have to be deleted after the stack."""
-    known = remembered(bucket)
-    wanted = list(dict.fromkeys([*known, *validations]))
-    if wanted != known and bucket.exists():
-        bucket.put(NOTE, json.dumps([one._asdict() for one in wanted]).encode())
+    earlier = remembered(bucket)
+    wanted = list(dict.fromkeys([*earlier, *validations]))
+    if wanted != earlier and bucket.exists():
+        bucket.put(NOTE, json.dumps([validation._asdict() for validation in wanted]).encode())
 
 
 def remembered(bucket: CodeBucket) -> list[Validation]:
     """Read the records that `remember` has written."""
     body = bucket.get(NOTE)
-    return [Validation(**one) for one in json.loads(body)] if body else []
+    return [Validation(**fields) for fields in json.loads(body)] if body else []
 
 
 def present(account: Account, validation: Validation) -> dict[str, Any] | None:
@@ -139,8 +139,8 @@ def users(account: Account, validation: Validation) -> list[str]:
     except ClientError:
         return ["whatever is in other regions, which these credentials may not list"]
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        found = pool.map(lambda region: [*_users_in(account, region, validation)], regions)
-        return [user for users_of_region in found for user in users_of_region]
+        answers = pool.map(lambda region: [*_users_in(account, region, validation)], regions)
+        return [user for users_of_region in answers for user in users_of_region]
 
 
 def _regions(account: Account) -> Sequence[str]:
@@ -153,17 +153,17 @@ def _users_in(account: Account, region: str, validation: Validation) -> Iterator
     try:
         pages = account.client("acm", region).get_paginator("list_certificates")
         for page in pages.paginate(Includes={"keyTypes": list(KEY_TYPES)}):
-            for found in page["CertificateSummaryList"]:
-                arn = found["CertificateArn"]
-                if _may_name(found, names) and _needs(account, arn, region, validation):
+            for summary in page["CertificateSummaryList"]:
+                arn = summary["CertificateArn"]
+                if _may_name(summary, names) and _needs(account, arn, region, validation):
                     yield arn
     except (ClientError, BotoCoreError):  # a region that the organization has forbidden, or that does not answer
         yield f"whatever is in {region}, where these credentials may not look"
 
 
-def _may_name(found: dict[str, Any], names: Collection[str]) -> bool:
-    listed = {found.get("DomainName", ""), *found.get("SubjectAlternativeNameSummaries", ())}
-    return bool(listed & set(names)) or bool(found.get("HasAdditionalSubjectAlternativeNames"))
+def _may_name(certificate: dict[str, Any], names: Collection[str]) -> bool:
+    listed = {certificate.get("DomainName", ""), *certificate.get("SubjectAlternativeNameSummaries", ())}
+    return bool(listed & set(names)) or bool(certificate.get("HasAdditionalSubjectAlternativeNames"))
 
 
 def _needs(account: Account, arn: str, region: str, validation: Validation) -> bool:

@@ -235,12 +235,12 @@ def check(account: Account, installation: Installation, directory: str, own: boo
         )
     if own:
         return
-    found = delegation(zone)
-    if found.problem and not found.certain:
-        screen.warning(found.problem)
-    elif found.problem:
+    servers = delegation(zone)
+    if servers.problem and not servers.certain:
+        screen.warning(servers.problem)
+    elif servers.problem:
         raise Problem(
-            f"{found.problem} So no authority can see that it is yours.",
+            f"{servers.problem} So no authority can see that it is yours.",
             f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers; then wait until "
             "that is known, which may take some hours.",
             zone.name_servers,
@@ -258,15 +258,15 @@ def check(account: Account, installation: Installation, directory: str, own: boo
         _check_caa(domain, authorities, partial(exists, account, zone))
 
 
-def _check_caa(domain: str, authorities: tuple[str, ...], known: Callable[[str], bool]) -> None:
+def _check_caa(domain: str, authorities: tuple[str, ...], exists: Callable[[str], bool]) -> None:
     """Raise `Problem` if a CAA record forbids the order: Let's Encrypt would refuse it, and count a failure."""
     for name in names_of(domain):
-        found = caa.find(name.removeprefix("*."), known)
-        if forbidding := found.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
+        record = caa.find(name.removeprefix("*."), exists)
+        if forbidding := record.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
             raise Problem(
-                f"A CAA record of {found.where} does not let {authorities[0]} issue certificates for {name}.",
-                f'Add a CAA record to {found.where}: 0 issuewild "{authorities[0]}".',
-                [f'{found.where} CAA 0 {tag} "{value}"' for tag, value in forbidding],
+                f"A CAA record of {record.where} does not let {authorities[0]} issue certificates for {name}.",
+                f'Add a CAA record to {record.where}: 0 issuewild "{authorities[0]}".',
+                [f'{record.where} CAA 0 {tag} "{value}"' for tag, value in forbidding],
             )
 
 
@@ -382,8 +382,8 @@ def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
 
 
 def _authority(directory: str) -> str:
-    known = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
-    return known.get(directory) or f"The certificate authority {urlsplit(directory).hostname}"
+    names = {PRODUCTION: "Let's Encrypt", STAGING: "Let's Encrypt (staging)"}
+    return names.get(directory) or f"The certificate authority {urlsplit(directory).hostname}"
 
 
 def _until(until: datetime | None) -> str:

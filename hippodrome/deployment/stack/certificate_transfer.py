@@ -43,7 +43,9 @@ def take_over(account: Account, installation: Installation) -> StoredCertificate
             stored_certificates.append((stored, bucket, body))
     if not stored_certificates:
         return None
-    stored, bucket, body = max(stored_certificates, key=lambda one: (one[0].directory == PRODUCTION, one[0].not_after))
+    stored, bucket, body = max(
+        stored_certificates, key=lambda candidate: (candidate[0].directory == PRODUCTION, candidate[0].not_after)
+    )
     _write(documents, ACCOUNT, _read(account, bucket, ACCOUNT))
     if not _write(documents, privkey, body):
         return None

@@ -91,9 +91,9 @@ def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
     Raises `Problem` if a setting is missing or refused, the functions cannot be built, or the stack is of others.
     """
     stack, bucket = Stack(account, name), CodeBucket(account, name)
-    found = stack.describe()
+    existing = stack.describe()
     source = Template.read().for_region(account.region)
-    parameters = settings.parameters(account, source.defaults, parameters_of(found), bucket.name, _subnets(found))
+    parameters = settings.parameters(account, source.defaults, parameters_of(existing), bucket.name, _subnets(existing))
     wrong = [f"{option(name)} {parameters[name]!r} {what}" for name, what in source.refused(parameters)]
     if account.region in regions.WITHOUT_BUDGETS and parameters.get("MonthlyBudget", "0") != "0":
         wrong.append(f"--budget must be 0 in {account.region}: make it in the console, Billing and Cost Management")
@@ -102,12 +102,12 @@ def prepare(account: Account, name: str, settings: StackSettings) -> Prepared:
     functions = build.functions(Target.from_env())
     template = source.with_code(functions)
     used = [function for function in functions if function.name in source.functions]
-    return Prepared(account, stack, found, template, used, parameters, bucket)
+    return Prepared(account, stack, existing, template, used, parameters, bucket)
 
 
-def _subnets(found: Mapping[str, Any] | None) -> list[str]:
+def _subnets(stack: Mapping[str, Any] | None) -> list[str]:
     """Return the ids in the output `Subnets` of a described stack; empty if it has none."""
-    outputs = {one["OutputKey"]: one["OutputValue"] for one in (found or {}).get("Outputs", ())}
+    outputs = {output["OutputKey"]: output["OutputValue"] for output in (stack or {}).get("Outputs", ())}
     return [name for name in outputs.get("Subnets", "").split(",") if name]
 
 
@@ -147,16 +147,16 @@ def change_set(prepared: Prepared, keep: bool) -> Iterator[ChangeSet]:
                 "Nothing was changed. Put that right, and run the same command again.",
             ) from None
         raise
-    made = ChangeSet(answer["Id"], answer["StackId"])
-    kept = False
+    changes = ChangeSet(answer["Id"], answer["StackId"])
+    is_kept = False
     try:
-        made.changes = _wait(client, made)
-        made.warnings = _findings(client, made, "WARN")
-        yield made
-        kept = keep and bool(made.changes)
+        changes.changes = _wait(client, changes)
+        changes.warnings = _findings(client, changes, "WARN")
+        yield changes
+        is_kept = keep and bool(changes.changes)
     finally:
-        if not kept:
-            _discard(client, made, prepared)
+        if not is_kept:
+            _discard(client, changes, prepared)
 
 
 def _wait(client: Any, change_set: ChangeSet) -> list[dict[str, Any]]:
@@ -190,17 +190,17 @@ def _findings(client: Any, change_set: ChangeSet, mode: str) -> list[str]:
     `mode` is FAIL for findings that made the change set fail, WARN for other ones, such as a quota that is used up
     (CloudFormation User Guide, "Validate stack deployments"; API Reference, OperationEvent).
     """
-    found: list[str] = []
+    sentences: list[str] = []
     with contextlib.suppress(ClientError):
         for page in client.get_paginator("describe_events").paginate(ChangeSetName=change_set.arn):
-            found += [
+            sentences += [
                 f"{event.get('LogicalResourceId', '')}: {event.get('ValidationStatusReason', '')}"
                 for event in page["OperationEvents"]
                 if event.get("EventType") == "VALIDATION_ERROR"
                 and event.get("ValidationFailureMode", "FAIL") == mode
                 and event.get("ValidationStatus", "FAILED") == "FAILED"  # and not SKIPPED
             ]
-    return found[:5]
+    return sentences[:5]
 
 
 def _discard(client: Any, change_set: ChangeSet, prepared: Prepared) -> None:
@@ -209,6 +209,6 @@ def _discard(client: Any, change_set: ChangeSet, prepared: Prepared) -> None:
         client.delete_change_set(ChangeSetName=change_set.arn, StackName=change_set.stack_id)
     if prepared.existing is None:
         with contextlib.suppress(ClientError):
-            found = client.describe_stacks(StackName=change_set.stack_id)["Stacks"][0]
-            if found["StackStatus"] == "REVIEW_IN_PROGRESS":
+            stack = client.describe_stacks(StackName=change_set.stack_id)["Stacks"][0]
+            if stack["StackStatus"] == "REVIEW_IN_PROGRESS":
                 client.delete_stack(StackName=change_set.stack_id)

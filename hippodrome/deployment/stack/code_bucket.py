@@ -80,7 +80,7 @@ class CodeBucket:
         """Upload the zips that the bucket does not have, and return how many."""
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             present = list(pool.map(lambda function: self._has(function.key), functions))
-        missing = [function for function, found in zip(functions, present, strict=True) if not found]
+        missing = [function for function, is_present in zip(functions, present, strict=True) if not is_present]
         if not missing:
             return 0
         with screen.ProgressBars() as bar:
@@ -119,12 +119,12 @@ class CodeBucket:
 
     def _has(self, key: str) -> bool:
         try:
-            found = self._s3.head_object(**self._owner, Key=key)
+            answer = self._s3.head_object(**self._owner, Key=key)
         except ClientError as error:
             if errors.status(error) == 404:
                 return False
             raise
-        return int(found["ContentLength"]) > 0
+        return int(answer["ContentLength"]) > 0
 
     def _tagged(self) -> bool:
         try:

@@ -38,13 +38,13 @@ def remaining(account: Account, stack: str) -> float:
     pages = client.get_paginator("list_stacks").paginate()
     answers = list(pages)
     now = _now(answers[-1] if answers else {})
-    found = [one for page in answers for one in page["StackSummaries"] if one["StackName"] == stack]
-    found.sort(key=_last_change, reverse=True)
-    left = [0.0]
-    for one in found[:_STACKS]:
-        for kind, at in _deleted(client, one["StackId"], now):
-            left.append(KEPT[kind] + MARGIN - (now - at).total_seconds())
-    return min(max(left), max(KEPT.values()) + MARGIN)
+    stacks = [summary for page in answers for summary in page["StackSummaries"] if summary["StackName"] == stack]
+    stacks.sort(key=_last_change, reverse=True)
+    seconds = [0.0]
+    for summary in stacks[:_STACKS]:
+        for kind, at in _deleted(client, summary["StackId"], now):
+            seconds.append(KEPT[kind] + MARGIN - (now - at).total_seconds())
+    return min(max(seconds), max(KEPT.values()) + MARGIN)
 
 
 def wait(account: Account, stack: str) -> None:
@@ -52,12 +52,12 @@ def wait(account: Account, stack: str) -> None:
     executor = Executor()
     title = "EventBridge is still deleting the timers of an earlier stack: waiting for that"
     executor.wait(lambda: _group_is_deleting(account, stack), LONGEST, pause=PAUSE, title=title)
-    left = round(remaining(account, stack))
-    if left <= 0:
+    seconds_left = round(remaining(account, stack))
+    if seconds_left <= 0:
         return
     with screen.ProgressBars() as bar:
-        task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {left} s", total=left)
-        for _ in range(left):
+        task = bar.add_task(f"AWS keeps the names of deleted queues for a minute: {seconds_left} s", total=seconds_left)
+        for _ in range(seconds_left):
             executor.sleep(1)
             bar.advance(task)
 

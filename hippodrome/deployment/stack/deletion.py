@@ -82,19 +82,20 @@ class StackDeletion:
         """Wait until ACM lists nothing that uses the certificate. Raises `Problem` after `IN_USE` seconds."""
 
         def users() -> list[str]:
-            found = acm_records.in_use_by(self._account, arn)
-            if others := [one for one in found if _is_other_use(self._account, one)]:
+            arns = acm_records.in_use_by(self._account, arn)
+            if others := [arn_of_user for arn_of_user in arns if _is_other_use(self._account, arn_of_user)]:
                 raise Problem(
                     f"The site's certificate is used by {', '.join(others)}.",
                     "Take the certificate away from there, and run the same command again.",
                 )
-            return found
+            return arns
 
         title = "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes"
         # ACM's list of uses and its refusals to delete need not agree at once.
-        if left := self._until_none(users, title, IN_USE, disagreeing=DISAGREEING):
+        if users_now := self._until_none(users, title, IN_USE, disagreeing=DISAGREEING):
             raise Problem(
-                f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by {', '.join(left)}.",
+                f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by "
+                f"{', '.join(users_now)}.",
                 "Run the same command later; it goes on from here. If that lasts for a day, only AWS's support can "
                 "release it. It costs nothing.",
             )
@@ -111,19 +112,21 @@ class StackDeletion:
 
         def interfaces() -> list[str]:
             pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
-            found = [interface for page in pages for interface in page["NetworkInterfaces"]] if where["Values"] else []
-            for one in found:
+            all_interfaces = (
+                [interface for page in pages for interface in page["NetworkInterfaces"]] if where["Values"] else []
+            )
+            for one in all_interfaces:
                 if instance := one.get("Attachment", {}).get("InstanceId"):
                     raise Problem(
                         f"The instance {instance} is in the network of the installation.",
                         "It is not Hippodrome's: remove it, and run the same command again.",
                     )
-            return [str(one["NetworkInterfaceId"]) for one in found]
+            return [str(interface["NetworkInterfaceId"]) for interface in all_interfaces]
 
         title = "The addresses of servers that have ended are in use for up to 20 minutes"
-        if left := self._until_none(interfaces, title, NETWORK_IN_USE, disagreeing=PAUSE):
+        if interfaces_left := self._until_none(interfaces, title, NETWORK_IN_USE, disagreeing=PAUSE):
             raise Problem(
-                f"After {duration(NETWORK_IN_USE)} the network still has the interfaces {', '.join(left)}.",
+                f"After {duration(NETWORK_IN_USE)} the network still has the interfaces {', '.join(interfaces_left)}.",
                 "See in the EC2 console what they belong to, remove that, and run the same command again.",
             )
         guardduty.remove_groups(client, vpcs)

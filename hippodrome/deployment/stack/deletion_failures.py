@@ -112,15 +112,15 @@ def recovery_from(failure: FailedResource) -> Recovery | None:
     """Find what helps against this failure; None if it does not pass and no command can mend it."""
     if _DENIED.search(failure.reason):
         return None
-    for known in TABLE:
-        if (not known.types or re.fullmatch(known.types, failure.type)) and re.search(
-            known.says, failure.reason, re.IGNORECASE
+    for row in TABLE:
+        if (not row.types or re.fullmatch(row.types, failure.type)) and re.search(
+            row.says, failure.reason, re.IGNORECASE
         ):
-            return known.recovery
+            return row.recovery
     return None
 
 
 def recoveries(failures: Iterable[FailedResource]) -> list[Recovery]:
     """Find what helps against these failures, each once; empty if nothing helps against one of them."""
-    found = [recovery_from(failure) for failure in failures]
-    return [] if None in found else list(dict.fromkeys(recovery for recovery in found if recovery))
+    all_recoveries = [recovery_from(failure) for failure in failures]
+    return [] if None in all_recoveries else list(dict.fromkeys(recovery for recovery in all_recoveries if recovery))

@@ -125,9 +125,9 @@ def _before(prepared: Prepared) -> Installation | None:
     """Return the present installation; None if there is none, or it is not complete."""
     if prepared.existing is None:
         return None
-    found = Installation.of(prepared.account, prepared.existing)
+    installation = Installation.of(prepared.account, prepared.existing)
     try:
-        return found if found.env else None
+        return installation if installation.env else None
     except Problem:
         return None
 
@@ -139,10 +139,10 @@ def _running(account: Account, installation: Installation) -> list[Server]:
 
 def _must_not_be_delegated(account: Account, zone: str, domain: str) -> None:
     """Raise `Problem` if the zone delegates this domain, since the zone's records for it are not used then."""
-    found = account.client("route53").list_resource_record_sets(
+    records = account.client("route53").list_resource_record_sets(
         HostedZoneId=zone, StartRecordName=f"{domain}.", StartRecordType="NS", MaxItems="1"
     )
-    for record in found["ResourceRecordSets"]:
+    for record in records["ResourceRecordSets"]:
         if record["Type"] == "NS" and record["Name"].rstrip(".").lower() == domain:
             raise Problem(
                 f"Names below {domain} are answered elsewhere: the zone delegates them.",

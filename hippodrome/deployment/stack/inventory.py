@@ -57,32 +57,34 @@ def stacks(account: Account, stack: str) -> list[Mapping[str, Any]]:
     """
     client = account.client("cloudformation")
     pages = client.get_paginator("list_stacks").paginate()
-    found = [one for page in pages for one in page["StackSummaries"] if one["StackName"] == stack]
-    found.sort(key=lambda one: one["StackStatus"] == "DELETE_COMPLETE")
-    described = [_described(client, one["StackId"]) for one in found[:REMEMBERED]]
-    return [one for one in described if one and is_ours(one)]  # a stack of others may have had the name
+    summaries = [summary for page in pages for summary in page["StackSummaries"] if summary["StackName"] == stack]
+    summaries.sort(key=lambda summary: summary["StackStatus"] == "DELETE_COMPLETE")
+    described = [_described(client, summary["StackId"]) for summary in summaries[:REMEMBERED]]
+    return [
+        stack_described for stack_described in described if stack_described and is_ours(stack_described)
+    ]  # a stack of others may have had the name
 
 
 def _described(client: Any, stack_id: str) -> Mapping[str, Any] | None:
     """Describe a stack, also a deleted one; None if CloudFormation does not know it any more."""
     try:
-        found: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
+        stack: Mapping[str, Any] = client.describe_stacks(StackName=stack_id)["Stacks"][0]
     except ClientError as error:
         if is_no_stack(error):
             return None
         raise
-    return found
+    return stack
 
 
 def resources(account: Account, described: Iterable[Mapping[str, Any]]) -> list[Resource]:
     """List the resources of these installations, which `stacks` has described, each once."""
-    found = [
+    resources = [
         Resource(resource["ResourceType"], resource["PhysicalResourceId"])
         for stack in described
         for resource in Stack(account, stack["StackName"]).resources(stack["StackId"])
         if resource.get("PhysicalResourceId")
     ]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(resources))
 
 
 class Addresses(NamedTuple):
@@ -96,32 +98,32 @@ class Addresses(NamedTuple):
 
 def addresses(described: Iterable[Mapping[str, Any]]) -> list[Addresses]:
     """Return the domains of these installations, each once."""
-    found = []
+    all_addresses = []
     for parameters in map(parameters_of, described):
         zone, root, host = (parameters.get(name, "") for name in ("HostedZoneId", "RootDomain", "SiteHost"))
         if zone and root:
             site = site_host(parameters) if host else ""
-            found.append(Addresses(zone, root, site, servers_domain(parameters)))
-    return list(dict.fromkeys(found))
+            all_addresses.append(Addresses(zone, root, site, servers_domain(parameters)))
+    return list(dict.fromkeys(all_addresses))
 
 
-def still_there(account: Account, wanted: Iterable[Resource]) -> list[ListedResource]:
+def still_there(account: Account, resources: Iterable[Resource]) -> list[ListedResource]:
     """Find which resources of `wanted` exist, by one listing for each type.
 
     Skips types that are not in `LISTINGS`.
     """
     by_type: dict[str, set[str]] = {}
-    for resource in wanted:
+    for resource in resources:
         by_type.setdefault(resource.type, set()).add(resource.physical_id)
-    found = []
+    remaining = []
     for type_, ids in sorted(by_type.items()):
         if type_ in LISTINGS:
             listing = LISTINGS[type_]
             listed = set(_list(account, listing))
             if type_ == "AWS::ECS::Cluster":  # AWS lists ARNs, and CloudFormation names
                 listed = {arn.rpartition("/")[2] for arn in listed}
-            found += [ListedResource(listing.kind, one) for one in sorted(ids & listed)]
-    return found
+            remaining += [ListedResource(listing.kind, listed_id) for listed_id in sorted(ids & listed)]
+    return remaining
 
 
 def _list(account: Account, listing: Listing) -> Iterator[str]:
@@ -193,12 +195,12 @@ def log_groups(account: Account, stack: str) -> list[str]:
     ]
 
 
-def data_buckets(account: Account, stack: str, known: Iterable[Resource] = ()) -> list[str]:
+def data_buckets(account: Account, stack: str, resources: Iterable[Resource] = ()) -> list[str]:
     """Return the existing data buckets of the stack, and of earlier stacks of that name in this region.
 
     Such a bucket is among the `known` resources that CloudFormation lists, or has the stack's tag, which stays longer.
     """
-    remembered = {one.physical_id for one in known if one.type == "AWS::S3::Bucket"}
+    remembered = {resource.physical_id for resource in resources if resource.type == "AWS::S3::Bucket"}
     buckets = [str(bucket["Name"]) for bucket in account.client("s3").list_buckets()["Buckets"]]
     prefix = resource_names.bucket_prefix(stack)
     code_bucket = resource_names.code_bucket(stack, account.id, account.region)
@@ -216,7 +218,9 @@ def server_names(account: Account, where: Addresses) -> list[str]:
     settings = {"ROOT_DOMAIN": where.root, "HOSTED_ZONE_ID": where.zone}
     host = where.servers.removesuffix(where.root).rstrip(".")
     try:
-        return [one.name for one in Route53Dns(lambda: account.client("route53"), settings.__getitem__, host).list()]
+        return [
+            record.name for record in Route53Dns(lambda: account.client("route53"), settings.__getitem__, host).list()
+        ]
     except ClientError as error:
         if errors.code(error) == "NoSuchHostedZone":
             return []
@@ -231,7 +235,7 @@ name."""
 def service_roles(account: Account) -> list[str]:
     """Return the names of the roles that AWS makes for the whole account (`SERVICE_ROLES`), if they exist."""
     iam = account.client("iam")
-    found = []
+    roles = []
     for name in SERVICE_ROLES:
         try:
             iam.get_role(RoleName=name)
@@ -239,14 +243,14 @@ def service_roles(account: Account) -> list[str]:
             if errors.code(error) != "NoSuchEntity":
                 raise
         else:
-            found.append(name)
-    return found
+            roles.append(name)
+    return roles
 
 
 def stored(account: Account, bucket: str) -> int:
     """Return the bytes of all versions in a bucket; only of the first `MEASURED` versions if there are more."""
-    found = VersionedBucket(account, bucket).versions()
-    return sum(version.size for version in itertools.islice(found, MEASURED))
+    versions = VersionedBucket(account, bucket).versions()
+    return sum(version.size for version in itertools.islice(versions, MEASURED))
 
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:
@@ -265,9 +269,9 @@ def mark(account: Account, bucket: str, stack: str) -> None:
     """
     tags = _tags(account, bucket)
     if TAG not in tags and bucket_exists(account, bucket):
-        wanted = [{"Key": key, "Value": value} for key, value in (tags | {TAG: stack}).items()]
+        tag_list = [{"Key": key, "Value": value} for key, value in (tags | {TAG: stack}).items()]
         s3 = account.client("s3")
-        s3.put_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id, Tagging={"TagSet": wanted})
+        s3.put_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id, Tagging={"TagSet": tag_list})
 
 
 def _tags(account: Account, bucket: str) -> dict[str, str]:
@@ -291,8 +295,8 @@ def bucket_exists(account: Account, name: str) -> bool:
 
 def cluster_exists(account: Account, name: str) -> bool:
     """Whether the ECS cluster exists. A deleted one stays visible for a while, as INACTIVE."""
-    found = account.client("ecs").describe_clusters(clusters=[name])["clusters"]
-    return any(cluster.get("status") != "INACTIVE" for cluster in found)
+    clusters_found = account.client("ecs").describe_clusters(clusters=[name])["clusters"]
+    return any(cluster.get("status") != "INACTIVE" for cluster in clusters_found)
 
 
 _TAGGED = {  # services, by their names in ARNs, whose resources only the tagging API lists here
@@ -305,13 +309,13 @@ _TAGGED = {  # services, by their names in ARNs, whose resources only the taggin
 def tagged(account: Account, stack: str) -> list[ListedResource]:
     """Find resources with the stack's tag that no listing finds, by the tagging API, which learns of changes late."""
     client = account.client("resourcegroupstaggingapi")
-    found = []
+    arns = []
     try:
         for page in client.get_paginator("get_resources").paginate(TagFilters=[{"Key": TAG, "Values": [stack]}]):
-            for one in page["ResourceTagMappingList"]:
-                arn = one["ResourceARN"]
+            for mapping in page["ResourceTagMappingList"]:
+                arn = mapping["ResourceARN"]
                 if arn.split(":")[2] in _TAGGED:
-                    found.append(ListedResource("tagged", arn))
+                    arns.append(ListedResource("tagged", arn))
     except ClientError:  # these credentials may not ask, or the region has no such API
         return []
-    return found
+    return arns

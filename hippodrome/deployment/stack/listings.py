@@ -89,12 +89,12 @@ AWS::ECS::TaskDefinition | ECS task definition | ecs
 
 
 def _read(table: str) -> dict[str, Listing]:
-    found, lines = {}, table.strip().splitlines()
+    listings, lines = {}, table.strip().splitlines()
     for first, second in zip(lines[::2], lines[1::2], strict=True):
         type_, kind, service = first.split(" | ")
         operation, path, remove = second.strip().split(" | ")
-        found[type_] = Listing(kind, service, operation, path, remove, _COSTS.get(kind, "nothing"))
-    return found
+        listings[type_] = Listing(kind, service, operation, path, remove, _COSTS.get(kind, "nothing"))
+    return listings
 
 
 _ALL = _read(_TABLE)

@@ -32,22 +32,22 @@ class PolicyAttachments(NamedTuple):
     @property
     def whom(self) -> str:
         """The users, groups and roles, in words: `the user ada, the group lab`."""
-        named = (("user", self.users), ("group", self.groups), ("role", self.roles))
-        return ", ".join(f"the {kind} {name}" for kind, names in named for name in names)
+        kinds = (("user", self.users), ("group", self.groups), ("role", self.roles))
+        return ", ".join(f"the {kind} {name}" for kind, names in kinds for name in names)
 
 
 def attached(account: Account, arn: str, usage: str = "PermissionsPolicy") -> PolicyAttachments:
     """Ask IAM who has the policy; with `usage` PermissionsBoundary, whose boundary it is. Empty if it is gone."""
-    found: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
+    by_kind: dict[str, list[str]] = {"User": [], "Group": [], "Role": []}
     pages = account.client("iam").get_paginator("list_entities_for_policy")
     try:
         for page in pages.paginate(PolicyArn=arn, PolicyUsageFilter=usage):
-            for kind, names in found.items():
-                names += [one[f"{kind}Name"] for one in page.get(f"Policy{kind}s", ())]
+            for kind, names in by_kind.items():
+                names += [principal[f"{kind}Name"] for principal in page.get(f"Policy{kind}s", ())]
     except ClientError as error:
         if errors.code(error) != _MISSING:
             raise
-    return PolicyAttachments(arn.rsplit("/", 1)[-1], *(tuple(dict.fromkeys(names)) for names in found.values()))
+    return PolicyAttachments(arn.rsplit("/", 1)[-1], *(tuple(dict.fromkeys(names)) for names in by_kind.values()))
 
 
 def must_be_no_boundary(account: Account, arn: str) -> None:
@@ -71,24 +71,24 @@ def _bound(entity: Mapping[str, Any], arn: str) -> bool:
 def detach(account: Account, arn: str) -> PolicyAttachments:
     """Detach the policy, delete its other versions, and return who had it. Raises `Problem` if it is a boundary."""
     must_be_no_boundary(account, arn)
-    found = attached(account, arn)
+    by_kind = attached(account, arn)
     iam = account.client("iam")
-    for name in found.users:
+    for name in by_kind.users:
         _quietly(iam.detach_user_policy, UserName=name, PolicyArn=arn)
-    for name in found.groups:
+    for name in by_kind.groups:
         _quietly(iam.detach_group_policy, GroupName=name, PolicyArn=arn)
-    for name in found.roles:
+    for name in by_kind.roles:
         _quietly(iam.detach_role_policy, RoleName=name, PolicyArn=arn)
     for version in _other_versions(iam, arn):
         _quietly(iam.delete_policy_version, PolicyArn=arn, VersionId=version)
-    return found
+    return by_kind
 
 
 def free_role(account: Account, name: str) -> None:
     """Detach all managed policies of a role, and delete its inline policies; people may have added such policies."""
     iam = account.client("iam")
     try:
-        given = [
+        policies = [
             attached_policy["PolicyArn"]
             for page in iam.get_paginator("list_attached_role_policies").paginate(RoleName=name)
             for attached_policy in page["AttachedPolicies"]
@@ -102,7 +102,7 @@ def free_role(account: Account, name: str) -> None:
         if errors.code(error) == _MISSING:
             return
         raise
-    for arn in given:
+    for arn in policies:
         _quietly(iam.detach_role_policy, RoleName=name, PolicyArn=arn)
     for policy in own:
         _quietly(iam.delete_role_policy, RoleName=name, PolicyName=policy)

@@ -36,7 +36,14 @@ _PARAMETERS = {  # setting → the template's parameter that gets its value unch
 
 def option(parameter: str) -> str:
     """Return the option that sets a parameter of the template; the parameter's name if there is no such option."""
-    return next((f"--{name.replace('_', '-')}" for name, one in _PARAMETERS.items() if one == parameter), parameter)
+    return next(
+        (
+            f"--{name.replace('_', '-')}"
+            for name, name_of_parameter in _PARAMETERS.items()
+            if name_of_parameter == parameter
+        ),
+        parameter,
+    )
 
 
 @dataclass(frozen=True)
@@ -100,8 +107,8 @@ class StackSettings:
 
         `subnets` are the present installation's. Raises `Problem` if a value is missing, or values do not fit together.
         """
-        found = {name: value for name, value in defaults.items() if value is not None}
-        found |= {name: value for name, value in previous.items() if name in defaults}
+        values_given = {name: value for name, value in defaults.items() if value is not None}
+        values_given |= {name: value for name, value in previous.items() if name in defaults}
         for setting, parameter in _PARAMETERS.items():
             value = getattr(self, setting)
             if value is not None:
@@ -110,32 +117,34 @@ class StackSettings:
                         f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.",
                         "Leave that option out, or take infra/template.yml from the repository again.",
                     )
-                found[parameter] = str(value).strip()
-        if found.get("SiteHost") and found.get("SiteHost") == found.get("ServersHost"):
+                values_given[parameter] = str(value).strip()
+        if values_given.get("SiteHost") and values_given.get("SiteHost") == values_given.get("ServersHost"):
             raise Problem(
-                f"--site and --servers are both {found['SiteHost']}.",
+                f"--site and --servers are both {values_given['SiteHost']}.",
                 "Servers get their names beside the site: give two.",
             )
-        found["SubnetIds"] = ",".join(part.strip() for part in found.get("SubnetIds", "").split(",") if part.strip())
-        if bool(found.get("VpcId")) != bool(found["SubnetIds"]):
+        values_given["SubnetIds"] = ",".join(
+            part.strip() for part in values_given.get("SubnetIds", "").split(",") if part.strip()
+        )
+        if bool(values_given.get("VpcId")) != bool(values_given["SubnetIds"]):
             raise Problem(
                 "--vpc and --subnets go together.", "Give both, or both as '' for a VPC of the installation's."
             )
-        found |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
+        values_given |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
         limit = concurrency.unreserved_or_none(account) if concurrency.PARAMETER in defaults else None
         if limit is not None:
-            found |= concurrency.parameters(limit)
-        if found["RootDomain"]:
-            _check_site(site_host(found))
+            values_given |= concurrency.parameters(limit)
+        if values_given["RootDomain"]:
+            _check_site(site_host(values_given))
         if set(availability_zones.PARAMETERS) <= set(defaults):
-            found |= _zones(account, found, previous, subnets)
-        missing = sorted(set(defaults) - set(found))
+            values_given |= _zones(account, values_given, previous, subnets)
+        missing = sorted(set(defaults) - set(values_given))
         if missing:
             raise Problem(
                 f"The template wants values that no option gives: {', '.join(missing)}.",
                 "Give these parameters a Default in infra/template.yml, or take the file from the repository again.",
             )
-        return {name: value for name, value in found.items() if name in defaults}
+        return {name: value for name, value in values_given.items() if name in defaults}
 
     def _addresses(self, account: Account, previous: Mapping[str, str]) -> dict[str, str]:
         before = previous.get("RootDomain", "")

@@ -91,8 +91,8 @@ class Stack:
     @property
     def status(self) -> str:
         """The stack's state; "" if there is none."""
-        found = self.describe()
-        return str(found["StackStatus"]) if found else ""
+        stack = self.describe()
+        return str(stack["StackStatus"]) if stack else ""
 
     def template(self) -> str:
         """Return the text of the stack's template; "" if it is JSON, so not Hippodrome's."""
@@ -163,17 +163,17 @@ class Stack:
 
     def operation(self, stack_id: str) -> Operation:
         """Read the latest operation on the stack from its events."""
-        found = Operation()
+        operation = Operation()
         for event in reversed([*self._events(stack_id)]):
             if self._is_own(event):
                 continue
             name, status = event["LogicalResourceId"], event["ResourceStatus"]
-            found.states[name] = status
+            operation.states[name] = status
             reason = str(event.get("ResourceStatusReason", ""))
             if status.endswith("_FAILED") and not _CONSEQUENCE.search(reason):
                 physical = str(event.get("PhysicalResourceId", ""))
-                found.failures.append(FailedResource(name, event["ResourceType"], physical, reason))
-        return found
+                operation.failures.append(FailedResource(name, event["ResourceType"], physical, reason))
+        return operation
 
     def _events(self, stack_id: str) -> Iterator[Mapping[str, Any]]:
         """Yield the events of the latest operation, newest first."""
@@ -205,10 +205,10 @@ class Stack:
 
     def attach(self) -> None:
         """If an operation on the stack is under way, show it until it ends."""
-        found = self.describe()
-        if found and states.action_for(str(found["StackStatus"])) is StackAction.WAIT:
-            screen.info(f"The stack {self.name} is in {found['StackStatus']}: waiting for that first.")
-            self.follow("Waiting for CloudFormation", found["StackId"])
+        stack = self.describe()
+        if stack and states.action_for(str(stack["StackStatus"])) is StackAction.WAIT:
+            screen.info(f"The stack {self.name} is in {stack['StackStatus']}: waiting for that first.")
+            self.follow("Waiting for CloudFormation", stack["StackId"])
 
     def settle(self) -> None:
         """Wait for the present operation, and roll back a failed update, so that the stack can be changed.
@@ -216,43 +216,43 @@ class Stack:
         Raises `Problem` if only the administrator can decide what to do.
         """
         self.attach()
-        found = self.describe()
-        status = str(found["StackStatus"]) if found else ""
+        stack = self.describe()
+        status = str(stack["StackStatus"]) if stack else ""
         act = states.action_for(status)
         if act is StackAction.STOP:
             raise states.problem(self.name, status)
-        if found and act in {StackAction.ROLL_BACK, StackAction.CONTINUE}:
-            self._take_back(found, act)
+        if stack and act in {StackAction.ROLL_BACK, StackAction.CONTINUE}:
+            self._take_back(stack, act)
 
-    def _take_back(self, found: Mapping[str, Any], act: StackAction) -> None:
+    def _take_back(self, stack: Mapping[str, Any], act: StackAction) -> None:
         """Roll back an update that failed, or go on with a rollback that failed."""
         if act is StackAction.ROLL_BACK:
             screen.info(
-                f"An update of {self.name} failed and was left as it is ({found['StackStatus']}): back to before."
+                f"An update of {self.name} failed and was left as it is ({stack['StackStatus']}): back to before."
             )
             begin = self._client.rollback_stack
         else:
             screen.info(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
             begin = self._client.continue_update_rollback
-        after = self.last_event(found["StackId"])
+        after = self.last_event(stack["StackId"])
         begin(StackName=self.name)
-        status = self.follow("Taking back the update", found["StackId"], after=after)
+        status = self.follow("Taking back the update", stack["StackId"], after=after)
         if states.action_for(status) is not StackAction.UPDATE:
-            raise self.problem("The update could not be taken back", found["StackId"], status)
+            raise self.problem("The update could not be taken back", stack["StackId"], status)
 
     def delete(self, title: str = "Deleting the stack", without: Sequence[str] = ()) -> None:
         """Delete the stack and wait. Raises `NotDeleted` if that fails, `Problem` if the stack is protected.
 
         `without`: logical ids of resources that could not be deleted before, and are now left in AWS.
         """
-        found = self.describe()
-        if not found:
+        stack = self.describe()
+        if not stack:
             return
-        self.must_not_be_protected(found)
-        stack_id, total = found["StackId"], len(self.resources())
+        self.must_not_be_protected(stack)
+        stack_id, total = stack["StackId"], len(self.resources())
         after = self.last_event(stack_id)
         try:
-            if without and found["StackStatus"] == "DELETE_FAILED":  # RetainResources is allowed in no other state
+            if without and stack["StackStatus"] == "DELETE_FAILED":  # RetainResources is allowed in no other state
                 self._client.delete_stack(StackName=self.name, RetainResources=[*without])
             else:
                 self._client.delete_stack(StackName=self.name)
@@ -267,9 +267,9 @@ class Stack:
             problem = self.problem(f"The stack {self.name} could not be deleted", stack_id, status)
             raise NotDeleted(problem, self.operation(stack_id).failures)
 
-    def must_not_be_protected(self, found: Mapping[str, Any]) -> None:
+    def must_not_be_protected(self, stack: Mapping[str, Any]) -> None:
         """Raise `Problem` if the stack's termination protection is on."""
-        if found.get("EnableTerminationProtection"):
+        if stack.get("EnableTerminationProtection"):
             raise Problem(
                 f"The stack {self.name} is protected against deletion (termination protection).",
                 "If it may go, take that away: aws cloudformation update-termination-protection "

@@ -83,10 +83,10 @@ def definition(
     }
 
 
-def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
+def find(account: Account, definition: Mapping[str, Any]) -> str | None:
     """Find the family's newest revision if it is active and has this content. Return its ARN, or None."""
     try:
-        task_definition = account.client("ecs").describe_task_definition(taskDefinition=wanted["family"])[
+        task_definition = account.client("ecs").describe_task_definition(taskDefinition=definition["family"])[
             "taskDefinition"
         ]
     except ClientError as error:
@@ -95,15 +95,15 @@ def find(account: Account, wanted: Mapping[str, Any]) -> str | None:
         raise
     if task_definition.get("status", "ACTIVE") != "ACTIVE":
         return None
-    same = _contains(task_definition, wanted) and _secrets(task_definition) == _secrets(wanted)
+    same = _contains(task_definition, definition) and _secrets(task_definition) == _secrets(definition)
     return str(task_definition["taskDefinitionArn"]) if same else None
 
 
-def register(account: Account, installation: Installation, project_id: str, wanted: Mapping[str, Any]) -> str:
+def register(account: Account, installation: Installation, project_id: str, definition: Mapping[str, Any]) -> str:
     """Register a new revision, and return its ARN."""
     tags = {TAG: installation.stack, "hippodrome:project": project_id}
     answer = account.client("ecs").register_task_definition(
-        **wanted, tags=[{"key": key, "value": value} for key, value in tags.items()]
+        **definition, tags=[{"key": key, "value": value} for key, value in tags.items()]
     )
     return str(answer["taskDefinition"]["taskDefinitionArn"])
 
@@ -120,14 +120,14 @@ def _secrets(found: Mapping[str, Any]) -> list[str]:
     return [secret["name"] for container in found["containerDefinitions"] for secret in container.get("secrets") or ()]
 
 
-def _contains(found: Any, wanted: Any) -> bool:
+def _contains(found: Any, pattern: Any) -> bool:
     """Whether `found` has all values of `wanted`. ECS adds values that were left out, such as host ports."""
-    if isinstance(wanted, Mapping):
-        return isinstance(found, Mapping) and all(_contains(found.get(key), value) for key, value in wanted.items())
-    if isinstance(wanted, Sequence) and not isinstance(wanted, str):
+    if isinstance(pattern, Mapping):
+        return isinstance(found, Mapping) and all(_contains(found.get(key), value) for key, value in pattern.items())
+    if isinstance(pattern, Sequence) and not isinstance(pattern, str):
         return (
             isinstance(found, Sequence)
-            and len(found) == len(wanted)
-            and all(_contains(one, other) for one, other in zip(found, wanted, strict=True))
+            and len(found) == len(pattern)
+            and all(_contains(part, other) for part, other in zip(found, pattern, strict=True))
         )
-    return bool(found == wanted)
+    return bool(found == pattern)

@@ -60,15 +60,15 @@ def command(
     account = open_account(profile, region)
     installation = find_installation(account, stack)
     documents = account.platform(installation).documents
-    (found,) = participants.choose(participants.registered_projects(documents), selected(study).id)
-    if not found.signed_links:
-        screen.warning(f"{found.id} lets everybody in: its config.yml does not say signedLinks: true.")
-    signatures = signed(account, installation, found.id, users)
-    made = [(user, link(installation["Site"], found, user, signature)) for user, signature in signatures.items()]
+    (project,) = participants.choose(participants.registered_projects(documents), selected(study).id)
+    if not project.signed_links:
+        screen.warning(f"{project.id} lets everybody in: its config.yml does not say signedLinks: true.")
+    signatures = signed(account, installation, project.id, users)
+    rows = [(user, link(installation["Site"], project, user, signature)) for user, signature in signatures.items()]
     if as_json:
-        screen.result_json([{"userId": user, "link": address} for user, address in made])
+        screen.result_json([{"userId": user, "link": address} for user, address in rows])
     else:
-        csv.writer(sys.stdout, lineterminator="\n").writerows([("userId", "link"), *made])
+        csv.writer(sys.stdout, lineterminator="\n").writerows([("userId", "link"), *rows])
     return Exit.DONE
 
 
@@ -105,7 +105,7 @@ def _read(file: Path) -> list[str]:
 
 def _checked(lines: Iterable[str], name: str) -> list[str]:
     """The ids in these lines, without what spreadsheets add: a heading, quotes, empty cells, invisible characters."""
-    found: dict[str, None] = {}
+    users: dict[str, None] = {}
     cells = [[cell.strip(_AROUND) for cell in re.split(r"[,;\t]", line)] for line in lines]
     rows = [(number, [cell for cell in row if cell]) for number, row in enumerate(cells, 1) if any(row)]
     for at, (number, row) in enumerate(rows):
@@ -114,11 +114,11 @@ def _checked(lines: Iterable[str], name: str) -> list[str]:
         if at == 0 and _HEADING.fullmatch(row[0]):
             screen.warning(f"{name}:{number}: this line is taken as the heading of the ids, and gets no link.")
         elif ids.is_user_id(row[0]):
-            found[row[0]] = None
+            users[row[0]] = None
         elif _ROUNDED.fullmatch(row[0]):
             advice = "Give the column the format Text, and enter the ids again: the digits of this one are lost."
             raise Problem(f"{name}:{number}: a spreadsheet has made a number of this id.", advice)
         else:
             advice = "An id has letters, digits, dashes and underscores, 64 at most; one on each line, nothing else."
             raise Problem(f"{name}:{number}: that is no participant's id.", advice)
-    return list(found)
+    return list(users)

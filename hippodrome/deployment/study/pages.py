@@ -51,10 +51,10 @@ def upload(account: Account, bucket: str, changes: Changes) -> None:
             _put(documents, key, file.read_bytes())
 
 
-def remove(account: Account, bucket: str, gone: Iterable[str]) -> None:
+def remove(account: Account, bucket: str, keys: Iterable[str]) -> None:
     """Remove pages that are not in the folder any more. Call it only when no registration names them."""
     documents = _documents(account, bucket)
-    for key in gone:
+    for key in keys:
         documents.delete(key)
 
 
@@ -65,7 +65,7 @@ def _files(folder: Path) -> list[Path]:
     """
     steps = layout.pages_folder(folder)
     files = sorted(file for file in steps.iterdir() if not file.name.startswith(".")) if steps else []
-    found = []
+    page_paths = []
     for file in files:
         name = f"{file.parent.name}/{file.name}"
         if not inside(folder, file):
@@ -80,8 +80,8 @@ def _files(folder: Path) -> list[Path]:
                 f"{name} is larger than {MAX_BYTES // 1024**2} MB.",
                 "Put it on a site of its own, name that site in allowedHosts, and link to it.",
             )
-        found.append(file)
-    return found
+        page_paths.append(file)
+    return page_paths
 
 
 def _listing(account: Account, bucket: str, prefix: str) -> dict[str, Mapping[str, Any]]:
@@ -113,12 +113,12 @@ def _documents(account: Account, bucket: str) -> S3Documents:
 def _put(documents: S3Documents, key: str, body: bytes) -> None:
     """Write the page, whatever is there: of two researchers who upload the same page, the later one wins."""
     while True:
-        found = documents.get(key)
+        document = documents.get(key)
         try:
-            if found is None:
+            if document is None:
                 documents.create(key, body)
-            elif found.body != body:
-                documents.replace(key, body, found.etag)
+            elif document.body != body:
+                documents.replace(key, body, document.etag)
         except Conflict:
             continue
         return

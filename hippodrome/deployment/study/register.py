@@ -72,17 +72,17 @@ class RegisterPlan:
     @property
     def steps(self) -> list[str]:
         """The steps that `register` would take, a line for each; empty if nothing has changed."""
-        found = [f"upload {key}" for key in self.pages.put]
+        acts = [f"upload {key}" for key in self.pages.put]
         if self.image and self.image.uri is None:
             order = self.image.order
-            found.append(f"build the image {order.content} ({formatting.size(order.bundle.size)} of files)")
+            acts.append(f"build the image {order.content} ({formatting.size(order.bundle.size)} of files)")
         if self.image and self.definition is None:
-            found.append("make a new revision of the task definition")
+            acts.append("make a new revision of the task definition")
         if self.before is None:
-            found.append("register the project, which is new here")
+            acts.append("register the project, which is new here")
         elif _differs(self.before, {**self.study.registration, **self.task(self.definition)}):
-            found.append("register the project's new version")
-        return found + [f"remove {key}" for key in self.pages.gone]
+            acts.append("register the project's new version")
+        return acts + [f"remove {key}" for key in self.pages.gone]
 
     def task(self, revision: str | None) -> dict[str, Any]:
         """Return a registration's keys for this revision: the revision, and the port on which its servers listen."""
@@ -121,8 +121,8 @@ def command(
     """
     _check_qr(qr)
     if live is not False:
-        found = project_folder.read(folder)  # shows mistakes before credentials are needed
-        if qr and found.config.project.signed_links:
+        study_folder = project_folder.read(folder)  # shows mistakes before credentials are needed
+        if qr and study_folder.config.project.signed_links:
             raise Problem(*NO_QR)
     account = open_account(profile, region)
     installation = find_installation(account, stack)
@@ -143,18 +143,24 @@ def command(
 
 def plan(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> RegisterPlan:
     """Compare the folder with AWS. Changes nothing. Raises `Problem` if the project cannot be registered here."""
-    found = project_folder.read(folder, installation)
+    study_folder = project_folder.read(folder, installation)
     if request.live is not None:
-        found.registration["live"] = request.live
-    before = _registered(account, installation, found.id)
-    changes = pages.compare(account, installation["Bucket"], found.id, folder, found.config.own_pages)
-    if not found.plays:
-        return RegisterPlan(found, before, changes, None, None)
-    _must_have_secrets(account, installation, found)
-    trial = found.registration["trial"]
-    wanted = image.plan(account, installation, found.id, folder, again=request.again, base=request.base, trial=trial)
-    revision = None if wanted.uri is None else definition.find(account, _definition(installation, found, wanted.uri))
-    return RegisterPlan(found, before, changes, wanted, revision, definition.port(installation))
+        study_folder.registration["live"] = request.live
+    before = _registered(account, installation, study_folder.id)
+    changes = pages.compare(account, installation["Bucket"], study_folder.id, folder, study_folder.config.own_pages)
+    if not study_folder.plays:
+        return RegisterPlan(study_folder, before, changes, None, None)
+    _must_have_secrets(account, installation, study_folder)
+    trial = study_folder.registration["trial"]
+    image_plan = image.plan(
+        account, installation, study_folder.id, folder, again=request.again, base=request.base, trial=trial
+    )
+    revision = (
+        None
+        if image_plan.uri is None
+        else definition.find(account, _definition(installation, study_folder, image_plan.uri))
+    )
+    return RegisterPlan(study_folder, before, changes, image_plan, revision, definition.port(installation))
 
 
 def register(account: Account, installation: Installation, folder: Path, request: RegisterRequest) -> dict[str, Any]:
@@ -165,27 +171,27 @@ def register(account: Account, installation: Installation, folder: Path, request
     if request.live is False:
         _close(account, installation, folder)
     doing = plan(account, installation, folder, request)
-    found, bucket = doing.study, installation["Bucket"]
-    screen.success(f"{found.id}: {found.config.summary()}")
-    remarks_found = _remarks(folder, found)
+    study, bucket = doing.study, installation["Bucket"]
+    screen.success(f"{study.id}: {study.config.summary()}")
+    remarks_found = _remarks(folder, study)
     if remarks_found and request.strict:
         raise Problem("There are remarks on the project, and --strict was given.", "Nothing was done.", remarks_found)
     for remark in remarks_found:
         screen.warning(remark)
     _confirm(account, installation, doing, request)
-    made, revision = None, None
+    image_made, revision = None, None
     if doing.image:
-        made = image.build(doing.image, by_dockerfile=request.docker)
-        screen.success(f"Image {doing.image.order.content}: {'built' if made.built else 'there already'}")
-        wanted = _definition(installation, found, made.uri)
+        image_made = image.build(doing.image, by_dockerfile=request.docker)
+        screen.success(f"Image {doing.image.order.content}: {'built' if image_made.built else 'there already'}")
+        wanted = _definition(installation, study, image_made.uri)
         revision = doing.definition or definition.find(account, wanted)
-        known = revision is not None
-        revision = revision or definition.register(account, installation, found.id, wanted)
-        screen.success(f"Task definition {revision.rpartition('/')[2]}: {'there already' if known else 'new'}")
+        is_known = revision is not None
+        revision = revision or definition.register(account, installation, study.id, wanted)
+        screen.success(f"Task definition {revision.rpartition('/')[2]}: {'there already' if is_known else 'new'}")
     if doing.pages.put:
         pages.upload(account, bucket, doing.pages)
     screen.success(f"Pages: {len(doing.pages.put)} uploaded, {doing.pages.same} as they were")
-    registration = {**found.registration, **doing.task(revision)}
+    registration = {**study.registration, **doing.task(revision)}
     invoke(account, installation, registration)
     screen.success("Registered: the study is " + ("open" if registration["live"] else "closed"))
     _tell_warm(registration)
@@ -193,25 +199,25 @@ def register(account: Account, installation: Installation, folder: Path, request
         pages.remove(account, bucket, doing.pages.gone)
         screen.success(f"Pages removed that are not in the folder any more: {len(doing.pages.gone)}")
     return {
-        "project": found.id,
+        "project": study.id,
         "live": registration["live"],
         "signedLinks": registration["signedLinks"],
-        "link": None if registration["signedLinks"] else link(installation, found.id),
+        "link": None if registration["signedLinks"] else link(installation, study.id),
         "pages": {"uploaded": len(doing.pages.put), "same": doing.pages.same, "removed": len(doing.pages.gone)},
-        "image": made.uri if made else None,
-        "imageBuilt": made.built if made else False,
+        "image": image_made.uri if image_made else None,
+        "imageBuilt": image_made.built if image_made else False,
         "taskDefinition": revision,
     }
 
 
 def _remarks(folder: Path, found: project_folder.ProjectFolder) -> list[str]:
     """Return remarks on a project without mistakes: on its files, the installation, and with a game its packages."""
-    made = [*remarks.remarks_on(folder, found.config), *found.remarks]
+    all_remarks = [*remarks.remarks_on(folder, found.config), *found.remarks]
     if found.plays:
-        made += agent_imports.requirement_remarks(folder)
-        made += agent_imports.missing(folder)
-        made += agent_imports.missing_for_players(folder, found.config)
-    return [str(remark) for remark in made]
+        all_remarks += agent_imports.requirement_remarks(folder)
+        all_remarks += agent_imports.missing(folder)
+        all_remarks += agent_imports.missing_for_players(folder, found.config)
+    return [str(remark) for remark in all_remarks]
 
 
 def link(installation: Installation, project_id: str) -> str:
@@ -280,8 +286,8 @@ def _confirm(account: Account, installation: Installation, doing: RegisterPlan, 
     under_way = steps != had and before.live and after.registration["live"]
     if was == name and not under_way:
         return
-    found = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
-    if not found.get("KeyCount"):
+    answer = account.client("s3").list_objects_v2(Bucket=installation["Bucket"], Prefix=f"{after.id}/users/", MaxKeys=1)
+    if not answer.get("KeyCount"):
         return
     if was != name:
         question = (

@@ -137,25 +137,25 @@ class ActivityLog:
 
         Other documents are not shown.
         """
-        found, together, record = _PERSON.fullmatch(key), _SESSION.fullmatch(key), _json(body)
+        match, together, record = _PERSON.fullmatch(key), _SESSION.fullmatch(key), _json(body)
         if key.startswith("_servers/"):
             folder = folder_of(str(record.get("projectId")), str(record.get("userId")))
             self._reserved(str(record.get("warmServerName")), folder)
             self._catch_up(folder)
             self._server(record)
-        elif found and found[2] == "participant":
+        elif match and match[2] == "participant":
             self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
-            self.participant(found[1], "arrived" if group is None else f"arrived, group {group}")
-            self._show_held(found[1])
+            self.participant(match[1], "arrived" if group is None else f"arrived, group {group}")
+            self._show_held(match[1])
         elif together:
             self._plays_together(together[1], record)
-        elif found and found[2] == "session":
+        elif match and match[2] == "session":
             if record.get("unmatched"):
-                self.participant(found[1], "found no others to play with", "yellow")
-        elif found and found[2].startswith("answers/"):
+                self.participant(match[1], "found no others to play with", "yellow")
+        elif match and match[2].startswith("answers/"):
             self._catch_up(key.partition("/answers/")[0])
-            self._answer(key, found[1], record)
+            self._answer(key, match[1], record)
 
     def _plays_together(self, session_id: str, record: dict[str, Any]) -> None:
         """Show the members of a session, once. Later lines of their server have the session's id."""
@@ -164,7 +164,7 @@ class ActivityLog:
                 return
             self._shown.add(session_id)
         members = sorted(record.get("members", ()), key=lambda each: each.get("seat", 0))
-        names = ", ".join(_short(str(each.get("userId"))) for each in members)
+        names = ", ".join(_short(str(member.get("userId"))) for member in members)
         lacking = int(record.get("players", 0)) - len(members)
         rest = f"; a policy plays in {lacking} place{'s' if lacking > 1 else ''}" if lacking > 0 else ""
         self.participant(session_id, f"{names} {'play together' if len(members) > 1 else 'plays'}{rest}")

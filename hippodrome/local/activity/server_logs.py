@@ -45,12 +45,12 @@ class WatchedServer:
         if not self._folders:
             self._find_members()
             return []
-        found = []
+        answers = []
         for key in sorted(self._keys() - self._known):
             with contextlib.suppress(OSError):
-                found.append((key, (self._data / key).read_bytes()))
+                answers.append((key, (self._data / key).read_bytes()))
                 self._known.add(key)
-        return found
+        return answers
 
     def errors(self) -> list[str]:
         """Return the errors that are new in the server's log, each text once.
@@ -65,12 +65,12 @@ class WatchedServer:
             return []
         self._read += len(new)
         *lines, self._rest = (self._rest + new).split(b"\n")
-        found = []
+        errors = []
         for text in filter(None, (_begins_anew(line) or self._reader.read(line) for line in lines)):
             if text not in self._returned:
                 self._returned.add(text)
-                found.append(text)
-        return found
+                errors.append(text)
+        return errors
 
     def _keys(self) -> set[str]:
         """The keys of the answers that exist now."""
@@ -117,8 +117,8 @@ class ErrorReader:
 
 def _advice(line: str) -> str:
     """The advice of `hippodrome check` for an error, by the last line of its traceback."""
-    found = _ERROR.match(line)
-    return remedy(found["kind"], found["text"]) if found else ""
+    match = _ERROR.match(line)
+    return remedy(match["kind"], match["text"]) if match else ""
 
 
 def _begins_anew(raw: bytes) -> str:

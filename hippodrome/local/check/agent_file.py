@@ -60,7 +60,11 @@ def never_called(folder: Path, config: Config) -> list[Diagnostic]:
     found = [(method.lineno, _nearly_called(method.name, members)) for method in methods]
     if config.project.has_sessions and config.project.matching != MATCH:
         sentence = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
-        found += [(each.lineno, sentence) for each in _unused_functions(tree.body, used) if each.name == MATCH]
+        found += [
+            (unused_function.lineno, sentence)
+            for unused_function in _unused_functions(tree.body, used)
+            if unused_function.name == MATCH
+        ]
     return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in found if sentence]
 
 
@@ -100,5 +104,5 @@ def line_of(path: Path, method: str) -> int | None:
 
 def _last(body: list[ast.stmt], function: str) -> int | None:
     """The line of the last function of that name; None if there is none."""
-    found = [part.lineno for part in body if isinstance(part, ast.FunctionDef) and part.name == function]
-    return found[-1] if found else None
+    linenos = [part.lineno for part in body if isinstance(part, ast.FunctionDef) and part.name == function]
+    return linenos[-1] if linenos else None

@@ -92,7 +92,7 @@ class AgentProgress:
         """
         values = (*(("info", info) for info in infos), ("what step() returns", extra or {}))
         if "onlyText" not in self.known:
-            for where, value in (*(("an observation", each) for each in observations), *values):
+            for where, value in (*(("an observation", observation) for observation in observations), *values):
                 reader = Values(most=_LOOKED_AT, longest=_LOOKED_AT)
                 reader.keep(value)
                 if reader.only_text:

@@ -42,8 +42,8 @@ def last_line(report: str) -> dict[str, Any]:
     The process may have been killed while it wrote another line.
     """
     whole, _, _ = report.rpartition("\n")
-    found: dict[str, Any] = json.loads(whole.rpartition("\n")[2])
-    return found
+    last_line: dict[str, Any] = json.loads(whole.rpartition("\n")[2])
+    return last_line
 
 
 class AgentReport:
@@ -136,23 +136,23 @@ class AgentReport:
     def _slow_policies(self) -> list[Diagnostic]:
         """Remarks on policies that need longer for an action than they have, for the first group only."""
         trial, pace = self._config.trial, Pace(**self._report.get("pace", {}))
-        found: list[Diagnostic] = []
+        diagnostics: list[Diagnostic] = []
         for player, reported in () if self._group else self._report.get("policies", {}).items():
             each = Pace(**reported)
             if trial.pace == "turns":
-                given, why = trial.policy_seconds, f"policySeconds is {trial.policy_seconds:g}"
+                policy_seconds, why = trial.policy_seconds, f"policySeconds is {trial.policy_seconds:g}"
             else:
                 tick = 1 / trial.starting_frame_rate
-                given = max(tick - pace.usual, tick / 2)
+                policy_seconds = max(tick - pace.usual, tick / 2)
                 why = (
                     f"at startingFrameRate {trial.starting_frame_rate} a step has {1_000 * tick:.3g} ms, and takes "
                     f"{1_000 * pace.usual:.2g} itself"
                 )
-            if each.steps > 1 and each.usual > given:
+            if each.steps > 1 and each.usual > policy_seconds:
                 needs = f"{self._plays(player)} needs {1_000 * each.usual:.3g} ms for an action here"
                 message = f"{needs}; {why}, so its actions come late"
-                found.append(self._in_config(self._player(player), message, remark=True))
-        return found
+                diagnostics.append(self._in_config(self._player(player), message, remark=True))
+        return diagnostics
 
     def _forgetful(self) -> list[Diagnostic]:
         """Remarks on policies that lose their state with a server, for the first group only."""
@@ -286,8 +286,8 @@ class AgentReport:
         """Remarks on packages that were loaded here and that servers on AWS lack."""
         if not self._config.project.may_run_on_aws:
             return []
-        found = agent_imports.missing_of_loaded(self._folder, self._config, self._report.get("loaded", ()))
-        return [self._at((self._label or AGENT, None), message, remark=True) for message in found]
+        missing = agent_imports.missing_of_loaded(self._folder, self._config, self._report.get("loaded", ()))
+        return [self._at((self._label or AGENT, None), message, remark=True) for message in missing]
 
     def _failures(self, status: int | None) -> list[Diagnostic]:
         """The mistake for which the agent did not play to the end; if it did, mistakes in the number of actions."""
@@ -418,7 +418,7 @@ class AgentReport:
             found = remarks.arrows_without_an_action(self._config, names)
         arrows = [each for each in found if source.names(each.path)]
         keys = [] if self._config.trial.action_space else remarks.keys_without_an_action(self._config, names)
-        return [self._in_config(*each, remark=True) for each in (*arrows, *keys)]
+        return [self._in_config(*arrow, remark=True) for arrow in (*arrows, *keys)]
 
     def _call(self) -> str:
         """The last call, as messages name it."""

@@ -28,10 +28,10 @@ def check_answers_named(label: str, parsed: nodes.Template, earlier: EarlierAnsw
         if not isinstance(key, str):
             continue
         step = _key(inner)
-        known = earlier.fields_of(step) if isinstance(step, str) else None
-        if known is not None and key not in known:
-            has = ", ".join(known) or "no fields"
-            message = f"step {step} has no answer {short(key)}{did_you_mean(key, known)} (it has {short(has)})"
+        fields = earlier.fields_of(step) if isinstance(step, str) else None
+        if fields is not None and key not in fields:
+            has = ", ".join(fields) or "no fields"
+            message = f"step {step} has no answer {short(key)}{did_you_mean(key, fields)} (it has {short(has)})"
             yield _remark(label, node, message)
 
 

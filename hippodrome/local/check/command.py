@@ -67,18 +67,18 @@ def _say(line: str) -> None:
     sys.stdout.flush()
 
 
-def _print(found: Iterable[Diagnostic]) -> None:
-    for problem in found:
+def _print(diagnostics: Iterable[Diagnostic]) -> None:
+    for problem in diagnostics:
         sys.stdout.write(f"{problem}\n")
 
 
-def _mistakes(found: Iterable[Diagnostic]) -> list[Diagnostic]:
-    return [problem for problem in found if not problem.remark]
+def _mistakes(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
+    return [problem for problem in diagnostics if not problem.remark]
 
 
-def _summary(found: list[Diagnostic], config: Config | None) -> str:
-    mistakes = len(_mistakes(found))
-    remarks = len(found) - mistakes
+def _summary(diagnostics: list[Diagnostic], config: Config | None) -> str:
+    mistakes = len(_mistakes(diagnostics))
+    remarks = len(diagnostics) - mistakes
     counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]
     if config is None or mistakes:
         return f"{' and '.join(counts)}."

@@ -86,11 +86,13 @@ def _rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str]]:
 def _choices(file: Path, field: str) -> list[str]:
     """The values among which participants choose for a field; none if they may type, or if Jinja fills them in."""
     text = file.read_text(encoding="utf-8", errors="replace")
-    controls = [each for form in forms.read(f"<form>{text}</form>") for each in form.controls if each.name == field]
-    if any(each.kind not in ("radio", "select") for each in controls):
+    controls = [
+        control for form in forms.read(f"<form>{text}</form>") for control in form.controls if control.name == field
+    ]
+    if any(control.kind not in ("radio", "select") for control in controls):
         return []
-    values = [each.value or "on" for each in controls if each.kind == "radio"]
-    values += [option.value for each in controls for option in each.options if option.value]
+    values = [control.value or "on" for control in controls if control.kind == "radio"]
+    values += [option.value for control in controls for option in control.options if option.value]
     return [] if any("{" in value for value in values) else list(dict.fromkeys(values))
 
 

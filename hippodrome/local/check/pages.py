@@ -36,7 +36,7 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
     except StepFileError:
         return []
     of_hippo = steps.path.name != PAGES[0]  # HIPPO shows its pages whatever is wrong in them, and so do we
-    found: list[Diagnostic] = []
+    diagnostics: list[Diagnostic] = []
     for name, groups in _pages(steps.names, config).items():
         try:
             source = (steps.path / name).read_bytes().decode("utf-8", "replace")
@@ -50,8 +50,8 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
             *Tags(label, steps.names, config).read(source),
             *(replace(problem, remark=problem.remark or of_hippo) for problem in check_structure(label, source)),
         ]
-        found += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
-    return found + (_of_all(steps.path, steps.names, config) if config else [])
+        diagnostics += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
+    return diagnostics + (_of_all(steps.path, steps.names, config) if config else [])
 
 
 def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnostic]:

@@ -17,13 +17,13 @@ def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
     `config` is None if the configuration cannot be read.
     """
     plays = config is None or bool(config.game_steps)
-    found = remarks.remarks_on(folder, config) if config else []
+    remarks_on = remarks.remarks_on(folder, config) if config else []
     if config and plays and config.project.may_run_on_aws:
-        found += agent_imports.requirement_remarks(folder)
+        remarks_on += agent_imports.requirement_remarks(folder)
     if config:
-        found += check_sessions(folder, config)
-        found += check_designs(folder, config)
+        remarks_on += check_sessions(folder, config)
+        remarks_on += check_designs(folder, config)
     if config and plays:
-        found += never_called(folder, config)
-        found += [*agent_imports.hiding_files(folder), *agent_imports.hidden_files(folder)]
-    return found + check_pages(folder, config) + (read_agent(folder) if plays else [])
+        remarks_on += never_called(folder, config)
+        remarks_on += [*agent_imports.hiding_files(folder), *agent_imports.hidden_files(folder)]
+    return remarks_on + check_pages(folder, config) + (read_agent(folder) if plays else [])

@@ -39,8 +39,8 @@ def remedy(kind: str, text: str, game: str = "Id-v0") -> str:
     lacking = _NAME.search(text) or _ATTRIBUTE.search(text)
     if lacking and kind in ("ImportError", "AttributeError"):
         return _of_gym(f"{lacking['module']}.{lacking['name']}")
-    found = _MODULE.search(text)
-    return _of_module(found["module"]) if found and kind == "ModuleNotFoundError" else ""
+    match = _MODULE.search(text)
+    return _of_module(match["module"]) if match and kind == "ModuleNotFoundError" else ""
 
 
 def _of_id(game: str) -> str:

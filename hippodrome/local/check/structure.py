@@ -25,18 +25,18 @@ _SWALLOWS = ("script", "style", "textarea", "title", "select")
 
 def check_structure(label: str, source: str) -> list[Diagnostic]:
     """Return the page's mistakes and remarks, in no order."""
-    found = [*_scripts(label, source)]
+    check_structure = [*_scripts(label, source)]
     text = spans.replace(source, spans.lines, spans.RAW)
     text = spans.replace(text, lambda value: spans.MARK + spans.lines(value), spans.VALUE, spans.NOTE)
     text = spans.replace(text, lambda block: _STEP + spans.lines(block), spans.BLOCK)
     reader = _Reader(label)
     reader.feed(text)
     reader.close()
-    found += [*reader.radios(), *reader.mixed()]
+    check_structure += [*reader.radios(), *reader.mixed()]
     if _STEP not in text:  # each branch of an {% if %} may open a tag that is closed once
-        found += reader.open_tags()
-        found += _comments(label, text)
-    return found
+        check_structure += reader.open_tags()
+        check_structure += _comments(label, text)
+    return check_structure
 
 
 def _scripts(label: str, source: str) -> Iterator[Diagnostic]:
@@ -94,7 +94,7 @@ class _Reader(PageParser):
         self._row = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = attributes_of(attrs)
+        attributes = attributes_of(attrs)
         self._blocks += sum((value or "").count(_STEP) + name.count(_STEP) for name, value in attrs)
         if tag not in VOID and tag not in _OPTIONAL:
             self._open.append((tag, self.getpos()[0]))
@@ -104,9 +104,12 @@ class _Reader(PageParser):
         elif tag == "tr":
             self._row += 1
         elif tag in ("input", "select", "textarea"):
-            name, kind = given.get("name", ""), given.get("type", "").strip().lower() if tag == "input" else tag
+            name, kind = (
+                attributes.get("name", ""),
+                attributes.get("type", "").strip().lower() if tag == "input" else tag,
+            )
             if name and spans.MARK not in name and _STEP not in name and kind not in BUTTONS:
-                self._field(name, kind == "radio", given.get("value"))
+                self._field(name, kind == "radio", attributes.get("value"))
 
     def _field(self, name: str, is_radio: bool, value: str | None) -> None:
         line = self.getpos()[0]

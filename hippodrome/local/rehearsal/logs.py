@@ -44,7 +44,7 @@ class FunctionLog:
 
     def warnings(self) -> list[str]:
         """Return the new warnings and errors: a line for each time that one was logged."""
-        found = []
+        warnings = []
         try:
             lines = self._log.read_bytes()[self._size :].splitlines()
         except OSError:
@@ -55,5 +55,5 @@ class FunctionLog:
             except ValueError:
                 continue
             if record.get("level") in ("WARNING", "ERROR"):
-                found.append(log_line(str(record.get("message")), record))
-        return found
+                warnings.append(log_line(str(record.get("message")), record))
+        return warnings

@@ -25,8 +25,8 @@ SHOWN_CRASHES = 3  # the most tracebacks of agent.py
 def report(
     console: Console,
     reports: Sequence[BotReport],
-    found: Verification | None,
-    left: Leftovers | None,
+    verification: Verification | None,
+    leftovers: Leftovers | None,
     seconds: float,
     *,
     play: float,
@@ -44,9 +44,9 @@ def report(
     """
     table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")
     for name, value in [
-        *_played(reports, found, play),
-        *_found(reports, found, recorded=recorded, live=live),
-        *([("servers left over", str(max(left.processes, len(left.records))))] if left else []),
+        *_played(reports, verification, play),
+        *_found(reports, verification, recorded=recorded, live=live),
+        *([("servers left over", str(max(leftovers.processes, len(leftovers.records))))] if leftovers else []),
     ]:
         table.add_row(name, value)
     errors = [f"{bot.user_id}: {error}" for bot in reports for error in bot.errors]
@@ -55,7 +55,7 @@ def report(
         table.add_row("troubles got over", str(len(troubles)))
     if not any(bot.finished or bot.end for bot in reports) and not errors:
         errors = ["no bot came to the last page"]
-    bad = errors + (found.missing if found else []) + (left.words() if left else [])
+    bad = errors + (verification.missing if verification else []) + (leftovers.words() if leftovers else [])
     failures = [crash.words() for crash in crashes]
     table.add_row("errors", escape("\n".join([*([str(len(bad))] if bad else []), *failures])) or "none")
     console.print(table)
@@ -76,9 +76,9 @@ def _title(reports: Sequence[BotReport], seconds: float) -> str:
     return f"Rehearsal with {len(reports)} bot{'s' if len(reports) != 1 else ''}, {seconds:.0f} s"
 
 
-def _played(reports: Sequence[BotReport], found: Verification | None, play: float) -> Rows:
+def _played(reports: Sequence[BotReport], verification: Verification | None, play: float) -> Rows:
     """The rows of what the bots have seen."""
-    plays = [each for bot in reports for each in bot.plays]
+    plays = [play for bot in reports for play in bot.plays]
     rows = [("bots finished", _of(sum(bot.finished for bot in reports), len(reports)))]
     for step, count in sorted(Counter(bot.ended for bot in reports if bot.ended).items()):
         rows.append(("ended before", f"{count} at step {step}, whose page had no button for them to press"))
@@ -92,17 +92,17 @@ def _played(reports: Sequence[BotReport], found: Verification | None, play: floa
             ("games stopped early", f"{_of(stopped, len(games))}: a bot plays {play:g} s (`--play 0`: to the end)")
         )
     if plays:
-        rows.append(("wait on the game page", _spread([each.waited for each in plays])))
-    if found and found.starts:
-        rows.append(("server: request to ready", _spread(found.starts)))
-    rates = [rate for each in plays if (rate := each.received_rate)]
+        rows.append(("wait on the game page", _spread([play.waited for play in plays])))
+    if verification and verification.starts:
+        rows.append(("server: request to ready", _spread(verification.starts)))
+    rates = [rate for play in plays if (rate := play.received_rate)]
     if rates:
-        frame_rates = ", ".join(sorted({str(each.frame_rate) for each in plays if each.frame_rate}))
-        amount = sum(each.bytes for each in plays)
+        frame_rates = ", ".join(sorted({str(play.frame_rate) for play in plays if play.frame_rate}))
+        amount = sum(play.bytes for play in plays)
         rows.append(("frames per second", f"p50 {median(rates):.1f}, least {min(rates):.1f}, of {frame_rates} set"))
-        if any(each.lines for each in plays):
-            rows.append(("lines said", str(sum(each.lines for each in plays))))
-        rows.append(("frames received", f"{sum(each.frames for each in plays)}, {amount / 1e6:.1f} MB"))
+        if any(play.lines for play in plays):
+            rows.append(("lines said", str(sum(play.lines for play in plays))))
+        rows.append(("frames received", f"{sum(play.frames for play in plays)}, {amount / 1e6:.1f} MB"))
     return rows
 
 
@@ -140,19 +140,19 @@ def _together(reports: Sequence[BotReport]) -> Rows:
     ]
 
 
-def _found(reports: Sequence[BotReport], found: Verification | None, *, recorded: bool, live: bool) -> Rows:
+def _found(reports: Sequence[BotReport], verification: Verification | None, *, recorded: bool, live: bool) -> Rows:
     """The rows of what is in the data."""
-    if not found:
+    if not verification:
         return [("data", "not looked at: --data says where they are")]
     unrecorded = "none expected: config.yml says `s3upload: false`"
     closed = "none expected: config.yml says `live: false`, so no participant gets in"
     finished = sum(bot.finished for bot in reports)
-    recordings = f"{found.recordings}, with {found.steps} steps"
+    recordings = f"{verification.recordings}, with {verification.steps} steps"
     return [
-        ("answers found", _of(found.answers, found.answers_sent)),
-        ("games found", _of(found.games, found.games_played)),
-        ("recordings", recordings if recorded or found.recordings else unrecorded),
-        ("codes or links back shown", _of(found.codes + found.links, finished) if live else closed),
+        ("answers found", _of(verification.answers, verification.answers_sent)),
+        ("games found", _of(verification.games, verification.games_played)),
+        ("recordings", recordings if recorded or verification.recordings else unrecorded),
+        ("codes or links back shown", _of(verification.codes + verification.links, finished) if live else closed),
     ]
 
 

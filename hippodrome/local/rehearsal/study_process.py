@@ -99,9 +99,9 @@ class StudyProcess:
         while True:
             ended = self._process.poll() is not None
             text = self.log.read_bytes()[begin:].decode("utf-8", "replace")
-            found = _LINK.search(text)
-            if found:
-                self.link = found[0]
+            match = _LINK.search(text)
+            if match:
+                self.link = match[0]
                 return
             if ended or time.monotonic() > until:
                 self.kill()
@@ -136,12 +136,12 @@ class StudyProcess:
     def clear(self) -> int:
         """Kill local mode and all its servers; return how many servers there were."""
         self.kill()
-        left = servers_of(self.data)
-        for process in left:
+        servers = servers_of(self.data)
+        for process in servers:
             with contextlib.suppress(psutil.Error):
                 process.kill()
-        psutil.wait_procs(left, timeout=5)
-        return len(left)
+        psutil.wait_procs(servers, timeout=5)
+        return len(servers)
 
 
 def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.Process]:
@@ -150,13 +150,13 @@ def servers_of(data: Path, users: Collection[str] | None = None) -> list[psutil.
     With `users`, return only servers of these owners: ids of participants and sessions.
     """
     store = str(data.resolve())
-    found = []
+    servers = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             variables = process.environ()
             if variables.get(environment.STORE) == store and (users is None or _owner(variables, data) in users):
-                found.append(process)
-    return found
+                servers.append(process)
+    return servers
 
 
 def _owner(variables: Mapping[str, str], data: Path) -> str | None:
@@ -306,7 +306,7 @@ def wait_until_gone(data: Path, users: Collection[str] | None = None) -> Leftove
     """Wait up to GONE_SECONDS until the last servers have ended; return what is left."""
     until = time.monotonic() + GONE_SECONDS
     while True:
-        left = Leftovers(len(servers_of(data, users)), open_records(data, users))
-        if not left.words() or time.monotonic() > until:
-            return left
+        leftovers = Leftovers(len(servers_of(data, users)), open_records(data, users))
+        if not leftovers.words() or time.monotonic() > until:
+            return leftovers
         time.sleep(0.2)

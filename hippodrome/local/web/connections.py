@@ -37,8 +37,12 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)
         self._arm(HEADER_SECONDS)
         if len(self.connections) > most():
-            waiting = [each for each in self.connections if isinstance(each, HttpConnection) and not each.answering]
-            oldest = min(waiting, key=lambda each: each._since)  # `waiting` has at least this connection
+            waiting = [
+                connection
+                for connection in self.connections
+                if isinstance(connection, HttpConnection) and not connection.answering
+            ]
+            oldest = min(waiting, key=lambda person: person._since)  # `waiting` has at least this connection
             self.connections.discard(oldest)  # `connection_lost` is called only later
             oldest.transport.abort()
 

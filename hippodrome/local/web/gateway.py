@@ -36,8 +36,8 @@ class Route(NamedTuple):
     def match(self, method: str, path: str) -> dict[str, str] | None:
         """Return the path parameters of a request for this route; None if it is for another route."""
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.path))
-        found = re.fullmatch(pattern, path) if method in self.methods else None
-        return found.groupdict() if found else None
+        match = re.fullmatch(pattern, path) if method in self.methods else None
+        return match.groupdict() if match else None
 
 
 ROUTES = (

@@ -141,9 +141,9 @@ class Names:
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def _join(one: Stream, other: Stream) -> None:
+async def _join(stream: Stream, other: Stream) -> None:
     """Copy bytes both ways until one side closes."""
-    ways = [asyncio.create_task(_copy(one[0], other[1])), asyncio.create_task(_copy(other[0], one[1]))]
+    ways = [asyncio.create_task(_copy(stream[0], other[1])), asyncio.create_task(_copy(other[0], stream[1]))]
     try:
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
     finally:

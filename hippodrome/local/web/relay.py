@@ -101,14 +101,14 @@ class Relay(asyncio.Protocol):
     def _begin(self) -> None:
         """Find the server that the request names, and connect to it."""
         head, end, rest = bytes(self._waiting).partition(b"\r\n")
-        asked = _REQUEST.fullmatch(head)
-        port = self._find(asked[1].decode()) if asked else None
-        if asked is None or port is None:
+        match = _REQUEST.fullmatch(head)
+        port = self._find(match[1].decode()) if match else None
+        if match is None or port is None:
             self._refuse("404 Not Found")
         elif _number(self._connections) > connections.most() // 2:  # the others are for pages
             self._refuse("503 Service Unavailable")
         else:
-            self._waiting = bytearray(b"GET %b %b%b%b" % (asked[2], asked[3], end, rest))
+            self._waiting = bytearray(b"GET %b %b%b%b" % (match[2], match[3], end, rest))
             self._browser.pause_reading()
             self._connecting = asyncio.get_running_loop().create_task(self._connect(port))
 
@@ -149,4 +149,4 @@ class _ServerSide(asyncio.Protocol):
 
 
 def _number(all_connections: Collection[object]) -> int:
-    return sum(isinstance(one, Relay) for one in all_connections)
+    return sum(isinstance(all_connection, Relay) for all_connection in all_connections)

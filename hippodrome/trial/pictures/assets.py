@@ -87,7 +87,7 @@ def load(project: Path, folder: str) -> Assets:
     assets_folder = project / folder
     if not assets_folder.is_dir():
         return Assets()
-    found: dict[str, Asset] = {}
+    assets: dict[str, Asset] = {}
     problems: list[str] = []
     total = pixels = 0
     try:
@@ -102,23 +102,23 @@ def load(project: Path, folder: str) -> Assets:
                 raise AssetError("is no PNG, JPEG or WebP image; sprites show only these")
             if not IMAGE.search(path.name):
                 continue
-            if name in found:
+            if name in assets:
                 raise AssetError("has the name of another image, apart from its extension; rename one of them")
             asset = read(path, name)
             total += len(asset.packed)
             pixels += asset.size[0] * asset.size[1]
-            if len(found) == MAX_ASSETS or total > MAX_BYTES_IN_ALL or pixels > MAX_PIXELS_IN_ALL:
+            if len(assets) == MAX_ASSETS or total > MAX_BYTES_IN_ALL or pixels > MAX_PIXELS_IN_ALL:
                 problems.append(
                     f"{folder}: more than {MAX_ASSETS} images, {MAX_BYTES_IN_ALL >> 20} MB or "
                     f"{MAX_PIXELS_IN_ALL >> 20} megapixels; {shown} and all after it are not shown"
                 )
                 break
-            found[name] = asset
-            if composed(name) not in found:
-                found[composed(name)] = replace(asset, name=composed(name))
+            assets[name] = asset
+            if composed(name) not in assets:
+                assets[composed(name)] = replace(asset, name=composed(name))
         except AssetError as error:
             problems.append(f"{shown} {error}")
-    return Assets(found, tuple(problems))
+    return Assets(assets, tuple(problems))
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -149,7 +149,7 @@ def read(path: Path, name: str) -> Asset:
     if frames:
         about["frames"] = frames
     if animations:
-        about["animations"] = {key: [list(each.frames), each.rate] for key, each in animations.items()}
+        about["animations"] = {key: [list(animation.frames), animation.rate] for key, animation in animations.items()}
     head = json.dumps(about, separators=(",", ":"), ensure_ascii=False).encode()
     packed = _HEAD.pack(len(head)) + head + image
     return Asset(name, image, size, packed, hashlib.sha256(packed).hexdigest()[:32], frames, animations)
@@ -202,7 +202,7 @@ def read_atlas(value: Any, size: tuple[int, int]) -> tuple[dict[str, Box], dict[
     animations = value.get("animations", {})
     if not isinstance(animations, dict):
         raise AssetError("has animations that are no map")
-    return frames, {str(key): _animation(str(key), each, frames) for key, each in animations.items()}
+    return frames, {str(key): _animation(str(key), animation, frames) for key, animation in animations.items()}
 
 
 def _grid(value: Mapping[str, Any], size: tuple[int, int]) -> dict[str, Box]:
@@ -259,10 +259,10 @@ def _animation(name: str, value: Any, frames: Mapping[str, Box]) -> AtlasAnimati
     listed = value.get("frames") if isinstance(value, dict) else None
     if not isinstance(listed, list) or not 0 < len(listed) <= MAX_FRAMES:
         raise AssetError(f"has the animation {name[:40]!r} without frames")
-    missing = next((str(each) for each in listed if str(each) not in frames), None)
+    missing = next((str(listing) for listing in listed if str(listing) not in frames), None)
     if missing is not None:
         raise AssetError(f"has the animation {name[:40]!r} with a frame {missing[:40]!r} that is not there")
     rate = value.get("frameRate", 8)
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not math.isfinite(rate) or not 0 < rate <= 240:
         raise AssetError(f"has the animation {name[:40]!r} with a frameRate that is no number up to 240")
-    return AtlasAnimation(tuple(str(each) for each in listed), rate)
+    return AtlasAnimation(tuple(str(listing) for listing in listed), rate)

@@ -43,69 +43,86 @@ class Raster:
                 self._object(canvas, each)
             return np.array(canvas, dtype=np.uint8)
 
-    def _object(self, canvas: Image.Image, each: CheckedObject) -> None:
-        kind, brush = each["type"], ImageDraw.Draw(canvas, "RGBA")
+    def _object(self, canvas: Image.Image, checked_object: CheckedObject) -> None:
+        kind, brush = checked_object["type"], ImageDraw.Draw(canvas, "RGBA")
         if kind == "line":
-            self._line(brush, each)
+            self._line(brush, checked_object)
         elif kind == "polygon":
-            points = self._points(each)
-            brush.polygon(points, fill=_fill(each), outline=_outline(each), width=_outline_width(each))
+            points = self._points(checked_object)
+            brush.polygon(
+                points,
+                fill=_fill(checked_object),
+                outline=_outline(checked_object),
+                width=_outline_width(checked_object),
+            )
         elif kind == "circle":
-            (x, y), radius = self._place(each), _bounded(each["radius"])
+            (x, y), radius = self._place(checked_object), _bounded(checked_object["radius"])
             box = (x - radius, y - radius, x + radius, y + radius)
-            brush.ellipse(box, fill=_fill(each), outline=_outline(each), width=_outline_width(each))
+            brush.ellipse(
+                box, fill=_fill(checked_object), outline=_outline(checked_object), width=_outline_width(checked_object)
+            )
         elif kind == "rectangle":
-            self._rectangle(brush, each)
+            self._rectangle(brush, checked_object)
         elif kind == "text":
-            self._text(canvas, each)
+            self._text(canvas, checked_object)
         else:
-            self._paste(canvas, each)
+            self._paste(canvas, checked_object)
 
-    def _place(self, each: CheckedObject) -> tuple[float, float]:
-        return _bounded(each["x"] * self._scale[0]), _bounded(each["y"] * self._scale[1])
+    def _place(self, checked_object: CheckedObject) -> tuple[float, float]:
+        return _bounded(checked_object["x"] * self._scale[0]), _bounded(checked_object["y"] * self._scale[1])
 
-    def _points(self, each: CheckedObject) -> list[tuple[float, float]]:
+    def _points(self, checked_object: CheckedObject) -> list[tuple[float, float]]:
         across, down = self._scale
-        return [(_bounded(x * across), _bounded(y * down)) for x, y in each["points"]]
+        return [(_bounded(x * across), _bounded(y * down)) for x, y in checked_object["points"]]
 
-    def _line(self, brush: ImageDraw.ImageDraw, each: CheckedObject) -> None:
-        points, ink = self._points(each), _fill(each)
+    def _line(self, brush: ImageDraw.ImageDraw, checked_object: CheckedObject) -> None:
+        points, ink = self._points(checked_object), _fill(checked_object)
         for key, edge in (("fill_above", 0), ("fill_below", self._size[1])):
-            if each.get(key):
+            if checked_object.get(key):
                 brush.polygon([*points, (points[-1][0], edge), (points[0][0], edge)], fill=ink)
-        brush.line(points, fill=ink, width=max(1, round(_bounded(each.get("width", 1)))), joint="curve")
+        brush.line(points, fill=ink, width=max(1, round(_bounded(checked_object.get("width", 1)))), joint="curve")
 
-    def _rectangle(self, brush: ImageDraw.ImageDraw, each: CheckedObject) -> None:
-        (x, y), width, height = self._place(each), _bounded(each["width"]), _bounded(each["height"])
-        (share_x, share_y), turn = each.get("origin", (0, 0)), np.radians(each.get("angle", 0))
+    def _rectangle(self, brush: ImageDraw.ImageDraw, checked_object: CheckedObject) -> None:
+        (x, y), width, height = (
+            self._place(checked_object),
+            _bounded(checked_object["width"]),
+            _bounded(checked_object["height"]),
+        )
+        (share_x, share_y), turn = checked_object.get("origin", (0, 0)), np.radians(checked_object.get("angle", 0))
         left, top = -share_x * width, -share_y * height
         cos, sin = float(np.cos(turn)), float(np.sin(turn))
         corners = [(left, top), (left + width, top), (left + width, top + height), (left, top + height)]
         points = [(x + across * cos - down * sin, y + across * sin + down * cos) for across, down in corners]
-        brush.polygon(points, fill=_fill(each), outline=_outline(each), width=_outline_width(each))
+        brush.polygon(
+            points, fill=_fill(checked_object), outline=_outline(checked_object), width=_outline_width(checked_object)
+        )
 
-    def _text(self, canvas: Image.Image, each: CheckedObject) -> None:
-        size = each.get("size", 16)
+    def _text(self, canvas: Image.Image, checked_object: CheckedObject) -> None:
+        size = checked_object.get("size", 16)
         most = int(4 * max(self._size) / size) + 1  # letters and lines outside the picture would only need memory
-        text = "\n".join(line[:most] for line in each["text"].split("\n")[:most])
-        font, ink = ImageFont.load_default(size), _fill(each)
+        text = "\n".join(line[:most] for line in checked_object["text"].split("\n")[:most])
+        font, ink = ImageFont.load_default(size), _fill(checked_object)
         _, _, right, bottom = ImageDraw.Draw(canvas).multiline_textbbox((0, 0), text, font)
         width, height = min(2_000, round(right) + 1), min(2_000, round(bottom) + 1)
         if width < 1 or height < 1:
             return
         layer = Image.new("RGBA", (width, height))
-        share = each.get("origin", (0, 0))[0]
+        share = checked_object.get("origin", (0, 0))[0]
         align = "left" if share < 0.25 else "center" if share < 0.75 else "right"
         ImageDraw.Draw(layer).multiline_text((0, 0), text, ink, font, align=align)
-        self._lay(canvas, layer, each)
+        self._lay(canvas, layer, checked_object)
 
-    def _paste(self, canvas: Image.Image, each: CheckedObject) -> None:
-        asset = self._assets.by_name.get(each["image"])
-        frame = each.get("frame")
-        if asset is not None and each.get("animation") in asset.animations:
-            frame = asset.animations[each["animation"]].frames[0]
-        width, height = _length(each.get("width")), _length(each.get("height"))
-        self._lay(canvas, self._sprite(each["image"], frame, width, height, each.get("alpha", 1)), each)
+    def _paste(self, canvas: Image.Image, checked_object: CheckedObject) -> None:
+        asset = self._assets.by_name.get(checked_object["image"])
+        frame = checked_object.get("frame")
+        if asset is not None and checked_object.get("animation") in asset.animations:
+            frame = asset.animations[checked_object["animation"]].frames[0]
+        width, height = _length(checked_object.get("width")), _length(checked_object.get("height"))
+        self._lay(
+            canvas,
+            self._sprite(checked_object["image"], frame, width, height, checked_object.get("alpha", 1)),
+            checked_object,
+        )
 
     def _new_sprite(self, name: str, frame: str | None, width: int, height: int, alpha: float) -> Image.Image:
         """Draw a sprite, not yet turned; a grey box if there is no such image or frame."""
@@ -122,11 +139,11 @@ class Raster:
             picture.putalpha(picture.getchannel("A").point(lambda value: round(value * alpha)))
         return picture
 
-    def _lay(self, canvas: Image.Image, layer: Image.Image, each: CheckedObject) -> None:
+    def _lay(self, canvas: Image.Image, layer: Image.Image, checked_object: CheckedObject) -> None:
         """Draw a picture on the canvas, turned about its origin."""
-        (x, y), (share_x, share_y) = self._place(each), each.get("origin", (0, 0))
+        (x, y), (share_x, share_y) = self._place(checked_object), checked_object.get("origin", (0, 0))
         across, down = (0.5 - share_x) * layer.width, (0.5 - share_y) * layer.height  # from the origin to the middle
-        angle = each.get("angle", 0)
+        angle = checked_object.get("angle", 0)
         if angle:
             turn = np.radians(angle)
             cos, sin = float(np.cos(turn)), float(np.sin(turn))
@@ -164,19 +181,19 @@ def _length(value: Any) -> int:
     return 0 if value is None else max(1, min(4_096, round(value)))
 
 
-def _fill(each: CheckedObject) -> Rgba:
-    return _ink(each.get("color", "#000000"), each)
+def _fill(checked_object: CheckedObject) -> Rgba:
+    return _ink(checked_object.get("color", "#000000"), checked_object)
 
 
-def _outline(each: CheckedObject) -> Rgba | None:
-    return _ink(each["outline"], each) if "outline" in each else None
+def _outline(checked_object: CheckedObject) -> Rgba | None:
+    return _ink(checked_object["outline"], checked_object) if "outline" in checked_object else None
 
 
-def _outline_width(each: CheckedObject) -> int:
-    return max(1, round(min(1_000, each.get("outline_width", 1)))) if "outline" in each else 1
+def _outline_width(checked_object: CheckedObject) -> int:
+    return max(1, round(min(1_000, checked_object.get("outline_width", 1)))) if "outline" in checked_object else 1
 
 
-def _ink(color: str, each: CheckedObject) -> Rgba:
+def _ink(color: str, checked_object: CheckedObject) -> Rgba:
     """Return the color as RGBA, with the object's `alpha`."""
     red, green, blue, *rest = ImageColor.getcolor(color, "RGBA")  # type: ignore[misc]
-    return red, green, blue, round((rest[0] if rest else 255) * each.get("alpha", 1))
+    return red, green, blue, round((rest[0] if rest else 255) * checked_object.get("alpha", 1))

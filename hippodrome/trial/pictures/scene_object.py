@@ -63,7 +63,7 @@ def mapping_of(value: Any) -> Mapping[str, Any]:
     if callable(convert):
         value = convert()
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if not isinstance(value, Mapping):
         raise UnusableValue(f"is no map of fields, but {type(value).__name__}")
     return value

@@ -135,8 +135,8 @@ class GameStep:
             stop = StopServer(visit.project.id, visit.user_id, record.attempt)  # after that, another may be requested
             self._services.platform.bus.publish(Topic.STOP, to_message(stop))
         since = visit.progress.reached_at(visit.project, visit.step)
-        asked = attempt_after_pause(record, since) if record else None
-        return self._services.state(visit.project, visit.user_id, visit.step, record, since, asked=asked)
+        attempt = attempt_after_pause(record, since) if record else None
+        return self._services.state(visit.project, visit.user_id, visit.step, record, since, asked=attempt)
 
     def _state_together(self, visit: Visit) -> dict[str, Any]:
         """The state of the lobby, or of the session's server. Raises `StepAnswered` if the participant is unmatched."""
@@ -149,8 +149,8 @@ class GameStep:
         if standing.session is not None:
             self._request_if_overdue(visit, standing.session, standing.record, standing.players)
         since = visit.progress.reached_at(project, step)
-        asked = attempt_after_pause(standing.record, since) if standing.record else None
-        return self._shared.state(project, user_id, step, standing, since, asked=asked)
+        attempt = attempt_after_pause(standing.record, since) if standing.record else None
+        return self._shared.state(project, user_id, step, standing, since, asked=attempt)
 
     def _request_if_overdue(self, visit: Visit, owner: str, record: Server | None, players: int = 0) -> None:
         """Send a lost start message again. `owner`: the id of the participant, or of a session of `players` members."""

@@ -74,8 +74,8 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
         **values_of(project, standing.assignment, visit.step),
     }
     if "participant" in mentioned:
-        known = repository.participant(project.id, user_id)
-        values["participant"] = {**(known.link if known else {}), "userId": user_id}
+        participant = repository.participant(project.id, user_id)
+        values["participant"] = {**(participant.link if participant else {}), "userId": user_id}
     if project.has_sessions and ("participant" in mentioned or "completion_code" in text):
         membership = repository.membership(project.id, user_id) or Membership()
         values["participant"] |= {"unmatched": membership.unmatched, "members": membership.members}
@@ -85,6 +85,6 @@ def _values(services: StepServices, visit: Visit, page: Step, text: str) -> Mapp
         codes = (str(game["completionCode"]) for game in games if "completionCode" in game)
         values["completion_code"] = next(codes, values["completion_code"])
     names = dict.fromkeys(step.step_name for step in project.steps if step.key in visit.progress.answered)
-    named = [name for name in names if "answers" in mentioned or f"answers.{name}" in mentioned]
-    values["answers"] = {name: standing.answers_to(name, visit.step) for name in named}
+    steps_named = [name for name in names if "answers" in mentioned or f"answers.{name}" in mentioned]
+    values["answers"] = {name: standing.answers_to(name, visit.step) for name in steps_named}
     return values

@@ -36,7 +36,7 @@ def zone(context: CheckContext) -> Iterator[Finding]:
     if not domain:
         return
     try:
-        found = read_zone(context.account, context.installation["HostedZoneId"])
+        zone = read_zone(context.account, context.installation["HostedZoneId"])
     except Problem as problem:
         yield bad(
             "hosted zone",
@@ -44,20 +44,20 @@ def zone(context: CheckContext) -> Iterator[Finding]:
             "The servers' names are written there: run `hippodrome apply` with --zone.",
         )
         return
-    if not found.holds(domain):
+    if not zone.holds(domain):
         yield bad(
             "hosted zone",
-            f"{found.id} is for {found.domain}, not for {domain}.",
+            f"{zone.id} is for {zone.domain}, not for {domain}.",
             "Give `hippodrome apply` its zone.",
         )
         return
     if context.delegation is None:
-        yield good("hosted zone", f"{found.domain} ({found.id}); DNS was not asked.")
+        yield good("hosted zone", f"{zone.domain} ({zone.id}); DNS was not asked.")
         return
-    answer = context.delegation(found)
-    servers = ", ".join(found.name_servers)
+    answer = context.delegation(zone)
+    servers = ", ".join(zone.name_servers)
     if not answer.problem:
-        yield good("hosted zone", f"{found.domain} is delegated to Route 53 ({found.id}).")
+        yield good("hosted zone", f"{zone.domain} is delegated to Route 53 ({zone.id}).")
     elif answer.certain:
         yield bad("hosted zone", answer.problem, f"At the domain's registrar, make these its name servers: {servers}.")
     else:
@@ -71,8 +71,8 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
     if not arns and context.installation.has_domain:
         yield look("site certificate", "The stack has none.", "Bring it up to date with `hippodrome apply`.")
     for arn in arns:
-        found = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
-        status, name = found["Status"], found["DomainName"]
+        certificate = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
+        status, name = certificate["Status"], certificate["DomainName"]
         if status == "ISSUED":
             yield good("site certificate", f"{name}: issued.")
         elif status == "PENDING_VALIDATION":
@@ -167,31 +167,31 @@ def certificate(context: CheckContext) -> Iterator[Finding]:
         return
     order = "Order one: `hippodrome certificate --production`."
     try:
-        found = snapshot.certificate(context.installation, context.platform.documents, context.now)
+        certificate = snapshot.certificate(context.installation, context.platform.documents, context.now)
     except Problem as problem:
         yield bad("certificate", str(problem), order)
         return
-    if found is None:
+    if certificate is None:
         yield bad("certificate", "There is none: no browser can reach a server.", order)
         return
     (wanted,) = names_of(context.installation.servers_domain)
-    if wanted not in found.names:
-        yield bad("certificate", f"It is for {', '.join(found.names) or 'no name'}, not for {wanted}.", order)
-    elif found.days_left < 0 or found.expires <= context.now:
-        yield bad("certificate", f"It expired on {found.expires:%d %B %Y}.", order)
-    elif found.staging:
+    if wanted not in certificate.names:
+        yield bad("certificate", f"It is for {', '.join(certificate.names) or 'no name'}, not for {wanted}.", order)
+    elif certificate.days_left < 0 or certificate.expires <= context.now:
+        yield bad("certificate", f"It expired on {certificate.expires:%d %B %Y}.", order)
+    elif certificate.staging:
         yield bad("certificate", "It comes from a staging authority: browsers refuse it.", order)
-    elif found.urgent(context.now):
+    elif certificate.urgent(context.now):
         yield bad(
             "certificate",
-            f"{found.days_left} days left, and it was not renewed.",
+            f"{certificate.days_left} days left, and it was not renewed.",
             f"{order} See `hippodrome logs --all --function renew_certificate --errors`.",
         )
-    elif found.overdue(context.now):
+    elif certificate.overdue(context.now):
         yield look(
             "certificate",
-            f"{found.days_left} days left: it should be renewed by now.",
+            f"{certificate.days_left} days left: it should be renewed by now.",
             "See `hippodrome logs --all --function renew_certificate`.",
         )
     else:
-        yield good("certificate", f"{', '.join(found.names)}: {found.days_left} days left.")
+        yield good("certificate", f"{', '.join(certificate.names)}: {certificate.days_left} days left.")

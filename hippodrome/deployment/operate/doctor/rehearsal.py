@@ -74,7 +74,7 @@ class Rehearsal:
 
         After Ctrl-C it cleans up as well; then `left` has the findings, and the exception is raised again.
         """
-        found: list[Finding] = []
+        findings: list[Finding] = []
         try:
             started = self._clock()
             if self._project.has_sessions:
@@ -85,14 +85,14 @@ class Rehearsal:
             kind = "on Spot" if self._record and self._record.spot else "on demand: Spot had no room"
             subject = "A warm server" if self._record and self._record.warm_server_name else "A server"
             took = ", ".join(f"{REACHED[state]} after {seconds:.0f} s" for state, seconds in self._seconds.items())
-            found.append(good(CHECK, f"{subject} of {self._project.id}, {kind}: {took}."))
-            found += self._visit()
+            findings.append(good(CHECK, f"{subject} of {self._project.id}, {kind}: {took}."))
+            findings += self._visit()
         except CheckFailed as failure:
-            found.append(bad(CHECK, str(failure), failure.advice))
+            findings.append(bad(CHECK, str(failure), failure.advice))
         except BaseException:
             self.left = self._leave()
             raise
-        return found + self._leave()
+        return findings + self._leave()
 
     def _until_ready(self, started: float) -> None:
         while True:

@@ -77,8 +77,8 @@ def _denies_without_tls(statement: dict[str, object]) -> bool:
 
 def queues(context: CheckContext) -> Iterator[Finding]:
     """Check whether the dead-letter queues are empty, and count the messages that wait."""
-    found = snapshot.queues(context.account, context.installation.stack)
-    dead = [queue for queue in found if queue.dead]
+    queues = snapshot.queues(context.account, context.installation.stack)
+    dead = [queue for queue in queues if queue.dead]
     if not dead:
         yield look("queues", "The stack has no dead-letter queues.", APPLY)
         return
@@ -90,7 +90,7 @@ def queues(context: CheckContext) -> Iterator[Finding]:
             "`hippodrome logs --all --errors` says why; SQS's console can send them again (redrive).",
         )
     else:
-        waiting = sum(queue.waiting for queue in found)
+        waiting = sum(queue.waiting for queue in queues)
         yield good("queues", f"No dead letters; {waiting:,} messages wait.")
 
 

@@ -69,9 +69,9 @@ class Base:
     def layers(self) -> list[dict[str, Any]]:
         """The descriptors of its layers, with OCI's media types: manifests that mix Docker's in are refused."""
         kinds = {"application/vnd.docker.image.rootfs.diff.tar.gzip": f"{OCI}.layer.v1.tar+gzip"}
-        kept = ("digest", "size")
+        keys = ("digest", "size")
         return [
-            {"mediaType": kinds.get(layer["mediaType"], layer["mediaType"]), **{key: layer[key] for key in kept}}
+            {"mediaType": kinds.get(layer["mediaType"], layer["mediaType"]), **{key: layer[key] for key in keys}}
             for layer in self.manifest["layers"]
         ]
 
@@ -82,7 +82,7 @@ def build(order: Order) -> None:
     cache.mkdir(parents=True, exist_ok=True)
     base = find_base(order.bundle.base, cache, fresh=order.fresh)
     installed = packages.install(order.bundle.requirements, cache, fresh=order.fresh)
-    tried.agent(order.bundle, [each.folder for each in installed])
+    tried.agent(order.bundle, [layer_installed.folder for layer_installed in installed])
     layers = make_layers(order.bundle, installed, cache)
     target = Repository(order.repository.address, order.repository.name, order.repository.password())
     push(target, order.tag, base, layers)
@@ -91,8 +91,8 @@ def build(order: Order) -> None:
 
 def find_base(name: str, cache: Path, *, fresh: bool = False) -> Base:
     """Return the base image of this name. It stays the same until `fresh`: a change of agent.py is no other Python."""
-    kept = cache / "bases" / f"{digest_of(name.encode())[7:]}.json"
-    if fresh or not kept.is_file():
+    cached = cache / "bases" / f"{digest_of(name.encode())[7:]}.json"
+    if fresh or not cached.is_file():
         place = place_of(name)
         source = Repository(place.address, place.repository)
         digest, manifest = source.manifest(place.reference)
@@ -100,11 +100,11 @@ def find_base(name: str, cache: Path, *, fresh: bool = False) -> Base:
             file = Path(coming, "config")
             source.pull(Blob(manifest["config"]["digest"], manifest["config"]["size"]), file)
             config = json.loads(file.read_bytes())
-            kept.parent.mkdir(exist_ok=True)
+            cached.parent.mkdir(exist_ok=True)
             file.write_bytes(canonical({"name": name, "digest": digest, "manifest": manifest, "config": config}))
-            os.replace(file, kept)
-    os.utime(kept)
-    base = Base(**json.loads(kept.read_bytes()))
+            os.replace(file, cached)
+    os.utime(cached)
+    base = Base(**json.loads(cached.read_bytes()))
     version = _variables(base.config).get("PYTHON_VERSION", packages.PYTHON)  # set by Docker's official images
     if not f"{version}.".startswith(f"{packages.PYTHON}."):
         raise Problem(
@@ -117,7 +117,7 @@ def find_base(name: str, cache: Path, *, fresh: bool = False) -> Base:
 def make_layers(bundle: Bundle, installed: list[packages.Packages], cache: Path) -> list[Layer]:
     """Return our layers, in their order: first what changes least."""
     store = cache / "layers"
-    layers = [layer(each.name, each.key, store, partial(_files_of, each)) for each in installed]
+    layers = [layer(package.name, package.key, store, partial(_files_of, package)) for package in installed]
     scratch = Folder(0o700, int(USER.partition(":")[0]))
     ours = Files(_with_bytecode(bundle.below("hippodrome")), {SCRATCH[1:]: scratch})
     study = Files({**bundle.below("project"), "project/requirements.txt": bundle.requirements.encode()})
@@ -136,8 +136,8 @@ def _with_bytecode(entries: Mapping[str, Path | bytes]) -> dict[str, Path | byte
     """Return our own modules by their paths in the image, with bytecode if this machine has the image's Python."""
     sources = {name: entry if isinstance(entry, bytes) else entry.read_bytes() for name, entry in entries.items()}
     python = bytecode.compiler(packages.PYTHON)
-    made = bytecode.compiled(sources, python, "/hippodrome") if python else {}
-    return {f"hippodrome/{name}": body for name, body in {**sources, **made}.items()}
+    bytecode_files = bytecode.compiled(sources, python, "/hippodrome") if python else {}
+    return {f"hippodrome/{name}": body for name, body in {**sources, **bytecode_files}.items()}
 
 
 def configure(base: Base, layers: list[Layer]) -> bytes:

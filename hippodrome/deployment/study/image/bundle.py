@@ -122,18 +122,18 @@ def _requirements(folder: Path) -> bytes:
     except (OSError, UnicodeDecodeError):
         raise Problem(f"{REQUIREMENTS} cannot be read.", "Save it as UTF-8 text.") from None
     for number, line in enumerate(text.splitlines(), 1):
-        wanted = _COMMENT.sub("", line).strip()
+        requirement = _COMMENT.sub("", line).strip()
         where = f"{REQUIREMENTS}:{number}"
-        if _PASSWORD.search(wanted):
+        if _PASSWORD.search(requirement):
             raise Problem(
                 f"{where}: an address with a password in it.", "Everyone who has the image could read it. Take it out."
             )
-        if "git+" in wanted:
+        if "git+" in requirement:
             raise Problem(
                 f"{where}: the image has no git to fetch this with.",
                 "Give the address of an archive of that commit, such as name @ https://…/archive/COMMIT.zip.",
             )
-        if _ELSEWHERE.match(wanted):
+        if _ELSEWHERE.match(requirement):
             raise Problem(
                 f"{where}: this leads to another file, which is not there when the image is built.",
                 f"Write what is needed into {REQUIREMENTS} itself; modules of your own can lie beside agent.py.",

@@ -55,7 +55,7 @@ class ImageRepository:
 
     def images(self) -> Images:
         """List the images that have a tag, 1,000 with each request. Raises `Problem` if the repository is gone."""
-        found: list[Tagged] = []
+        tagged_images: list[Tagged] = []
         pages = self._client.get_paginator("describe_images").paginate(
             repositoryName=self.name, filter={"tagStatus": "TAGGED"}, PaginationConfig={"PageSize": 1000}
         )
@@ -64,14 +64,14 @@ class ImageRepository:
                 for tag in image.get("imageTags", []):
                     content, _, number = tag.partition(".")
                     nth = int(number) if number.isdecimal() else 1
-                    found.append(Tagged(image["imagePushedAt"], nth, content, tag, image["imageDigest"]))
+                    tagged_images.append(Tagged(image["imagePushedAt"], nth, content, tag, image["imageDigest"]))
         except ClientError as error:
             if errors.code(error) != "RepositoryNotFoundException":
                 raise
             raise Problem(
                 f"The repository {self.name} is not there any more.", "Run `hippodrome apply` to make it again."
             ) from None
-        return Images(self.uri, sorted(found))
+        return Images(self.uri, sorted(tagged_images))
 
     def password(self) -> str:
         """Ask for the password for `docker login` as the user `AWS`. It is valid for twelve hours."""

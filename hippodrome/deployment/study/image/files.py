@@ -42,16 +42,16 @@ def project_files(folder: Path) -> dict[str, Path]:
         name = code.relative_to(folder).as_posix()
         raise Problem(f"{name} is a link out of the project folder.", "Put the folder itself there.")
     ignored = Ignore.of(folder)
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     size = 0
     for path in _walk(folder, code, ignored):
         name = path.relative_to(folder).as_posix()
         real = _target(folder, path, name, ignored)
-        found[path.relative_to(code).as_posix()] = real
+        paths[path.relative_to(code).as_posix()] = real
         size += real.stat().st_size
-        if size > LIMIT_BYTES or len(found) > LIMIT_FILES:
-            raise _too_much(found, size)
-    return dict(sorted(found.items()))
+        if size > LIMIT_BYTES or len(paths) > LIMIT_FILES:
+            raise _too_much(paths, size)
+    return dict(sorted(paths.items()))
 
 
 def inside(folder: Path, path: Path) -> bool:

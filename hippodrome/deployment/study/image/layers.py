@@ -83,9 +83,9 @@ def layer(name: str, key: str, cache: Path, content: Callable[[], Files]) -> Lay
     file, facts = cache / f"{key}.tar.gz", cache / f"{key}.json"
     if not (facts.is_file() and file.is_file()):
         with tempfile.TemporaryDirectory(dir=cache, prefix="coming-") as coming:
-            made = _write(name, Path(coming, "layer"), content())
-            os.replace(made.file, file)
-            known = {key: value for key, value in asdict(made).items() if key not in {"name", "file"}}
+            written = _write(name, Path(coming, "layer"), content())
+            os.replace(written.file, file)
+            known = {key: value for key, value in asdict(written).items() if key not in {"name", "file"}}
             Path(coming, "facts").write_text(json.dumps(known))
             os.replace(Path(coming, "facts"), facts)  # last: where the facts are, the layer is whole
     for path in (file, facts):
@@ -112,13 +112,13 @@ def _write(name: str, file: Path, files: Files) -> Layer:
 
 def _members(files: Files) -> Iterator[tuple[tarfile.TarInfo, Path | bytes]]:
     """Yield each file after the folders above it, in the order of their names."""
-    known = {"."}
+    folders = {"."}
     for name in sorted([*files.entries, *files.folders]):
         path = PurePosixPath(name)
         above = [*reversed(path.parents), *([path] if name in files.folders else [])]
         for folder in map(str, above):
-            if folder not in known:
-                known.add(folder)
+            if folder not in folders:
+                folders.add(folder)
                 place = files.folders.get(folder, Folder(0o755, 0))
                 yield _info(folder, tarfile.DIRTYPE, place.mode, place.owner), b""
         if name in files.entries:

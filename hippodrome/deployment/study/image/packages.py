@@ -139,15 +139,15 @@ def _index() -> list[str]:
 
     pip's further indexes are left out: such as piwheels, they are for this machine, and not for the servers.
     """
-    asked = [sys.executable, "-P", "-m", "pip", "config", "list", "--disable-pip-version-check"]
-    told = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
-    found = re.findall(r"(?m)^[\w:.]+\.index-url='(.*)'$", told)
-    return ["--default-index", found[-1]] if found else []  # variables come last, and count more than files
+    command = [sys.executable, "-P", "-m", "pip", "config", "list", "--disable-pip-version-check"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    urls = re.findall(r"(?m)^[\w:.]+\.index-url='(.*)'$", printed)
+    return ["--default-index", urls[-1]] if urls else []  # variables come last, and count more than files
 
 
-def explained(said: str) -> Problem:
+def explained(output: str) -> Problem:
     """Return the problem for what uv has said."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
     details = [line for line in lines if re.match(r"error:|cause:|hint:", line)][:6] or lines[:6]
     text = " ".join(lines)
     if match := re.search(r"Request failed|error sending request|Failed to fetch|dns error", text):

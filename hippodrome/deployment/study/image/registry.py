@@ -170,10 +170,10 @@ class Repository:
             self._login = self._token(challenge)
         if answer.ok or (missing and answer.status_code == 404):
             return answer
-        told = answer.text[:300] if method != "HEAD" else ""
+        text = answer.text[:300] if method != "HEAD" else ""
         if answer.status_code in {408, 429} or answer.status_code >= 500:
-            raise _Again(f"HTTP {answer.status_code} {told}")
-        raise self._refused(answer.status_code, told)
+            raise _Again(f"HTTP {answer.status_code} {text}")
+        raise self._refused(answer.status_code, text)
 
     def _token(self, challenge: str) -> str:
         """Ask for an anonymous token, as the challenge says."""
@@ -185,14 +185,14 @@ class Repository:
         document = answer.json()
         return f"Bearer {document.get('token') or document['access_token']}"
 
-    def _refused(self, status: int, told: str) -> Problem:
+    def _refused(self, status: int, text: str) -> Problem:
         what = f"{self._host} refused a request for {self.name} (HTTP {status})."
         advice = (
             "Run it again. If it fails again, ask the administrator to run `hippodrome apply`."
             if self._ours
             else "Correct the name of the base. If it needs a login, add --docker: the builder knows your logins."
         )
-        return Problem(what, advice, [" ".join(told.split())] if told else [])
+        return Problem(what, advice, [" ".join(text.split())] if text else [])
 
     @property
     def _host(self) -> str:

@@ -43,10 +43,10 @@ def agent(bundle: Bundle, site_packages: Sequence[Path]) -> None:
             (folder / name).mkdir()
         bundle.write_folder(folder / "context")
         venv = folder / "venv"
-        made = subprocess.run(
+        ran = subprocess.run(
             [python, "-I", "-m", "venv", "--without-pip", "--symlinks", venv], capture_output=True, check=False
         )
-        if made.returncode:  # such as Debian's Python without its package for that
+        if ran.returncode:  # such as Debian's Python without its package for that
             screen.warning(_NOT_TRIED.format(python=f"{PYTHON} with its module venv"))
             return
         lines = [f"import site; site.addsitedir({str(place)!r})\n" for place in site_packages]

@@ -117,11 +117,11 @@ def changed(project: Project, new_id: str) -> Project:
 def page_files(documents: Documents, of: Project) -> dict[str, str]:
     """Return, by key, the file name of a project's pages and of the files beside them."""
     prefix = f"{of.id}/{STEPS_FOLDER}/"
-    found = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
+    page_files = {entry.key: entry.key.removeprefix(prefix) for entry in documents.list(prefix)}
     if of.page_folder == STEPS_FOLDER:
-        return found
+        return page_files
     pages = {of.page_key(file): f"{file}.html" for step in (*of.steps, *of.pages_in_game) for file in step.files}
-    return {key: name for key, name in found.items() if name not in pages.values()} | pages
+    return {key: name for key, name in page_files.items() if name not in pages.values()} | pages
 
 
 def left_behind(documents: Documents, now: datetime) -> list[str]:

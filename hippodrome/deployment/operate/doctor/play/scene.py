@@ -56,10 +56,10 @@ class RehearsalContext:
     def server(self, user: str) -> Server | None:
         """Read the record of a bot's server, or of its session's server. The transcript hides its token and names."""
         membership = self.repository.membership(self.copy.id, user) if self.copy.project.players > 1 else None
-        found = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
-        if found is not None:
-            self.transcript.hide(found.nonce, found.name, found.label, found.host, found.task)
-        return found
+        server = self.repository.server_of(self.copy.id, (membership and membership.session) or user)
+        if server is not None:
+            self.transcript.hide(server.nonce, server.name, server.label, server.host, server.task)
+        return server
 
     def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
         """Call `look` until it returns a value, and return that. Raises `failed` after `seconds`, or at `until`."""

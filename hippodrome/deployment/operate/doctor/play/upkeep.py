@@ -254,12 +254,12 @@ def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
 def _tasks(scene: RehearsalContext, records: Iterable[Server]) -> dict[str, Mapping[str, Any]]:
     """Return, by ARN, the servers' tasks from DescribeTasks, which knows a stopped task for about an hour."""
     ecs = scene.context.account.client("ecs")
-    found: dict[str, Mapping[str, Any]] = {}
+    tasks: dict[str, Mapping[str, Any]] = {}
     for record in records:
         if record.task and record.cluster:
             answer = ecs.describe_tasks(cluster=record.cluster, tasks=[record.task])
-            found |= {task["taskArn"]: task for task in answer["tasks"]}
-    return found
+            tasks |= {task["taskArn"]: task for task in answer["tasks"]}
+    return tasks
 
 
 def _add_seconds(seconds: list[float], begin: datetime | None, end: datetime | None) -> None:
