@@ -522,7 +522,7 @@ def test_whatever_step_returns_is_read_or_refused_with_a_sentence(results: list[
     agent = Returning()
     adapter = AgentAdapter(Path("/nowhere"), "none", ("left", "right"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hippodrome.trial.agent.agent.load", lambda _folder: agent)
+        patch.setattr("hippodrome.trial.agent.agent.load", lambda _folder, **_how: agent)
         found = start(adapter)
     assert isinstance(found, JointAdapter)
     now, _ = found.reset(1)
