@@ -19,7 +19,7 @@ The certificate is handed out once `task_changed` has seen the task's address, a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -43,26 +43,11 @@ from hippodrome.control.storage.compare_and_swap import SharedDocuments
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
 
+if TYPE_CHECKING:
+    from hippodrome.control.certificates.addresses import AddressAuthority
+
 MAX_BODY = 16 * 1024  # bytes
 _WAITING = (ServerState.STARTING, ServerState.NAMING, ServerState.READY)  # READY: it asks again if an answer was lost
-
-
-class PlacedOrder(Protocol):
-    """A new order at the authority, as in `certificates.addresses.AddressOrder`."""
-
-    @property
-    def url(self) -> str: ...
-    @property
-    def token(self) -> str: ...
-    @property
-    def proof(self) -> str: ...
-
-
-class Authority(Protocol):
-    """An ACME authority with our account, as in `certificates.addresses.AddressAuthority`."""
-
-    def order(self, address: str) -> PlacedOrder: ...
-    def advance(self, url: str, address: str, csr: str, *, answer: bool, may_issue: bool) -> str: ...
 
 
 class CertificateRequest(msgspec.Struct, frozen=True):
@@ -78,14 +63,14 @@ class CertificateRequest(msgspec.Struct, frozen=True):
 class Certifying:
     """Answers the requests of servers. Each running function has one `Certifying`."""
 
-    def __init__(self, platform: Platform, open_authority: Callable[[], Authority]) -> None:
+    def __init__(self, platform: Platform, open_authority: Callable[[], AddressAuthority]) -> None:
         """`open_authority` returns the client of the authority, and may raise OrderFailed."""
         self._platform = platform
         self._repository = Repository(platform.documents)
         self._secrets = SecretCache(platform.documents)
         self._shared = SharedDocuments(platform.documents)
         self._open_authority = open_authority
-        self._authority: Authority | None = None
+        self._authority: AddressAuthority | None = None
 
     def respond(self, request: Request) -> Response:
         """Place an order, or take its next step.
@@ -169,6 +154,6 @@ class Certifying:
             )
         return answer_of(200, {"refused": f"the limit of this {limit.value}"})
 
-    def _client(self) -> Authority:
+    def _client(self) -> AddressAuthority:
         self._authority = self._authority or self._open_authority()
         return self._authority
