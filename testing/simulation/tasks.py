@@ -57,6 +57,7 @@ class SimTasks:
         self._by_interface: dict[str, TimedTask] = {}
         self._own_clusters: set[str] = set()
         self.changed: Callable[[Mapping[str, Any], float], None] = lambda event, delay: None
+        self.started: Callable[[str], None] = lambda name: None  # called with the name of a server whose process runs
         self.interfaces = 0  # network interfaces that exist now, each with an address of a subnet
         # Returns the id of the participant or formed session to whom a server belongs; empty until there is one.
         self.owner: Callable[[TimedTask], str] = lambda task: ""
@@ -166,6 +167,7 @@ class SimTasks:
         task.last, task.began = Life.RUNNING, self._cloud.clock.seconds
         self._cloud.log(f"{task.name} runs")
         self._tell(task)
+        self.started(task.name)
         self._wait_for_guests(task)
         deadline = float(task.request.environment["DEADLINE"]) - EPOCH.timestamp()
         wait = deadline - self._cloud.clock.seconds

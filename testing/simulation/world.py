@@ -13,7 +13,7 @@ import msgspec
 from hippodrome.control.limits.rules import SERVER_SLOTS
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.messages import DnsChanged, KeepWarm, ServerAttempt, parse_task_changed, to_message
+from hippodrome.control.model.messages import DnsChanged, KeepWarm, ServerAttempt, to_message
 from hippodrome.control.model.project import MASTER_LIST, Events, MasterList, Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server, ServerState
@@ -115,7 +115,8 @@ class SimulatedWorld:
             for function in (self.start_server, self.stop_server, self.task_changed)
         )
         platform.bus = SimBus(self.cloud, self.publish, self.task_queue.send)
-        platform.tasks.changed = self._changed
+        platform.tasks.changed = self.task_queue.send
+        platform.tasks.started = self._started
         platform.tasks.owner = self._owner
         self._store_project()
         self.trials = SimTrials(platform, project.id, self.conditions.idle)
@@ -245,13 +246,11 @@ class SimulatedWorld:
         host = name if self.conditions.authority else self.platform.dns.records.get(name)
         return self.platform.tasks.at(host) if host else None
 
-    def _changed(self, event: Mapping[str, Any], delay: float) -> None:
-        """Deliver an event of ECS. Without a domain, a task that runs also orders a certificate for its address."""
-        self.task_queue.send(event, delay)
-        changed = parse_task_changed(event)
-        if self.conditions.authority and changed and changed.status == "RUNNING":
+    def _started(self, name: str) -> None:
+        """Without a domain, a server orders a certificate for its address at once."""
+        if self.conditions.authority:
             seconds = self.clock.random.uniform(*self.conditions.authority)
-            self.clock.after(seconds, lambda: self._certify(changed.name))
+            self.clock.after(seconds, lambda: self._certify(name))
 
     def _certify(self, name: str) -> None:
         """Do what `certify_server` does: the certificate is handed out once the server's record has its address."""

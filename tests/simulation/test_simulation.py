@@ -14,7 +14,7 @@ from testing.port_faults import FaultAt, PortFault
 from testing.simulation import faults
 from testing.simulation.aws_bound import aws_alone
 from testing.simulation.clock import GreenletClock
-from testing.simulation.conditions import Conditions
+from testing.simulation.conditions import AUTHORITY, Conditions
 from testing.simulation.people import POLLS, SimulatedParticipant, retry_delay
 from testing.simulation.world import TIMEOUTS, WIRES, SimulatedWorld
 from tests.simulation.explored import assert_faults_do_harm_without_repair, assert_no_fault_does_harm
@@ -93,6 +93,14 @@ def test_under_worse_assumptions_all_participants_are_served_before_they_give_up
     assert not any(world.left().values()), world.story()
     assert all(visit.finished is not None for visit in visits), world.story()
     assert max(visit.ready - visit.asked for visit in visits) < 300
+
+
+def test_servers_without_names_are_served_although_events_that_they_run_are_lost():
+    """The certificate waits for the task to be seen, and the sweep sees it: by the next sweep after three minutes."""
+    world, visits = crowd(11, 60, 60, Conditions(authority=AUTHORITY, lost=0.3))
+    served_and_gone(world, visits)
+    assert len(world.platform.tasks.tasks) == len(visits), "no server is started in vain"
+    assert max(visit.ready - visit.asked for visit in visits) < 10 * 60
 
 
 def waits(visits):
