@@ -11,6 +11,7 @@ from typing import Any
 from hippodrome.control.participants import frame
 from hippodrome.local.web import access
 from hippodrome.local.web.gateway import (
+    LAB_ROUTES,
     ROUTES,
     GatewayResponse,
     Scope,
@@ -74,7 +75,7 @@ class App:
         refused = access.refusal(scope["method"], path, headers, self._origins, scheme=scheme, any_name=self._any_name)
         if refused:
             return _plain(403, f"{refused}\n")
-        for route in ROUTES:
+        for route in (*ROUTES, *LAB_ROUTES):
             parameters = route.match(scope["method"], path)
             if parameters is not None and route.function in self._functions:
                 break

@@ -46,9 +46,10 @@ ROUTES = (
     Route(("GET", "HEAD"), "/", "next_step"),
     Route(("GET", "POST", "OPTIONS"), "/start", "send_start_server_message"),
     Route(("GET", "POST", "OPTIONS"), "/stop", "send_stop_server_message"),
-    Route(("GET", "HEAD"), "/join/{projectId}", "join"),  # these two on a lab's server alone
-    Route(("GET", "HEAD"), "/lab", "lab"),
 )
+"""The routes of the site, as on AWS."""
+LAB_ROUTES = (Route(("GET", "HEAD"), "/join/{projectId}", "join"), Route(("GET", "HEAD"), "/lab", "lab"))
+"""Those that only a lab's server has beside them (`local/lab.py`)."""
 
 
 class GatewayResponse(NamedTuple):
