@@ -69,15 +69,15 @@ class DnsRecords:
         addressed = {event: address for event, _ in waiting if (address := addresses.get(event.interface or ""))}
         again += self._retry_addresses([event for event, _ in waiting if event not in addressed])
         stored = dict(waiting)
-        named, failed = for_each(
+        ready_attempts, failed = for_each(
             self._platform,
             addressed,
             lambda event: self._write_naming(stored[event], event, addressed[event]),
             "the state naming is not written yet",
             lambda event: event.name,
         )
-        unregistered = {record.name for record in self._create([record for _, record in named])}
-        return again + failed + [event for event, record in named if record.name in unregistered]
+        unregistered = {record.name for record in self._create([record for _, record in ready_attempts])}
+        return again + failed + [event for event, record in ready_attempts if record.name in unregistered]
 
     def _retry_addresses(self, events: Sequence[TaskChanged]) -> list[TaskChanged]:
         """Send messages to look the addresses up again after `RETRY_PAUSE`; return the events to deliver again instead.
@@ -177,8 +177,8 @@ class DnsRecords:
         All messages are handled at once, because running tasks in the same batch wait for their DNS records.
         """
         unmade = [message for message in batch if message.unmade]
-        made = [message for message in batch if not message.unmade]
-        in_sync, again = for_each(self._platform, made, self._check, "a DNS change could not be checked")
+        insync = [message for message in batch if not message.unmade]
+        in_sync, again = for_each(self._platform, insync, self._check, "a DNS change could not be checked")
         again += self._retry_create(unmade) if unmade else []
         try:
             self._complete({server: message.looked for message, _ in in_sync for server in message.servers})
@@ -194,7 +194,7 @@ class DnsRecords:
             dict.fromkeys(server for message in unmade for server in message.servers),
             self._waiting_record,
             "a DNS record is not created yet",
-            lambda named: ids.server_name(named.label, named.attempt),
+            lambda attempt_named: ids.server_name(attempt_named.label, attempt_named.attempt),
         )
         try:
             unregistered = self._create([record for _, record in waiting], max(message.looked for message in unmade))
@@ -249,18 +249,18 @@ class DnsRecords:
         )
         delete_dns_records(self._platform, [record for _, record in late])
         if failed:  # the next check only tries these servers again, since the change is INSYNC
-            self._check_later(DnsChanged("", failed, max(1, *(servers[named] for named in failed))))
+            self._check_later(DnsChanged("", failed, max(1, *(servers[name] for name in failed))))
 
     def _make_ready(self, server_attempt: ServerAttempt) -> DnsRecord | None:
         """Write `ready`, and mark a warm server ready in its pool. If the server was closed, return its DNS record."""
         name = ids.server_name(server_attempt.label, server_attempt.attempt)
-        made = self._write_ready(server_attempt)
-        if made:
+        written = self._write_ready(server_attempt)
+        if written:
             logger.info("server ready", extra={"server": name})
-        found = made or self._repository.owner(name)
-        if found is None or found.server.name != name:
+        owner = written or self._repository.owner(name)
+        if owner is None or owner.server.name != name:
             return None
-        record = found.server
+        record = owner.server
         # Even if `ready` was written before: that call may have been interrupted before it changed the pool.
         if record.is_warm_server and record.state is ServerState.READY:
             self._pools.mark_ready(record.project_id, record.user_id)

@@ -273,7 +273,10 @@ class Signing:
             signed = self._sign(access, asked.requests)
         except Refusal as refusal:
             return answer_of(refusal.status, {"message": refusal.text})
-        requests = [{"method": one.method, "url": one.url, "headers": dict(one.headers)} for one in signed]
+        requests = [
+            {"method": presigned.method, "url": presigned.url, "headers": dict(presigned.headers)}
+            for presigned in signed
+        ]
         return answer_of(200, {"seconds": VALID_SECONDS, "requests": requests})
 
     def _authenticate(self, signing_request: SigningRequest) -> ServerAccess:

@@ -87,10 +87,10 @@ class Start:
             stored = self._repository.server(ids.server_label(project.id, message.user_id))
             players = stored.server.players if stored else 0
         now = self._services.project_cache.live_project(project.id, fits=lambda listed: listed.for_session(players))
-        found = now and now.for_session(players)
-        if found is None:
+        registration = now and now.for_session(players)
+        if registration is None:
             logger.error("nothing is registered for a session of so many players", extra={"project": project.id})
-        return found or project
+        return registration or project
 
     def _cancel_start(self, message: StartServer) -> None:
         """Start nothing: the project is closed, or has no sessions any more. If the server was started, stop it."""
@@ -107,14 +107,14 @@ class Start:
         """
         record = stored.server
         warm = project.warm_servers and record.spot and not record.is_warm_server
-        named = self._services.handovers.reserve(project, stored) if warm or record.warm_server_name else None
-        if named is None:
+        reserved = self._services.handovers.reserve(project, stored) if warm or record.warm_server_name else None
+        if reserved is None:
             return stored
-        if self._services.handovers.assign(project, named):
+        if self._services.handovers.assign(project, reserved):
             return None
         again = self._new_record(project, record.user_id, record.attempt)
         return self._repository.update(
-            named, lambda r: server.without_warm_server(r, again) if r.owns(named.server.name) else None
+            reserved, lambda r: server.without_warm_server(r, again) if r.owns(reserved.server.name) else None
         )
 
     def _start(self, project: Project, stored: Versioned) -> None:

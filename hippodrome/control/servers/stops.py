@@ -42,14 +42,14 @@ class Stops:
         except Exception as error:  # noqa: BLE001 - the messages for single servers need no list, and are handled
             failure("the list of projects cannot be read", error)
             return list(batch)
-        wanted = list(dict.fromkeys(batch))
-        now = wanted[: max(1, MAX_READS // max(1, len(projects)))]
+        messages = list(dict.fromkeys(batch))
+        now = messages[: max(1, MAX_READS // max(1, len(projects)))]
         candidates = [StopServer(project_id, message.user_id) for message in now for project_id in projects]
-        found, unread = for_each(self._services.platform, candidates, self._open, "a record cannot be read")
-        stops = [stop for _, stop in found]
+        opened, unread = for_each(self._services.platform, candidates, self._open, "a record cannot be read")
+        stops = [stop for _, stop in opened]
         logger.info("participants are stopped in all projects", extra={"participants": len(now), "servers": len(stops)})
         failed = {stop.user_id for stop in [*self._termination.stop(stops), *unread]}
-        return [message for message in wanted if message not in now or message.user_id in failed]
+        return [message for message in messages if message not in now or message.user_id in failed]
 
     def _open(self, stop: StopServer) -> StopServer | None:
         """The message, if the participant has an open server in the project or may have a session; else None."""

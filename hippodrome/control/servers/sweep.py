@@ -143,8 +143,8 @@ class Sweep:
     def _read_owners(self, names: Iterable[str]) -> None:
         """Read the records that own these names, many at once. If one cannot be read, its resource stays this time."""
         ours = sorted({name for name in names if ids.parse_server_name(name)})
-        found, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
-        self._owners, self._unread = dict(found), set(unread)
+        owners_read, unread = for_each(self._platform, ours, self._repository.owner, "a server's record cannot be read")
+        self._owners, self._unread = dict(owners_read), set(unread)
         self._result.failed += len(unread)
 
     def _read_other_records(self) -> None:
@@ -163,10 +163,10 @@ class Sweep:
             due = any(since < age <= since + CHECKED_FOR for since in ages) and label not in labels
             if due and entry.key == server_key(label) and ids.parse_server_name(f"{label}-1"):
                 wanted.append(label)
-        found, unread = for_each(
+        records_read, unread = for_each(
             self._platform, wanted, self._repository.server, "a server's record cannot be read", str
         )
-        self._other_records = [stored for label, stored in found if stored.server.label == label]
+        self._other_records = [stored for label, stored in records_read if stored.server.label == label]
         self._result.failed += len(unread)
 
     def _record_of(self, name: str) -> Server | None:
@@ -219,14 +219,14 @@ class Sweep:
         or drained. Safe against concurrent handovers: one compare-and-swap on the warm server's record decides.
         """
         try:
-            known = self._pools.repair(self._repository)
+            pools_known = self._pools.repair(self._repository)
         except Exception as error:  # noqa: BLE001 - as below
             failure("the pools of warm servers could not be repaired", error)
             self._result.failed += 1
             return
         for record in [stored.server for stored in self._open() if stored.server.is_warm_server]:
             is_stopped = record.state is ServerState.DRAINING  # `_check_states` has sent it a stop message
-            if record.user_id not in known and not is_stopped:
+            if record.user_id not in pools_known and not is_stopped:
                 self._try("warm_servers", partial(self._send_stop, record, Reason.STOPPED))
 
     def _stop_sessions(self, listed: Mapping[str, Collection[str] | None]) -> None:
@@ -239,7 +239,7 @@ class Sweep:
         unlisted = [
             record
             for record in running
-            if (known := listed.get(record.project_id, ())) is not None and record.user_id not in known
+            if (open_sessions := listed.get(record.project_id, ())) is not None and record.user_id not in open_sessions
         ]
         stopped, failed = for_each(
             self._platform, unlisted, self._stop_if_over, "a session's server is not stopped yet", lambda r: r.name
@@ -280,8 +280,8 @@ class Sweep:
 
     def _records(self) -> list[Versioned]:
         """Every record that was read, once; without assigned warm servers, which their participants' records own."""
-        found = [stored for stored in self._other_records if stored.server.assigned_to is None]
-        return list({s.server.name: s for s in [*found, *self._owners.values()]}.values())
+        unassigned = [stored for stored in self._other_records if stored.server.assigned_to is None]
+        return list({s.server.name: s for s in [*unassigned, *self._owners.values()]}.values())
 
     def _open(self) -> list[Versioned]:
         """The records that are not closed."""

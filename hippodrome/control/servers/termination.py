@@ -70,18 +70,18 @@ class Termination:
                 break
         return again + changed
 
-    def _stop_once(self, wanted: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
+    def _stop_once(self, messages: Sequence[StopServer]) -> tuple[list[StopServer], list[StopServer]]:
         """Stop servers; return the messages that failed, and the messages for servers whose record has just changed.
 
         The caller handles the second kind once more from the beginning: the change may have added a task or an address.
         The queue would deliver these messages again only after its visibility timeout.
         """
-        found, again = for_each(self._platform, wanted, self._stop_task, "a server is not stopped yet")
-        closing = _each_once(found)
-        self._delete_dns_records(one.stored for _, one in closing)
+        to_close, again = for_each(self._platform, messages, self._stop_task, "a server is not stopped yet")
+        closing = _each_once(to_close)
+        self._delete_dns_records(server_to_close.stored for _, server_to_close in closing)
         freed, stuck = self._free_slots(closing)
         tried, failed = for_each(
-            self._platform, freed, lambda one: self._close_stopped(one[1]), "a server is not closed yet", _server_name
+            self._platform, freed, lambda pair: self._close_stopped(pair[1]), "a server is not closed yet", _server_name
         )
         changed = [message for (message, _), closed in tried if not closed]
         return again + stuck + [message for message, _ in failed], changed
@@ -160,12 +160,12 @@ class Termination:
         closing, again = for_each(
             self._platform, events, self._ended_server, "an ended task is not handled yet", lambda event: event.name
         )
-        self._delete_dns_records(one.stored for _, one in closing)
+        self._delete_dns_records(server_to_close.stored for _, server_to_close in closing)
         freed, stuck = self._free_slots(closing)
         _, failed = for_each(
             self._platform,
             freed,
-            lambda one: self._close_ended(one[1]),
+            lambda pair: self._close_ended(pair[1]),
             "a lost server is not closed yet",
             _server_name,
         )
@@ -214,11 +214,11 @@ class Termination:
         Return the servers that may be closed now, and the items to deliver again because the write failed.
         """
         projects: dict[str, list[Release]] = {}
-        for _, one in closing:
-            record = one.stored.server
+        for _, server_to_close in closing:
+            record = server_to_close.stored.server
             if record.counted and not record.is_closed:
-                closed = server.close(record, one.reason, self._platform.now(), one.cause or "")
-                release = Release(record, one.reason, keep=next_attempt(closed) is not None)
+                closed = server.close(record, server_to_close.reason, self._platform.now(), server_to_close.cause or "")
+                release = Release(record, server_to_close.reason, keep=next_attempt(closed) is not None)
                 projects.setdefault(record.project_id, []).append(release)
         _, failed = for_each(
             self._platform,
@@ -226,7 +226,7 @@ class Termination:
             lambda project: self._services.slots.release(project, projects[project]),
             "slots are not freed yet",
         )
-        freed = [one for one in closing if one[1].stored.server.project_id not in failed]
+        freed = [pair for pair in closing if pair[1].stored.server.project_id not in failed]
         return freed, [item for item, one in closing if one.stored.server.project_id in failed]
 
     def _close_ended(self, closing: ServerToClose) -> None:
@@ -286,10 +286,15 @@ class Termination:
             self._services.pools.request_adjustment(closed.project_id)
 
 
-def _each_once(found: Sequence[tuple[StopServer, ServerToClose]]) -> list[tuple[StopServer, ServerToClose]]:
+def _each_once(pairs: Sequence[tuple[StopServer, ServerToClose]]) -> list[tuple[StopServer, ServerToClose]]:
     """The list with each server once: several members' messages may be for the server of their session."""
-    return list({one.stored.server.name: (message, one) for message, one in reversed(found)}.values())[::-1]
+    return list(
+        {
+            server_to_close.stored.server.name: (message, server_to_close)
+            for message, server_to_close in reversed(pairs)
+        }.values()
+    )[::-1]
 
 
-def _server_name(one: tuple[object, ServerToClose]) -> str:
-    return one[1].stored.server.name
+def _server_name(pair: tuple[object, ServerToClose]) -> str:
+    return pair[1].stored.server.name

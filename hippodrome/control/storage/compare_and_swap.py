@@ -33,8 +33,8 @@ class SharedDocuments:
 
         Raises ValueError if the document cannot be read as such a record.
         """
-        found = self._documents.get(key)
-        return from_json(found.body, kind) if found else kind()
+        document = self._documents.get(key)
+        return from_json(document.body, kind) if document else kind()
 
     def change(self, key: str, kind: type[R], change: Callable[[R], R], *, anew: R | None = None) -> Changed[R]:
         """Apply `change` to the record and write the result; after a `Conflict`, read the document again and repeat.
@@ -45,11 +45,11 @@ class SharedDocuments:
         `anew` instead, and the result replaces the document.
         """
         for _ in range(TRIES):
-            found = self._documents.get(key)
+            document = self._documents.get(key)
             before, unreadable = kind(), False
-            if found:
+            if document:
                 try:
-                    before = from_json(found.body, kind)
+                    before = from_json(document.body, kind)
                 except ValueError as error:
                     if anew is None:
                         raise
@@ -59,8 +59,8 @@ class SharedDocuments:
             if after == before and not unreadable:
                 return Changed(before, after)
             try:
-                if found:
-                    self._documents.replace(key, to_json(after), found.etag)
+                if document:
+                    self._documents.replace(key, to_json(after), document.etag)
                 else:
                     self._documents.create(key, to_json(after))
             except Conflict:

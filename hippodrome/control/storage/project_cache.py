@@ -39,8 +39,8 @@ class ProjectCache:
         """Return the registered project, live or not, from a list at most `fresh` old; None if it has no readable
         entry.
         """
-        found = self._list(fresh).find(project_id)
-        return self._secrets.with_secret(found) if found and self._secrets else found
+        registration = self._list(fresh).find(project_id)
+        return self._secrets.with_secret(registration) if registration and self._secrets else registration
 
     def projects(self, fresh: timedelta = FRESH) -> list[Project]:
         """Return all registered projects, without their secrets, from a list at most `fresh` old."""
@@ -88,14 +88,14 @@ class ProjectCache:
     def document(self, key: str, fresh: timedelta = FRESH, version: str = "") -> Document | None:
         """Return the document, at most `fresh` old and read for this version of its project; None if it is missing."""
         now = self._platform.now()
-        kept = self._cached.get(key)
-        if kept and kept.version == version and now < kept.read + fresh:
-            return kept.document
-        document = self._platform.documents.get(key, kept.document if kept else None)
+        cached = self._cached.get(key)
+        if cached and cached.version == version and now < cached.read + fresh:
+            return cached.document
+        document = self._platform.documents.get(key, cached.document if cached else None)
         if document is None:
             self._cached.pop(key, None)  # a missing document is not cached
             return None
-        size = sum(len(each.document.body) for each in list(self._cached.values()))  # other threads change the cache
+        size = sum(len(entry.document.body) for entry in list(self._cached.values()))  # other threads change the cache
         if len(self._cached) >= MAX_DOCUMENTS or size + len(document.body) > MAX_BYTES:
             self._cached.clear()
         self._cached[key] = _Cached(document, now, version)

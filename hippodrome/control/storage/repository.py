@@ -51,9 +51,9 @@ class Repository:
 
     def participant(self, project_id: str, user_id: str) -> Participant | None:
         """Return the participant's record; None if there is none or if it cannot be read."""
-        found = self._documents.get(participant.participant_key(project_id, user_id))
+        document = self._documents.get(participant.participant_key(project_id, user_id))
         try:
-            return from_json(found.body, Participant) if found else None
+            return from_json(document.body, Participant) if document else None
         except ValueError:
             logger.error("a participant's record cannot be read", extra={"project": project_id})
             return None
@@ -69,12 +69,12 @@ class Repository:
         was erased and comes again gets others. Raises ValueError if the document cannot be read.
         """
         key = assignment_key(project_id, owner)
-        if written is not None and (known := self._assignments.get((key, written))):
-            return known
-        found = self._documents.get(key)
-        if found is None:
+        if written is not None and (cached := self._assignments.get((key, written))):
+            return cached
+        document = self._documents.get(key)
+        if document is None:
             return None
-        assignment = from_json(found.body, Assignment)
+        assignment = from_json(document.body, Assignment)
         if written is not None:
             if len(self._assignments) >= CACHED_ASSIGNMENTS:
                 self._assignments.clear()
@@ -87,8 +87,8 @@ class Repository:
 
     def ended(self, project_id: str, user_id: str) -> Ended | None:
         """Return the record of the end that the participant has reached; None if there is none."""
-        found = self._documents.get(participant.end_key(project_id, user_id))
-        return from_json(found.body, Ended) if found else None
+        document = self._documents.get(participant.end_key(project_id, user_id))
+        return from_json(document.body, Ended) if document else None
 
     def create_ended(self, project_id: str, user_id: str, record: Ended) -> bool:
         """Write the record of the end that a participant has reached; return False if there is one already."""
@@ -120,8 +120,8 @@ class Repository:
 
         Raises ValueError if the document cannot be read.
         """
-        found = self._documents.get(membership_key(project_id, user_id))
-        return memberships.read(found.body) if found else None
+        document = self._documents.get(membership_key(project_id, user_id))
+        return memberships.read(document.body) if document else None
 
     def session_id(self, project: Project, user_id: str) -> str | None:
         """Return the id of the session that the participant is a member of; None if there is none.
@@ -133,8 +133,8 @@ class Repository:
 
     def session(self, project_id: str, session_id: str) -> SessionDocument | None:
         """Return the session's document; None if there is none. Raises `BadSession` if it cannot be read."""
-        found = self._documents.get(session_key(project_id, session_id))
-        return session.parse(found.body) if found else None
+        document = self._documents.get(session_key(project_id, session_id))
+        return session.parse(document.body) if document else None
 
     # Servers
 
@@ -158,8 +158,8 @@ class Repository:
 
     def server(self, label: str) -> Versioned | None:
         """Return the record under a label, with its ETag; None if there is none."""
-        found = self._documents.get(server.key(label))
-        return Versioned(from_json(found.body, Server), found.etag) if found else None
+        document = self._documents.get(server.key(label))
+        return Versioned(from_json(document.body, Server), document.etag) if document else None
 
     def owner(self, name: str) -> Versioned | None:
         """Return the record that owns the resources of this name, following handovers; None if there is none.

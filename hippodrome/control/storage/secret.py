@@ -74,27 +74,27 @@ class SecretCache:
 
     def get_or_create(self) -> Secret:
         """Return the secret; if there is none, create it."""
-        found = self.find()
-        while found is None:
+        secret = self.find()
+        while secret is None:
             with contextlib.suppress(Conflict):  # another function has created it
                 self._documents.create(KEY, to_json(Secret(os.urandom(32).hex())))
-            found = self.find()
-        return found
+            secret = self.find()
+        return secret
 
     def token(self, server: Server) -> str:
         """Return the token with which the participant plays on this server; "" if it was never started.
 
         AWS calls: at most one an hour; none for a record without a nonce.
         """
-        found = self.find() if server.nonce else None
-        return found.token(server) if found else ""
+        secret = self.find() if server.nonce else None
+        return secret.token(server) if secret else ""
 
     def with_secret(self, project: Project) -> Project:
         """Return the project with its secret, which the master list does not hold.
 
         Raises LookupError if the document `_secret.json` is gone.
         """
-        found = self.find()
-        if found is None:
+        secret = self.find()
+        if secret is None:
             raise LookupError(f"{KEY} is gone; the bucket keeps older versions: put the last one in its place")
-        return msgspec.structs.replace(project, secret=found.project_secret(project))
+        return msgspec.structs.replace(project, secret=secret.project_secret(project))

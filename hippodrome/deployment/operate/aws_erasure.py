@@ -39,12 +39,12 @@ def erase(
     installation = find_installation(account, stack)
     projects = _projects(account, installation) if only is None else [only]
     erasers = [Eraser(account, installation, name, user) for name in projects]
-    found = {eraser.project: eraser.look() for eraser in erasers}
-    if only is not None and not any(found.values()):
+    by_project = {eraser.project: eraser.look() for eraser in erasers}
+    if only is not None and not any(by_project.values()):
         _must_be_known(only, _projects(account, installation), stack)
     if not json or dry_run:
-        _show(found, json, dry_run)
-    concerned = [name for name, one in found.items() if one]
+        _show(by_project, json, dry_run)
+    concerned = [name for name, data_found in by_project.items() if data_found]
     if dry_run:
         return Exit.CHANGES if concerned else Exit.DONE
     if concerned:
@@ -54,15 +54,15 @@ def erase(
     if target.exists() or not target.parent.is_dir():
         raise Problem(f"The receipt cannot be written to {target}.", "Name a new file in a folder that exists.")
     try:
-        _erase(erasers, found)
+        _erase(erasers, by_project)
         whole = True
     finally:
         parts = [eraser.receipt for eraser in erasers]
-        made = receipts.receipt(parts, user, account, installation, began=began, whole=whole, with_id=with_id)
+        written = receipts.receipt(parts, user, account, installation, began=began, whole=whole, with_id=with_id)
         if whole or any(part.deleted for part in parts):
-            receipts.write(target, made)
+            receipts.write(target, written)
     if json:
-        screen.result_json(made)
+        screen.result_json(written)
     _warn_of_unreadable(erasers)
     if concerned:
         screen.success(f"Everything is gone. The receipt: {target}")
@@ -86,22 +86,24 @@ def _projects(account: Account, installation: Installation) -> list[str]:
     return sorted(name for name in names if ids.is_project_id(name))
 
 
-def _must_be_known(project: str, known: list[str], stack: str) -> None:
+def _must_be_known(project: str, project_ids: list[str], stack: str) -> None:
     """Raise `Problem` for an unknown project: a mistyped id must not look like an erasure."""
-    if project not in known:
+    if project not in project_ids:
         raise Problem(
             f"The installation {stack} holds nothing of a project {project}.",
-            f"Name another, or take --everywhere. It holds: {', '.join(known) or 'nothing yet'}.",
+            f"Name another, or take --everywhere. It holds: {', '.join(project_ids) or 'nothing yet'}.",
         )
 
 
 def _erase(erasers: list[Eraser], participants_data: Mapping[str, FoundOfParticipant]) -> None:
     with screen.ProgressBars() as bars:
-        bar = bars.add_task("Erasing", total=sum(one.documents for one in participants_data.values()))
+        bar = bars.add_task("Erasing", total=sum(data_found.documents for data_found in participants_data.values()))
         for eraser in erasers:
-            if participants_data[eraser.project] and (left := eraser.run(lambda count: _advance(bars, bar, count))):
+            if participants_data[eraser.project] and (
+                remaining := eraser.run(lambda count: _advance(bars, bar, count))
+            ):
                 raise Problem(
-                    f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(left)}.",
+                    f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(remaining)}.",
                     "The participant's link is in use. Close the study with `register --no-live`, and run this again.",
                 )
 
@@ -121,11 +123,11 @@ def _advance(bars: Progress, bar: TaskID, count: int) -> None:
 
 def _show(participants_data: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
     if json:
-        screen.result_json({"found": {name: one.counts() for name, one in participants_data.items()}})
+        screen.result_json({"found": {name: data_found.counts() for name, data_found in participants_data.items()}})
         return
-    rows = [(name, *one.counts().values()) for name, one in participants_data.items() if one]
+    rows = [(name, *data_found.counts().values()) for name, data_found in participants_data.items() if data_found]
     if rows:
-        heads = max((list(one.counts()) for one in participants_data.values()), key=len)
+        heads = max((list(data_found.counts()) for data_found in participants_data.values()), key=len)
         screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
         _warn_of_others(participants_data)
     elif dry_run:
@@ -134,7 +136,9 @@ def _show(participants_data: Mapping[str, FoundOfParticipant], json: bool, dry_r
 
 def _warn_of_others(participants_data: Mapping[str, FoundOfParticipant]) -> None:
     """Warn that the servers of sessions will be stopped on which other participants still play."""
-    playing = sum(not each.is_closed for one in participants_data.values() for each in one.of_sessions)
+    playing = sum(
+        not session.is_closed for data_found in participants_data.values() for session in data_found.of_sessions
+    )
     if playing:
         screen.warning(
             f"They play with others now: {count(playing, 'session')} will be stopped, for all who play there."

@@ -116,11 +116,11 @@ def command(
         source = _bucket(open_account(profile, region), stack, bucket, study.id)
     if dry_run:
         return _dry_run(work.look(source, study.id, target, wishes), target, as_json)
-    made = work.run(source, study.id, target, wishes)
+    outcome = work.run(source, study.id, target, wishes)
     if as_json:
-        screen.result_json(made)
+        screen.result_json(outcome)
     else:
-        _tell(made, target)
+        _tell(outcome, target)
     return Exit.DONE
 
 
@@ -146,14 +146,14 @@ def _refuse_outer(folder: Path, project: str) -> None:
         )
 
 
-def _bucket(account: Account, stack: str, kept: str | None, project: str) -> Source:
+def _bucket(account: Account, stack: str, bucket_name: str | None, project: str) -> Source:
     """Open the installation's bucket, or the bucket `kept` that `destroy` has kept."""
     from hippodrome.deployment.aws.account import find_installation
     from hippodrome.deployment.stack.retained_bucket import open_bucket
     from hippodrome.export.bucket import Bucket
 
-    if kept is not None:
-        return open_bucket(account, kept, project)
+    if bucket_name is not None:
+        return open_bucket(account, bucket_name, project)
     try:
         installation = find_installation(account, stack)
     except Problem as problem:
@@ -208,13 +208,13 @@ def _tell_agent(moved: list[dict[str, Any]]) -> None:
         screen.info("  `finished` is by the steps as they are now.")
 
 
-def _tell(made: dict[str, Any], target: Path) -> None:
-    counts, run = made["counts"], made["run"]
+def _tell(outcome: dict[str, Any], target: Path) -> None:
+    counts, run = outcome["counts"], outcome["run"]
     if run["damaged"]:
         screen.warning(f"{run['damaged']:,} files here were damaged, and have been made anew.")
     if run["gone"]:
         screen.warning(f"{run['gone']:,} files are gone from the source, and so from here.")
-    for dataset in made["minari"]:
+    for dataset in outcome["minari"]:
         for why, count in dataset["leftOut"].items():
             screen.warning(f"{dataset['id']}: {count:,} episodes were left out: {why}.")
         if not dataset["observations"] and dataset["observationsRecorded"]:
@@ -224,17 +224,17 @@ def _tell(made: dict[str, Any], target: Path) -> None:
             )
         elif not dataset["observations"]:
             screen.warning(f"{dataset['id']}: observations were not recorded; steps' numbers stand in their place.")
-    if not all(dataset["observationsRecorded"] for dataset in made["minari"]):
+    if not all(dataset["observationsRecorded"] for dataset in outcome["minari"]):
         screen.info(
             "  `recordObservations: true` in `trial` of config.yml records them in games that begin after that."
         )
-    _tell_agent(made["moved"])
+    _tell_agent(outcome["moved"])
     if counts["problems"]:
         problems = formatting.count(counts["problems"], "remark")
         screen.warning(f"{problems} on files that are not as they should be: {target / 'problems.csv'}")
     if target.stat().st_mode & 0o077:
         screen.warning(f"Other users of this machine can read {target}/. To change that: chmod -R go-rwx {target}")
-    has_recordings = made["formats"] != ["csv"]
+    has_recordings = outcome["formats"] != ["csv"]
     counted = ("participants", "finished", "answers", *(("episodes", "frames") if has_recordings else ()))
     screen.table(["", "count"], [(name, f"{counts[name]:,}") for name in counted], right=["count"])
     if not has_recordings:
@@ -242,7 +242,7 @@ def _tell(made: dict[str, Any], target: Path) -> None:
     screen.success(
         f"{run['new'] + run['changed']:,} files fetched ({formatting.size(run['bytes'])}); everything is in {target}/"
     )
-    if datasets := ", ".join(dataset["id"] for dataset in made["minari"] if dataset["episodes"]):
+    if datasets := ", ".join(dataset["id"] for dataset in outcome["minari"] if dataset["episodes"]):
         screen.info(f"  MINARI_DATASETS_PATH={target.resolve() / 'minari'} {datasets}")
-    if made["identities"] == "apart":
+    if outcome["identities"] == "apart":
         screen.info(f"  Who is who: {target / 'private/identities.csv'}. Share everything but private/.")

@@ -64,8 +64,8 @@ class DataFolder:
     def delete(self, versions: Iterable[Version], note: Note = lambda _: None) -> int:
         """Delete these files, and folders that become empty."""
         deleted = list(versions)
-        for each in deleted:
-            path = self.root / each.key
+        for file in deleted:
+            path = self.root / file.key
             path.unlink(missing_ok=True)
             remove_empty(path.parent, self.root)
         note(deleted)

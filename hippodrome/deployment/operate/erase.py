@@ -109,17 +109,17 @@ def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes:
         for folder in folders
         for eraser in (FolderEraser(folder, name, user) for name in folder_eraser.projects(folder))
     ]
-    found = [look for look in looks if (look[1] or look[2]) and only in (None, look[0].project)]
+    concerned = [look for look in looks if (look[1] or look[2]) and only in (None, look[0].project)]
     others = {look[0].project for look in looks if (look[1] or look[2]) and only not in (None, look[0].project)}
     rows = [
-        (eraser.project, str(eraser.data), f"{len(own):,}", f"{len(sessions):,}") for eraser, own, sessions in found
+        (eraser.project, str(eraser.data), f"{len(own):,}", f"{len(sessions):,}") for eraser, own, sessions in concerned
     ]
     if rows and not json:
         screen.table(["project", "data", "files", "sessions"], rows, right=["files", "sessions"])
     done = []
-    if found and not dry_run:
+    if concerned and not dry_run:
         screen.confirm(f"Erase this participant for good from {', '.join(dict.fromkeys(row[0] for row in rows))}?", yes)
-        done = [eraser.run() for eraser, *_ in found]
+        done = [eraser.run() for eraser, *_ in concerned]
     for eraser, *_ in looks:
         for key in eraser.unreadable:
             screen.warning(f"{eraser.data / key} cannot be read, and may name this participant: look at it yourself.")
@@ -128,17 +128,17 @@ def _from_folder(data: Path, only: str | None, user: str, *, dry_run: bool, yes:
     elif not dry_run:
         for path in (path for folder in folders for path in folder_eraser.mentions(folder, user)):
             screen.warning(f"{path} still names them: look at it, and delete it if you do not need it.")
-    files, rewritten = sum(each.files for each in done), sum(each.rewritten for each in done)
+    files, rewritten = sum(erasure.files for erasure in done), sum(each.rewritten for each in done)
     if json:
-        amount = sum(len(own) + len(sessions) for _, own, sessions in found)
+        amount = sum(len(own) + len(sessions) for _, own, sessions in concerned)
         screen.result_json({"found": amount, "deleted": files, "rewritten": rewritten})
     if done:
         screen.success(f"{count(files, 'file')} deleted, {count(rewritten, 'recording')} rewritten without them.")
         screen.info("  Where this study was converted, run `hippodrome data` again: it removes them there.")
-    elif not found:
+    elif not concerned:
         screen.success(f"There is nothing of this participant in {data}, in {only or ', '.join(sorted(present))}.")
         screen.info("  An id must be written exactly as in their link.")
-    return Exit.CHANGES if dry_run and found else Exit.DONE
+    return Exit.CHANGES if dry_run and concerned else Exit.DONE
 
 
 def _must_hold(data: Path, only: str | None, present: list[str]) -> None:

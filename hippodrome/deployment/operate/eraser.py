@@ -125,7 +125,7 @@ class Eraser:
 
         Raises `Problem` if a server does not end.
         """
-        return self._executor.converge(self.look, lambda found: self.plan(found, advance), rounds=ROUNDS, pause=0)
+        return self._executor.converge(self.look, lambda state: self.plan(state, advance), rounds=ROUNDS, pause=0)
 
     def look(self) -> FoundOfParticipant:
         """Find everything about this participant. Changes nothing."""
@@ -198,8 +198,8 @@ class Eraser:
         return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
 
     def _draining(self, clusters: Sequence[str]) -> list[RunningTask]:
-        found = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
-        return [task for task in found if self._scope.erases(task.name)]
+        tasks = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
+        return [task for task in tasks if self._scope.erases(task.name)]
 
     def _record(self, key: str) -> Server | None:
         document = self._platform.documents.get(key)

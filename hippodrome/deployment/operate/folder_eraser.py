@@ -108,7 +108,7 @@ class FolderEraser:
         except (OSError, ValueError):
             record = None
         keys = (*keys_of_warm_servers(self.project, warm_servers_of(record)), key)
-        return [version for each in keys for version in self._folder.versions_of(each)]
+        return [version for key in keys for version in self._folder.versions_of(key)]
 
     def _release_slot(self) -> None:
         """Take the participant out of the project's documents of slots (`maxParticipants`)."""

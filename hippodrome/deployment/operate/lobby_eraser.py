@@ -58,9 +58,9 @@ class LobbyEraser:
     def _questions(self) -> list[Version]:
         """Return all versions of questions to the function `match`, and of its answers, that name the participant."""
         folders = (questions_folder(self._project), groups_folder(self._project))
-        found = [version for folder in folders for version in self._storage.versions(folder) if not version.marker]
-        bodies = read_all(self._storage, found)
-        return [version for version, body in zip(found, bodies, strict=True) if self._names(body)]
+        versions = [version for folder in folders for version in self._storage.versions(folder) if not version.marker]
+        bodies = read_all(self._storage, versions)
+        return [version for version, body in zip(versions, bodies, strict=True) if self._names(body)]
 
     def _names(self, body: bytes) -> bool:
         return self._label.encode() in body or f'"{self._user}"'.encode() in body

@@ -129,11 +129,11 @@ def receipt(
     }
 
 
-def write(target: Path, made: Mapping[str, Any]) -> None:
+def write(target: Path, receipt: Mapping[str, Any]) -> None:
     """Write the receipt into a new file. Raises `Problem` if that fails."""
     try:
         with target.open("x", encoding="utf-8") as file:
-            json.dump(made, file, indent=1)
+            json.dump(receipt, file, indent=1)
             file.write("\n")
     except OSError as error:
         raise Problem(

@@ -52,17 +52,17 @@ def command(
         return Exit.DONE
     if action is Action.SET:
         replaced = secret_parameters.store(account, installation.stack, name, value)
-        found, done = replaced, f"{name} {'has its new value' if replaced else 'is stored'}."
+        existed, done = replaced, f"{name} {'has its new value' if replaced else 'is stored'}."
     else:
-        found = secret_parameters.remove(account, installation.stack, name)
-        done = f"{name} is removed." if found else f"There was no {name}."
+        existed = secret_parameters.remove(account, installation.stack, name)
+        done = f"{name} is removed." if existed else f"There was no {name}."
     screen.success(done)
-    if found:
+    if existed:
         screen.info("Servers that run now keep what they had until they end. `hippodrome register` replaces warm ones.")
-    if action is Action.REMOVE and found:
+    if action is Action.REMOVE and existed:
         screen.warning("No server of a study with trial.llm can start until there is one again.")
     if as_json:
-        screen.result_json({"name": name, "action": action, "existed": found})
+        screen.result_json({"name": name, "action": action, "existed": existed})
     return Exit.DONE
 
 

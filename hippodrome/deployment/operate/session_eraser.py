@@ -70,9 +70,9 @@ class SessionEraser:
         theirs = self._membership() if existing else None
         if theirs is not None and theirs.id in existing and theirs.id not in by_id and theirs.id not in documents:
             by_id[theirs.id] = theirs
-        return sorted(by_id.values(), key=lambda each: each.id)
+        return sorted(by_id.values(), key=lambda session: session.id)
 
-    def _look(self, session: str, key: str, body: bytes, found: dict[str, FoundSession]) -> None:
+    def _look(self, session: str, key: str, body: bytes, by_id: dict[str, FoundSession]) -> None:
         try:
             parsed = sessions.parse(body)
         except BadSession:
@@ -82,8 +82,8 @@ class SessionEraser:
         member = parsed.member(self._user)
         if member is not None:
             others = any(member.user_id not in ("", self._user) for member in parsed.members)
-            before = found.get(session)
-            found[session] = FoundSession(session, member.seat, others and (before is None or before.others))
+            before = by_id.get(session)
+            by_id[session] = FoundSession(session, member.seat, others and (before is None or before.others))
 
     def _membership(self) -> FoundSession | None:
         """Find the session by the participant's membership document, if the session's own document is lost."""

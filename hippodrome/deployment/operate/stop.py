@@ -170,19 +170,19 @@ def command(
     live = [p for p in participants.choose(participants.registered_projects(platform.documents), project) if p.live]
     stopper = Stopper(platform, project)
     screen.info("Looking for servers …", "dim")
-    found = stopper.look()
+    state = stopper.look()
     if dry_run:
-        _show(found, as_json)
-        return Exit.CHANGES if found.to_do else Exit.DONE
-    if found.to_do:
+        _show(state, as_json)
+        return Exit.CHANGES if state.to_do else Exit.DONE
+    if state.to_do:
         if not as_json:
-            _show(found, False)
+            _show(state, False)
         owner = f"of {project}" if project else "of all projects together"
-        warm = sum(record.is_warm_server for record in found.servers)
-        servers = count(len(found.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
+        warm = sum(record.is_warm_server for record in state.servers)
+        servers = count(len(state.servers), "server") + (f" ({warm:,} of them warm)" if warm else "")
         screen.confirm(f"Stop {servers} {owner}? Participants who play there lose the game that is on.", yes)
     with screen.ProgressBars() as progress:
-        bar = progress.add_task("Stopping servers", total=len(found.servers))
+        bar = progress.add_task("Stopping servers", total=len(state.servers))
         remaining = stopper.run(wait, lambda number: progress.advance(bar, number))
     if as_json:
         screen.result_json(
@@ -203,7 +203,7 @@ def command(
         screen.warning(
             f"{count(len(remaining.draining), 'task')} still saving: they end within two minutes of the stop."
         )
-    if live and found.servers:
+    if live and state.servers:
         screen.warning(f"{_again(live)}; `register --no-live` closes it.")
     return Exit.DONE
 

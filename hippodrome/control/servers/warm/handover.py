@@ -47,14 +47,14 @@ class Handovers:
         if found is None or found.server.state is not ServerState.READY:
             return None  # the warm server has ended; the sweep removes it from its pool
         warm_server, attempt = found.server, stored.server.attempt
-        named = self._repository.update(
+        reserved_record = self._repository.update(
             stored,
             lambda r: server.reserving(r, warm_server) if r.is_open(attempt) and _may_reserve(r, warm_server) else None,
         )
-        if named is None:
+        if reserved_record is None:
             self._pools.put_back(project, warm_id, entry)
             raise RetryLater("another delivery was faster")
-        return named
+        return reserved_record
 
     def assign(self, project: Project, versioned: Versioned) -> bool:
         """Hand over the reserved warm server. AWS calls: about eight.
@@ -96,11 +96,11 @@ class Handovers:
         None if the warm server has ended, or another participant has it. This record holds a slot of its own.
         """
         now, label = self._platform.now(), record.label
-        found = self._repository.server(record.warm_server_label)
-        taken = self._repository.update(
-            found, lambda s: server.handed_over(s, label, now) if s.state is ServerState.READY else None
+        warm_record = self._repository.server(record.warm_server_label)
+        handed = self._repository.update(
+            warm_record, lambda s: server.handed_over(s, label, now) if s.state is ServerState.READY else None
         )
-        present = taken or self._repository.server(record.warm_server_label)
+        present = handed or self._repository.server(record.warm_server_label)
         if present is None or present.server.assigned_to != label:
             return None
         if present.server.counted:

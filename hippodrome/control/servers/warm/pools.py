@@ -95,7 +95,7 @@ class Pools:
         raised.
         """
         configured, with_pool = self._projects()
-        known: set[str] = set()
+        pool_ids: set[str] = set()
         unread: list[Exception] = []
         for project_id in sorted(configured | with_pool):
             try:
@@ -106,14 +106,14 @@ class Pools:
                 self.request_adjustment(project_id)  # the adjustment replaces the document
                 continue
             pool = pool.without([warm_id for warm_id in pool.warm_servers if not ids.is_warm_id(warm_id)])
-            known.update(pool.warm_servers)
+            pool_ids.update(pool.warm_servers)
             if pool.warm_servers:
                 self._repair(project_id, pool, repository)
             if pool.warm_servers or project_id in configured:
                 self.request_adjustment(project_id)
         if unread:  # without the error, the caller would stop the warm servers of these pools
             raise unread[0]
-        return known
+        return pool_ids
 
     def handovers(self) -> Iterator[tuple[str, str]]:
         """Yield the project's id and the server's name of each handover document.

@@ -97,8 +97,8 @@ def command(
     document: dict[str, Any] = {}
     account = open_account(profile, region)
     findings = [*credentials(account)]
-    installation, found = installation_state(account, stack)
-    findings += found
+    installation, diagnoses = installation_state(account, stack)
+    findings += diagnoses
     if installation is not None:
         context = CheckContext(account, installation, at_once, datetime.now(UTC), fetch=addresses.fetch)
         if only_aws:
@@ -148,11 +148,11 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
         installation = find_installation(account, stack)
     except Problem as problem:
         return None, [bad("stack", str(problem), problem.advice)]
-    found = []
+    diagnoses = []
     if installation.status in states.COMPLETE:
-        found.append(good("stack", f"{stack} is in {installation.status}."))
+        diagnoses.append(good("stack", f"{stack} is in {installation.status}."))
     elif installation.status == "UPDATE_ROLLBACK_COMPLETE":
-        found.append(
+        diagnoses.append(
             look(
                 "stack",
                 f"{stack} works as before its last update, which failed.",
@@ -160,7 +160,7 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
             )
         )
     else:
-        found.append(
+        diagnoses.append(
             look(
                 "stack",
                 f"{stack} is in {installation.status}.",
@@ -168,11 +168,11 @@ def installation_state(account: Account, stack: str) -> tuple[Installation | Non
             )
         )
     try:
-        found += _version(account, stack)
+        diagnoses += _version(account, stack)
     except Exception as error:  # noqa: BLE001 - it becomes a finding, and the other checks go on
         why = explain.problem_from(error) or Problem(f"{type(error).__name__}.")
-        found.append(look("version", f"could not be checked: {why}", why.advice))
-    return installation, found
+        diagnoses.append(look("version", f"could not be checked: {why}", why.advice))
+    return installation, diagnoses
 
 
 def _version(account: Account, stack: str) -> Iterator[Finding]:
@@ -230,8 +230,8 @@ def _conclude(findings: list[Finding], rehearsal: list[Finding]) -> None:
     looks = sum(1 for finding in findings if finding.mark is Mark.LOOK)
     rehearsed = bool(rehearsal) and all(finding.mark is not Mark.BAD for finding in rehearsal)
     ready = "The rehearsal succeeded" if rehearsed else "" if bads else "Ready"
-    left = f"{bads} to mend, {looks} to look at" if bads else f"{looks} to look at" if looks else ""
-    screen.out.print(Text(f"{'; '.join(filter(None, (ready, left)))}.", style="bold"))
+    sentence = f"{bads} to mend, {looks} to look at" if bads else f"{looks} to look at" if looks else ""
+    screen.out.print(Text(f"{'; '.join(filter(None, (ready, sentence)))}.", style="bold"))
 
 
 def _data(finding: Finding) -> dict[str, Any]:

@@ -174,9 +174,9 @@ def certificate(context: CheckContext) -> Iterator[Finding]:
     if certificate is None:
         yield bad("certificate", "There is none: no browser can reach a server.", order)
         return
-    (wanted,) = names_of(context.installation.servers_domain)
-    if wanted not in certificate.names:
-        yield bad("certificate", f"It is for {', '.join(certificate.names) or 'no name'}, not for {wanted}.", order)
+    (expected,) = names_of(context.installation.servers_domain)
+    if expected not in certificate.names:
+        yield bad("certificate", f"It is for {', '.join(certificate.names) or 'no name'}, not for {expected}.", order)
     elif certificate.days_left < 0 or certificate.expires <= context.now:
         yield bad("certificate", f"It expired on {certificate.expires:%d %B %Y}.", order)
     elif certificate.staging:

@@ -42,11 +42,14 @@ OLDER = "The bucket keeps older versions: put the last good one in its place"
 
 def documents(context: CheckContext) -> Iterator[Finding]:
     """Find documents that cannot be read: list of projects, records of servers and participants, slots, sessions."""
-    found = [*_projects(context), *_secret(context), *_servers(context)]
+    diagnoses = [*_projects(context), *_secret(context), *_servers(context)]
     for project in context.projects:
-        found += [*_shared(context.platform.documents, project), *_participants(context.platform.documents, project)]
-        found += _sessions(context.platform.documents, project) if project.has_sessions else ()
-    yield from found or [good("documents", "All can be read.")]
+        diagnoses += [
+            *_shared(context.platform.documents, project),
+            *_participants(context.platform.documents, project),
+        ]
+        diagnoses += _sessions(context.platform.documents, project) if project.has_sessions else ()
+    yield from diagnoses or [good("documents", "All can be read.")]
 
 
 def _projects(context: CheckContext) -> Iterator[Finding]:
@@ -160,10 +163,10 @@ def _is_readable(documents: Documents, key: str, kind: type[Any]) -> bool:
 
 def _can_be_read(documents: Documents, key: str, read: Callable[[bytes], object]) -> bool:
     """Whether `read`, which raises ValueError, accepts a document, or there is none."""
-    found = documents.get(key)
+    document = documents.get(key)
     try:
-        if found:
-            read(found.body)
+        if document:
+            read(document.body)
     except ValueError:
         return False
     return True
@@ -178,11 +181,11 @@ def step_pages(context: CheckContext) -> Iterator[Finding]:
 def _pages(documents: Documents, project: Project) -> Iterator[Finding]:
     for step in project.steps:
         for file in step.files:
-            found = documents.get(project.page_key(file))
-            if found is None:
+            document = documents.get(project.page_key(file))
+            if document is None:
                 yield bad(f"project {project.id}", f"Step {step.key}: {file}.html is missing.", _again(project))
             else:
-                yield from _page(project, step, file, found.body.decode("utf-8", "replace"))
+                yield from _page(project, step, file, document.body.decode("utf-8", "replace"))
 
 
 def _page(project: Project, step: Step, file: str, source: str) -> Iterator[Finding]:

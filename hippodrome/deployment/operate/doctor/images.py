@@ -130,10 +130,10 @@ def _image(context: CheckContext, check: str, image: str) -> Iterator[Finding]:
     tag = name[len(repository) + 1 :]
     if not digest:
         yield look(check, f"names its image by a tag ({tag or 'latest'}), which may name another image later.", AGAIN)
-    wanted = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
+    image_id = {"imageDigest": digest} if digest else {"imageTag": tag or "latest"}
     client, name_there = context.account.client("ecr"), repository.partition("/")[2]
     try:
-        details = client.describe_images(repositoryName=name_there, imageIds=[wanted])["imageDetails"]
+        details = client.describe_images(repositoryName=name_there, imageIds=[image_id])["imageDetails"]
     except (client.exceptions.ImageNotFoundException, client.exceptions.RepositoryNotFoundException):
         details = []
     if not details:

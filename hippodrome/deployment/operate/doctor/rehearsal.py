@@ -170,32 +170,32 @@ class Rehearsal:
             self._platform.bus.publish(Topic.STOP, to_message(stop))
         end = self._clock() + LEAVE
         helped = False
-        while (left := self._left()) and self._clock() < end:
+        while (remaining := self._left()) and self._clock() < end:
             if self._clock() > end - LEAVE / 2 and not helped:  # the functions have not stopped the server
                 helped = True
                 self._stop_from_here(stop)
-            self._progress(f"stopping it: {', '.join(left)}")
+            self._progress(f"stopping it: {', '.join(remaining)}")
             self._sleep(PAUSE)
-        if left:
+        if remaining:
             return [
                 bad(
                     CHECK,
-                    f"Not gone after {LEAVE:.0f} seconds: {', '.join(left)}.",
+                    f"Not gone after {LEAVE:.0f} seconds: {', '.join(remaining)}.",
                     "Run `hippodrome stop --all`; the sweep removes it too.",
                 )
             ]
         ran = self._record is not None and self._record.running is not None
         self._delete_documents(ran)
-        found = [good(CHECK, "It was stopped, and nothing of it is left.")]
+        diagnoses = [good(CHECK, "It was stopped, and nothing of it is left.")]
         if helped:
-            found.append(
+            diagnoses.append(
                 look(
                     CHECK,
                     "No function has acted on the stop message, so this command stopped the server.",
                     "See `hippodrome logs --all --function stop_server`.",
                 )
             )
-        return found
+        return diagnoses
 
     def _left(self) -> list[str]:
         """Find what is left of the server, in words."""
@@ -206,8 +206,8 @@ class Rehearsal:
         self._record = record
         if not record.is_closed:
             return ["its record"]
-        found = resources.list_resources(self._platform).only(lambda name: name == record.name)
-        return [f"its {kind}" for kind in found.kinds()]
+        remaining = resources.list_resources(self._platform).only(lambda name: name == record.name)
+        return [f"its {kind}" for kind in remaining.kinds()]
 
     def _stop_from_here(self, stop: StopServer) -> None:
         from hippodrome.control.servers.services import ServerServices  # noqa: PLC0415 - Powertools

@@ -96,9 +96,9 @@ def queues(context: CheckContext) -> Iterator[Finding]:
 
 def alarms(context: CheckContext) -> Iterator[Finding]:
     """Check whether an alarm fires."""
-    found = [*snapshot.alarms(context.account, context.installation)]
-    firing = sorted(one["AlarmName"] for one in found if one.get("StateValue") == "ALARM")
-    if not found:
+    all_alarms = [*snapshot.alarms(context.account, context.installation)]
+    firing = sorted(alarm["AlarmName"] for alarm in all_alarms if alarm.get("StateValue") == "ALARM")
+    if not all_alarms:
         yield look("alarms", "The stack has no alarms.", APPLY)
     elif firing:
         yield bad(
@@ -107,14 +107,20 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
             f"See {context.installation.outputs.get('Dashboard', 'the dashboard')}.",
         )
     else:
-        yield good("alarms", f"{len(found)} alarms, none fires.")
+        yield good("alarms", f"{len(all_alarms)} alarms, none fires.")
 
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
     """Check whether the alarms' topic has a confirmed subscription."""
-    found = [*snapshot.subscriptions(context.account, context.installation)]
-    pending = [one["Endpoint"] for one in found if one["SubscriptionArn"] == "PendingConfirmation"]
-    confirmed = [one["Endpoint"] for one in found if one["SubscriptionArn"].startswith("arn:")]
+    subscriptions = [*snapshot.subscriptions(context.account, context.installation)]
+    pending = [
+        subscription["Endpoint"]
+        for subscription in subscriptions
+        if subscription["SubscriptionArn"] == "PendingConfirmation"
+    ]
+    confirmed = [
+        subscription["Endpoint"] for subscription in subscriptions if subscription["SubscriptionArn"].startswith("arn:")
+    ]
     if pending:
         yield look("alarm e-mail", f"{', '.join(pending)} has not confirmed.", "Follow the link in AWS's e-mail.")
     if confirmed:

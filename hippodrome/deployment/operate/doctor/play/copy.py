@@ -61,9 +61,9 @@ class Copy:
         """
         documents = self._platform.documents
         for key, name in (pages := page_files(documents, of)).items():
-            found = documents.get(key)
-            if found is not None:
-                documents.create(f"{self.id}/{STEPS_FOLDER}/{name}", found.body)
+            document = documents.get(key)
+            if document is not None:
+                documents.create(f"{self.id}/{STEPS_FOLDER}/{name}", document.body)
         invoke(self._account, self._installation, registration_of(changed(of, self.id), live=True))
         self._made = next(
             (
@@ -130,7 +130,7 @@ def left_behind(documents: Documents, now: datetime) -> list[str]:
     Copies that are younger than `OLD` are left out: their rehearsals may still run.
     """
     ids = [project.id for project in participants.registered_projects(documents, []) if ID.fullmatch(project.id)]
-    return [one for one in ids if _age(documents, one, now) > OLD]
+    return [project_name for project_name in ids if _age(documents, project_name, now) > OLD]
 
 
 def _age(documents: Documents, project_id: str, now: datetime) -> timedelta:
@@ -154,16 +154,18 @@ def remove(
     """
     progress("removing the copy of the study from the list")
     unregister(platform.documents, project_id)
-    known = dict.fromkeys([*(users or ()), *(user for user, _ in participants.folders(platform.documents, project_id))])
-    known |= dict.fromkeys(_lobby_sessions(platform.documents, project_id))
+    users_known = dict.fromkeys(
+        [*(users or ()), *(user for user, _ in participants.folders(platform.documents, project_id))]
+    )
+    users_known |= dict.fromkeys(_lobby_sessions(platform.documents, project_id))
     if users is None:
         records = Records(platform.documents).since()
-        known |= dict.fromkeys(record.user_id for record in records if record.project_id == project_id)
+        users_known |= dict.fromkeys(record.user_id for record in records if record.project_id == project_id)
     bucket = VersionedBucket(account, installation["Bucket"])
     lobby = (entries.folder(project_id), decisions.key(project_id), questions_folder(project_id))
     deleted = sum(bucket.delete(bucket.versions(place)) for place in lobby)
-    for number, user in enumerate(known, 1):
-        progress(f"removing what is left of bot {number} of {len(known)}")
+    for number, user in enumerate(users_known, 1):
+        progress(f"removing what is left of bot {number} of {len(users_known)}")
         eraser = Eraser(account, installation, project_id, user, late=False)
         if eraser.run():
             raise Problem("Something of a bot is still there.", f"Run `hippodrome stop {project_id}`.")
@@ -174,9 +176,9 @@ def remove(
 
 def _lobby_sessions(documents: Documents, project_id: str) -> list[str]:
     """Return the ids of sessions in the lobby's decisions, also of those with a server ahead and without members."""
-    found = documents.get(decisions.key(project_id))
+    document = documents.get(decisions.key(project_id))
     try:
-        return sorted(from_json(found.body, Decisions).session_ids()) if found else []
+        return sorted(from_json(document.body, Decisions).session_ids()) if document else []
     except ValueError:  # the sweep stops servers that no lobby lists
         return []
 
@@ -184,14 +186,14 @@ def _lobby_sessions(documents: Documents, project_id: str) -> list[str]:
 def unregister(documents: Documents, project_id: str) -> None:
     """Remove a project from the list of projects, if it is there. Raises `Problem` after `TRIES` conflicts."""
     for _ in range(TRIES):
-        found = documents.get(MASTER_LIST)
-        listed = read_list(found.body) if found else MasterList()
-        if found is None or listed.find(project_id) is None:
+        document = documents.get(MASTER_LIST)
+        listed = read_list(document.body) if document else MasterList()
+        if document is None or listed.find(project_id) is None:
             return
         master_list = MasterList(
             [project for project in listed.projects if project.id != project_id], listed.unreadable
         )
         with contextlib.suppress(Conflict):
-            documents.replace(MASTER_LIST, write_list(master_list), found.etag)
+            documents.replace(MASTER_LIST, write_list(master_list), document.etag)
             return
     raise Problem("The list of projects is being written all the time.", "Run it again.")

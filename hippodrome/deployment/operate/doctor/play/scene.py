@@ -64,10 +64,10 @@ class RehearsalContext:
     def wait(self, look: Callable[[], T | None], activity: str, seconds: float, failed: CheckFailed) -> T:
         """Call `look` until it returns a value, and return that. Raises `failed` after `seconds`, or at `until`."""
         began = time.monotonic()
-        while (found := look()) is None:
+        while (outcome := look()) is None:
             spent = time.monotonic() - began
             if spent > seconds or not self.left():
                 raise failed
             self.progress(f"{activity}, {spent:.0f} s")
             time.sleep(PAUSE)
-        return found
+        return outcome

@@ -181,7 +181,7 @@ def alarm(scene: RehearsalContext) -> None:
     ]
     if not quiet:
         raise CheckFailed("There is no alarm that is quiet and tells its topic.", "Run `hippodrome apply`.")
-    chosen = min(quiet, key=lambda one: str(one["AlarmName"]))
+    chosen = min(quiet, key=lambda candidate: str(candidate["AlarmName"]))
     name, before, began = chosen["AlarmName"], chosen.get("StateValue", "OK"), datetime.now(UTC) - timedelta(seconds=5)
     cloudwatch.set_alarm_state(AlarmName=name, StateValue="ALARM", StateReason=REASON)
     try:
@@ -245,7 +245,7 @@ def times(scene: RehearsalContext, records: Iterable[Server]) -> None:
             slow += [stage] if max(seconds) > assumed.most else []
     if not texts:
         raise CheckFailed("No server ran, so nothing was measured.", "See the line `servers`.")
-    rounded = {stage: [round(one, 1) for one in seconds] for stage, seconds in measured.items()}
+    rounded = {stage: [round(duration, 1) for duration in seconds] for stage, seconds in measured.items()}
     mark = Mark.LOOK if slow else Mark.GOOD
     advice = f"Slower than the simulation assumes: {', '.join(slow)}. Its figures are too hopeful here." if slow else ""
     scene.transcript.say("times", mark, "; ".join(texts) + ".", advice, **rounded)

@@ -155,8 +155,8 @@ class Walk:
     def servers(self) -> None:
         """Check that every bot got a server that became ready. Tell how many were on Spot, and how long bots waited."""
         transcript = self._scene.transcript
-        found = {bot: self._scene.server(bot.report.user_id) for bot in self.all}
-        self.records = {bot.report.user_id: record for bot, record in found.items() if record}
+        records = {bot: self._scene.server(bot.report.user_id) for bot in self.all}
+        self.records = {bot.report.user_id: record for bot, record in records.items() if record}
         waited = [play.waited for bot in self.bots for play in bot.report.plays if play.addresses]
         if len(waited) < len(self.bots) or not all(record.running for record in self.ran):
             reasons = sorted({str(record.reason or record.state) for record in self.ran})
@@ -170,7 +170,7 @@ class Walk:
         transcript.good(
             "servers",
             f"{len(self.ran)} ran, {spot} of them on Spot; bots waited {shown(waited)} on the game's page.",
-            waited=[round(one, 1) for one in waited],
+            waited=[round(seconds, 1) for seconds in waited],
         )
 
     def games(self) -> None:
@@ -197,18 +197,18 @@ class Walk:
         if self._struck is None or record is None:
             transcript.bad("killed", f"No task was killed: {self._not_struck}.", "These credentials need ecs:StopTask.")
             return
-        lost = record.earlier[0] if record.earlier else None
-        if record.attempt < 2 or lost is None or not report.finished:
+        first_attempt = record.earlier[0] if record.earlier else None
+        if record.attempt < 2 or first_attempt is None or not report.finished:
             transcript.bad(
                 "killed",
                 f"The task was killed, and its server not replaced: {record.reason or record.state}.",
                 "See `hippodrome logs --all --function task_changed`.",
             )
             return
-        again = (record.ready or record.requested) - (lost.closed or record.requested)
+        again = (record.ready or record.requested) - (first_attempt.closed or record.requested)
         transcript.good(
             "killed",
-            f"The server counted as {lost.reason} ({lost.cause or 'no cause'}); another was ready "
+            f"The server counted as {first_attempt.reason} ({first_attempt.cause or 'no cause'}); another was ready "
             f"{again.total_seconds():.0f} s later, and the game went on to its end.",
             again=round(again.total_seconds(), 1),
         )
@@ -233,8 +233,8 @@ class Walk:
             return
         self.records = {user: record for user in users if (record := scene.server(user))}
         reasons = sorted({str(record.reason) for record in self.ran})
-        wanted = {Reason.STOPPED, Reason.ENDED}
-        if not all(record.reason in wanted for record in self.ran):
+        expected = {Reason.STOPPED, Reason.ENDED}
+        if not all(record.reason in expected for record in self.ran):
             scene.transcript.bad("end", f"The servers ended as {', '.join(reasons)}.", "See `hippodrome status --all`.")
             return
         scene.transcript.good(
@@ -255,21 +255,21 @@ class Walk:
         recorded = bool(scene.copy.project.trial.get("s3upload", True))
         with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
             folder = Path(temporary)
-            made = data.run(source, scene.copy.id, folder / "data", data.Options(raw=True))
+            outcome = data.run(source, scene.copy.id, folder / "data", data.Options(raw=True))
             stored = folder / "stored" / scene.copy.id
             stored.mkdir(parents=True)
             for owners in ("users", "sessions"):
                 (stored / owners).symlink_to(folder / "data" / "private" / "raw")
             struck = self._played_with_the_victim()
             others = [bot for bot in self.all if bot not in struck]
-            found = [
+            verifications = [
                 verification.verify(folder / "stored", scene.copy.id, [bot.report for bot in bots], recorded=recorded)
                 for bots in (others, struck)
             ]
-        of_others, of_struck = found
+        of_others, of_struck = verifications
         # The recording of a killed server may lack its end.
         missing = [*of_others.missing, *(name for name in of_struck.missing if not name.endswith("is cut off"))]
-        counts = made["counts"]
+        counts = outcome["counts"]
         if counts["problems"]:
             missing.append(f"{counts['problems']} files are not as they should be")
         if counts["participants"] != len(self.all):
@@ -281,9 +281,9 @@ class Walk:
                 "See `hippodrome logs --all --function trial`.",
             )
             return
-        answers = sum(one.answers + one.games for one in found)
-        recordings = sum(one.recordings for one in found)
-        steps = sum(one.steps for one in found)
+        answers = sum(verification.answers + verification.games for verification in verifications)
+        recordings = sum(verification.recordings for verification in verifications)
+        steps = sum(verification.steps for verification in verifications)
         scene.transcript.good(
             "data", f"{answers} answers and {recordings} recordings with {steps} steps, as they were sent and played."
         )
@@ -301,5 +301,5 @@ def left(scene: RehearsalContext, user: str) -> list[str]:
         return []
     if record.state is not ServerState.CLOSED:
         return ["a record that is not closed"]
-    found = resources.list_resources(scene.platform).only(lambda name: name == record.name)
-    return [f"a {kind}" for kind in found.kinds()]
+    remaining = resources.list_resources(scene.platform).only(lambda name: name == record.name)
+    return [f"a {kind}" for kind in remaining.kinds()]
