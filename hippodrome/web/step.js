@@ -183,31 +183,56 @@
     const set = field.type === "radio" ? field.closest("fieldset")?.querySelector("legend") : null;
     const row = field.type === "radio" ? field.closest("tr")?.querySelector("th") : null;
     const source = row ?? set ?? field.labels?.[0];
-    const text = source?.textContent.replace(/\s+/g, " ").replace(/[\s*]+$/, "").trim() ?? field.getAttribute("aria-label") ?? "";
+    const words = [...(source?.childNodes ?? [])].filter((each) => each.className !== "note").map((each) => each.textContent).join("");
+    const text = words.replace(/\s+/g, " ").replace(/[\s*]+$/, "").trim() || (field.getAttribute("aria-label") ?? "");
     return text.length > 90 ? `${text.slice(0, 88)}…` : text;
   }
 
-  let firstInvalid = null;
-  let named = null; // the field that the sentence below the form names
+  const notes = new Map(); // field -> the sentence below it; of radio buttons that are one question, the first has it
+  let reported = false; // whether this press of the button has met a field without a valid answer
 
-  // The browser moves to the first field without a valid answer, and shows a bubble for a moment; this sentence stays.
+  // A browser's bubble would cover the next question and go after a moment: sentences of our own stay until the answer is there.
   function onInvalid(event) {
-    if (firstInvalid) return;
-    firstInvalid = event.target;
-    const name = nameForPeople(firstInvalid);
-    const empty = firstInvalid.validity.valueMissing;
-    if (name) {
-      named = firstInvalid;
-      say(empty ? TEXT.missing(name) : TEXT.lookAgain(name), true);
-    }
-    setTimeout(() => { firstInvalid = null; });
+    event.preventDefault();
+    const field = event.target;
+    const known = [...notes.keys()].some((each) => each === field || (each.type === "radio" && each.name === field.name));
+    if (!known) notes.set(field, noteAt(field));
+    if (notes.has(field)) notes.get(field).textContent = field.validity.valueMissing ? TEXT.answerHere : field.validationMessage;
+    sayMissing();
+    if (reported) return;
+    reported = true;
+    field.focus();
+    setTimeout(() => { reported = false; });
+  }
+
+  function noteAt(field) {
+    const note = Object.assign(document.createElement("span"), { className: "note", id: `note-${notes.size}-${field.name}` });
+    const question = field.type === "radio" ? field.closest("tr")?.querySelector("th") ?? field.closest("fieldset")?.querySelector("legend") : null;
+    const next = field.nextElementSibling; // a label may follow its checkbox
+    if (question) question.append(note);
+    else (field.closest("label, .range") ?? (next?.htmlFor && next.htmlFor === field.id ? next : field)).after(note);
+    field.setAttribute("aria-invalid", "true");
+    field.setAttribute("aria-describedby", note.id);
+    return note;
+  }
+
+  function sayMissing() {
+    const lines = [...notes.keys()].map((field) => [field.validity.valueMissing, nameForPeople(field)]).filter(([, name]) => name);
+    say(lines.map(([empty, name]) => (empty ? TEXT.missing(name) : TEXT.lookAgain(name))).join("\n"), true);
   }
 
   function onInput() {
     keepDraft();
-    if (!named?.validity.valid) return;
-    named = null;
-    say("");
+    let less = false;
+    for (const [field, note] of [...notes]) {
+      if (!field.validity.valid) continue;
+      notes.delete(field);
+      note.remove();
+      field.removeAttribute("aria-invalid");
+      field.removeAttribute("aria-describedby");
+      less = true;
+    }
+    if (less) sayMissing();
   }
 
   // Sliders

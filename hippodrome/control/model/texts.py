@@ -42,6 +42,7 @@ _PAGES = {
         "online."
     ),
     "missing": "Please answer this question: “{question}”",
+    "answerHere": "Please answer this question.",
     "lookAgain": "Please check this answer: “{question}”",
     "tooLong": "Your answers are too long to send. Please contact the researchers who invited you.",
     "shorten": "Your answers are too long to send. Please shorten your answer to “{question}”. Nothing has been lost.",

@@ -196,7 +196,7 @@ $content
 <section id="reading" tabindex="-1" style="outline:0" aria-label="TEXT.toRead" hidden>
 <p id="reading-score"></p>
 $texts
-<p style="margin-top:1.1rem"><button type="button" id="reading-button"></button></p>
+<p style="margin:2rem 0 0"><button type="button" class="button" id="reading-button"></button></p>
 </section>""",
     "text": '<form class="page" id="text-$key" hidden>\n$content\n</form>',
     "alone": """<h1>TEXT.gettingReady</h1>
