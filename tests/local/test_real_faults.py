@@ -181,5 +181,5 @@ def test_a_start_where_nothing_can_be_written_is_reported_in_a_sentence(local: M
         check=False,
     )
     assert made.returncode == 1
-    assert f"The study cannot run with the data in {here.folder}/data: File too large." in made.stdout
+    assert f"The study cannot run with the data in {here.folder}/data: File too large." in made.stderr
     assert "Traceback" not in made.stdout + made.stderr
